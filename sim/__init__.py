@@ -1,0 +1,1 @@
+"""The other side of the wire: vehicle, autopilot, cameras, radio channel."""

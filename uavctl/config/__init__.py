@@ -1,0 +1,5 @@
+"""Configuration: TOML in, typed and checked values out."""
+
+from uavctl.config.types import Config
+
+__all__ = ["Config"]

@@ -1,0 +1,364 @@
+"""Typed configuration: one definition gives the decoder, the checks and the reference page.
+
+Every key has its unit and meaning in `Meta(description=...)`; `docs/configuration.md` is generated
+from them.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Rows = tuple[tuple[float, ...], ...]
+Floats = tuple[float, ...]
+Position = tuple[float, float, float]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Probability = Annotated[float, Meta(ge=0, le=1)]
+OpenProbability = Annotated[float, Meta(gt=0, lt=1)]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all sections."""
+
+
+class PlantConfig(Section, frozen=True):
+    """The plant x(k+1) = A x + B u + E w, w ~ N(0, W); states are ordered axis by axis."""
+
+    model: Annotated[
+        Literal["matrices", "drag-lag"],
+        Meta(description="`matrices`: a, b, e, w as given; `drag-lag`: made from drag_1ps, lag_s, gain, wind_std_mps2"),
+    ]
+    dt_s: Annotated[float, Meta(gt=0, description="time step Δt [s]")]
+    axes: Annotated[
+        tuple[Literal["north", "east", "down"], ...],
+        Meta(
+            min_length=1,
+            max_length=3,
+            description="axes of local NED that the plant moves in, in the order of its states",
+        ),
+    ]
+    a: Annotated[Rows, Meta(description="A (n_x, n_x), with model `matrices`")] = ()
+    b: Annotated[Rows, Meta(description="B (n_x, n_u), with model `matrices`")] = ()
+    e: Annotated[Rows, Meta(description="E (n_x, n_w), with model `matrices`")] = ()
+    w: Annotated[Rows, Meta(description="covariance W (n_w, n_w) of the disturbance, with model `matrices`")] = ()
+    position_index: Annotated[
+        tuple[int, ...], Meta(description="state index of each axis' position, with model `matrices`")
+    ] = ()
+    velocity_index: Annotated[
+        tuple[int, ...], Meta(description="state index of each axis' velocity, with model `matrices`")
+    ] = ()
+    accel_per_input: Annotated[
+        Floats,
+        Meta(description="acceleration setpoint per unit of input, each axis [m/s² per unit], with model `matrices`"),
+    ] = ()
+    drag_1ps: Annotated[Floats, Meta(description="drag c of each axis [1/s], with model `drag-lag`")] = ()
+    lag_s: Annotated[Floats, Meta(description="acceleration lag T of each axis [s], with model `drag-lag`")] = ()
+    gain: Annotated[
+        Floats, Meta(description="acceleration reached per acceleration asked for, with model `drag-lag`")
+    ] = ()
+    wind_std_mps2: Annotated[
+        Floats,
+        Meta(
+            description="standard deviation of the acceleration noise, constant over Δt [m/s²], with model `drag-lag`"
+        ),
+    ] = ()
+
+
+class SetsConfig(Section, frozen=True):
+    """Admissible boxes X and U; `inf` leaves a side open."""
+
+    state_lower: Annotated[Floats, Meta(description="lower limits of the states (n_x) [m, m/s, m/s²]")]
+    state_upper: Annotated[Floats, Meta(description="upper limits of the states (n_x) [m, m/s, m/s²]")]
+    input_lower: Annotated[Floats, Meta(description="lower limits of the inputs (n_u) [input units]")]
+    input_upper: Annotated[Floats, Meta(description="upper limits of the inputs (n_u) [input units]")]
+
+
+class CostConfig(Section, frozen=True):
+    """Stage cost (3), diagonal weights."""
+
+    state: Annotated[Floats, Meta(description="diagonal of Q_x (n_x)")]
+    input: Annotated[Floats, Meta(description="diagonal of Q_u (n_u)")]
+
+
+class SmpcConfig(Section, frozen=True):
+    """The paper's scheme."""
+
+    horizon: Annotated[int, Meta(ge=2, le=60, description="prediction horizon H [steps]")]
+    tau: Annotated[int, Meta(ge=1, le=20, description="delay τ of the terminal control law [steps]")]
+    delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")]
+    delta_u: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_u of the input constraints")]
+    delta_tau: Annotated[float, Meta(gt=0, lt=1, description="threshold δ_τ of Assumption 4.1")]
+    k_tau: Annotated[Rows, Meta(description="terminal gain K_τ (n_u, n_x)")]
+    slack_linear: Annotated[
+        float, Meta(gt=0, description="exact penalty of a state-constraint slack, linear [cost per unit]")
+    ]
+    slack_quadratic: Annotated[float, Meta(gt=0, description="the same, quadratic [cost per unit²]")]
+    offset_weight: Annotated[
+        float, Meta(gt=0, description="l1 weight T that pulls the artificial reference to the target [cost per unit]")
+    ]
+    terminal_weight: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="l1 weight of a missed terminal equality, when no equilibrium is in reach [cost per unit]",
+        ),
+    ] = 1e5
+
+
+class ScheduleConfig(Section, frozen=True):
+    """Information delays d_t: what feedback may be counted on in stage t."""
+
+    rule: Annotated[
+        Literal["fixed", "search", "greedy"],
+        Meta(
+            description="`fixed`: as given; `search`: least mean cost over search_states; `greedy`: greedy reading of (7)"
+        ),
+    ] = "fixed"
+    delays: Annotated[
+        int | tuple[int, ...], Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]")
+    ] = 0
+    gamma_max: Annotated[float, Meta(gt=0, lt=1, description="`search` keeps every γ at or below this")] = 0.985
+    search_states: Annotated[Rows, Meta(description="states (n_x each) over whose mean cost `search` minimises")] = ()
+
+
+class RiskConfig(Section, frozen=True):
+    """How a likelihood becomes back-offs."""
+
+    allocation: Annotated[
+        Literal["ellipsoid", "halfspace"],
+        Meta(description="`ellipsoid`: χ² of the whole vector, as printed; `halfspace`: Boole with Gaussian quantiles"),
+    ] = "ellipsoid"
+
+
+class SolverConfig(Section, frozen=True):
+    """The solver of the decision problem."""
+
+    method: Annotated[
+        Literal["printed", "exact"],
+        Meta(
+            description="`exact`: reduced program in Clarabel; `printed`: (19) through CVXPY (slow, hard constraints)"
+        ),
+    ] = "exact"
+    max_iterations: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=500,
+            description="bound on interior-point iterations (never on time, so that a replay decides alike)",
+        ),
+    ] = 100
+
+
+class LinkConfig(Section, frozen=True):
+    """The radio link that carries positions: the design's assumption, and the simulator's channel."""
+
+    loss: Annotated[
+        float, Meta(ge=0, lt=1, description="probability that a packet is lost; the design uses p = 1 − loss")
+    ] = 0.0
+    model: Annotated[
+        Literal["bernoulli", "gilbert-elliott"], Meta(description="loss model of the simulated channel")
+    ] = "bernoulli"
+    burst_enter: Annotated[
+        float, Meta(ge=0, le=1, description="Gilbert–Elliott: probability of entering the bad state, each packet")
+    ] = 0.0
+    burst_leave: Annotated[
+        float, Meta(gt=0, le=1, description="Gilbert–Elliott: probability of leaving the bad state, each packet")
+    ] = 1.0
+    burst_loss: Annotated[
+        float, Meta(ge=0, le=1, description="Gilbert–Elliott: loss in the bad state (`loss` applies in the good one)")
+    ] = 1.0
+    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet [s]")] = 0.0
+    jitter_s: Annotated[
+        float, Meta(ge=0, description="uniform extra delay from 0 to this [s]; packets may overtake each other")
+    ] = 0.0
+    duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
+    corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
+    truncate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet is cut short")] = 0.0
+    blackout: Annotated[
+        tuple[tuple[float, float], ...],
+        Meta(description="spans [from_s, to_s] since the start in which every packet is lost [s]"),
+    ] = ()
+
+
+class TargetConfig(Section, frozen=True):
+    """Where to fly to."""
+
+    position_m: Annotated[
+        Position, Meta(description="target position in local NED [m]; axes that the plant has not are ignored")
+    ]
+
+
+class FrameConfig(Section, frozen=True):
+    """Camera frame to local NED."""
+
+    convention: Annotated[Literal["ned", "enu"], Meta(description="axes of the source's positions")] = "ned"
+    origin_m: Annotated[Position, Meta(description="position of the camera frame's origin in local NED [m]")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    yaw_deg: Annotated[
+        float,
+        Meta(
+            ge=-180, le=180, description="heading of the camera frame's first axis (after conversion to NED axes) [deg]"
+        ),
+    ] = 0.0
+
+
+class EstimatorConfig(Section, frozen=True):
+    """Kalman filter."""
+
+    position_std_m: Annotated[float, Meta(gt=0, description="standard deviation of a position sample, each axis [m]")]
+    velocity_std_mps: Annotated[
+        float, Meta(gt=0, description="standard deviation of a velocity sample, each axis [m/s]")
+    ] = 0.05
+    initial_std: Annotated[
+        float,
+        Meta(gt=0, description="standard deviation of the states that the first sample does not show [m/s, m/s²]"),
+    ] = 0.5
+    window_s: Annotated[float, Meta(gt=0, description="samples later than this are dropped [s]")] = 2.0
+    max_position_m: Annotated[
+        float, Meta(gt=0, description="a position further out, in any axis, is absurd and counts as lost [m]")
+    ] = 1000.0
+    max_velocity_mps: Annotated[
+        float, Meta(gt=0, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
+    ] = 100.0
+
+
+class FallbackConfig(Section, frozen=True):
+    """What takes over when the age of information reaches H."""
+
+    brake_gain_1ps: Annotated[float, Meta(gt=0, description="deceleration per predicted speed while braking [1/s]")] = (
+        1.5
+    )
+    brake_s: Annotated[float, Meta(ge=0, description="longest time of braking on the prediction [s]")] = 2.0
+    hold_s: Annotated[float, Meta(ge=0, description="then zero acceleration for this long [s]")] = 3.0
+    land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
+    recover_samples: Annotated[int, Meta(ge=1, description="fresh samples in a row before plans are flown again")] = 3
+
+
+class LimitsConfig(Section, frozen=True):
+    """The last gate on a setpoint."""
+
+    accel_mps2: Annotated[
+        Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")
+    ]
+    slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
+
+
+class SourceConfig(Section, frozen=True):
+    """Which messages count as external positions."""
+
+    messages: Annotated[
+        tuple[
+            Literal[
+                "VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LOCAL_POSITION_NED"
+            ],
+            ...,
+        ],
+        Meta(
+            min_length=1,
+            description="messages that are taken; LOCAL_POSITION_NED is the vehicle's own estimate only if named",
+        ),
+    ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
+    system_id: Annotated[
+        int, Meta(ge=0, le=255, description="MAVLink system id that positions must come from; 0 takes any")
+    ] = 0
+
+
+class ClockConfig(Section, frozen=True):
+    """The source's clock."""
+
+    latency_s: Annotated[
+        float, Meta(ge=0, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]")
+    ] = 0.0
+    window_s: Annotated[float, Meta(gt=0, description="window of the sliding minimum of (received − stamp) [s]")] = 10.0
+    future_tolerance_s: Annotated[float, Meta(ge=0, description="a stamp further in the future is refused [s]")] = 0.02
+
+
+class DaemonConfig(Section, frozen=True):
+    """The control loop and its connections."""
+
+    tick_s: Annotated[float, Meta(gt=0, le=0.1, description="time between setpoints; divides Δt [s]")]
+    vehicle: Annotated[str, Meta(description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
+    mocap: Annotated[
+        str, Meta(description="URL of the source of positions; the same URL as the vehicle's is one connection")
+    ] = "udpin://0.0.0.0:14560"
+    system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
+    component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
+        25
+    )
+
+
+class CameraConfig(Section, frozen=True):
+    """Simulated motion capture."""
+
+    rate_hz: Annotated[float, Meta(gt=0, description="samples a second [1/s]")]
+    phase_s: Annotated[float, Meta(ge=0, description="time of the first sample; then every 1/rate_hz [s]")] = 0.0
+    noise_std_m: Annotated[float, Meta(ge=0, description="noise of a position, each axis [m]")] = 0.0
+    latency_s: Annotated[float, Meta(ge=0, description="processing time in the cameras, before the link [s]")] = 0.0
+    clock_offset_s: Annotated[float, Meta(description="offset of the cameras' clock [s]")] = 0.0
+    message: Annotated[
+        Literal["vision", "vicon", "mocap", "odometry"],
+        Meta(description="MAVLink message; `odometry` carries the velocity too"),
+    ] = "vision"
+
+
+class SimConfig(Section, frozen=True):
+    """The simulated side of the wire."""
+
+    camera: CameraConfig
+    plant: Annotated[Literal["linear"], Meta(description="simulated vehicle")] = "linear"
+    autopilot: Annotated[
+        Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
+    ] = "px4"
+    seed: Annotated[int, Meta(ge=0, description="seed of every random draw")] = 0
+    start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
+    start_velocity_mps: Annotated[Position, Meta(description="velocity at the start, local NED [m/s]")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    setpoint_timeout_s: Annotated[
+        float, Meta(gt=0, description="silence after which the vehicle leaves the mode that takes setpoints [s]")
+    ] = 1.0
+
+
+class LogConfig(Section, frozen=True):
+    """Recording."""
+
+    chunk_bytes: Annotated[int, Meta(ge=1024, le=16384, description="largest chunk of the recording [bytes]")] = 16384
+    queue: Annotated[
+        int, Meta(ge=16, description="records that may wait for the disk; more are dropped and counted")
+    ] = 8192
+    free_bytes: Annotated[int, Meta(ge=0, description="a flight is refused with less free space than this [bytes]")] = (
+        50_000_000
+    )
+
+
+class Config(Section, frozen=True):
+    """A complete configuration."""
+
+    name: Annotated[str, Meta(description="name of the configuration")]
+    duration_s: Annotated[float, Meta(gt=0, description="length of a loopback flight [s]")]
+    plant: PlantConfig
+    sets: SetsConfig
+    cost: CostConfig
+    smpc: SmpcConfig
+    schedule: ScheduleConfig
+    target: TargetConfig
+    estimator: EstimatorConfig
+    limits: LimitsConfig
+    daemon: DaemonConfig
+    sim: SimConfig
+    risk: RiskConfig = RiskConfig()
+    solver: SolverConfig = SolverConfig()
+    link: LinkConfig = LinkConfig()
+    frame: FrameConfig = FrameConfig()
+    fallback: FallbackConfig = FallbackConfig()
+    clock: ClockConfig = ClockConfig()
+    source: SourceConfig = SourceConfig()
+    log: LogConfig = LogConfig()

@@ -1,0 +1,259 @@
+"""Records that cross module borders, and the protocols that join the modules.
+
+SI units; positions in local NED; times are integer nanoseconds on our monotonic clock.
+Every record is frozen and made of plain numbers, so that it can be compared bit for bit,
+written to a recording and read back without loss.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Protocol
+
+import msgspec
+
+Vec3 = tuple[float, float, float]
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all records."""
+
+
+class SolveStatus(StrEnum):
+    """How a solve ended; only OPTIMAL may fly."""
+
+    OPTIMAL = "optimal"
+    INFEASIBLE = "infeasible"
+    INACCURATE = "inaccurate"
+    ITERATION_LIMIT = "iteration_limit"
+    LATE = "late"
+    FAILED = "failed"
+
+
+class ControlMode(StrEnum):
+    """What the controller is doing in a tick."""
+
+    WAIT = "wait"  # no estimate yet, or nobody to fly
+    TRACK = "track"  # a plan is flown: fresh, or played out
+    BRAKE = "brake"  # fallback: take the predicted velocity to zero
+    HOLD = "hold"  # fallback: zero acceleration
+    LAND = "land"  # fallback: the vehicle's own landing is asked for
+    STOPPED = "stopped"  # handed over; nothing is sent
+
+
+class SetpointSource(StrEnum):
+    """Where a setpoint comes from."""
+
+    PLAN = "plan"
+    BRAKE = "brake"
+    HOLD = "hold"
+
+
+class PositionSample(Record, frozen=True):
+    """One external position, after frame and clock conversion."""
+
+    captured_ns: int
+    received_ns: int
+    position_m: Vec3
+    velocity_mps: Vec3 | None = None
+    std_m: float
+    source: str
+    seq: int
+
+
+class Estimate(Record, frozen=True):
+    """State estimate at `at_ns`; `captured_ns` is the capture time of the newest sample in it."""
+
+    at_ns: int
+    captured_ns: int
+    mean: Vector  # (n_x,)
+    cov: Matrix  # (n_x, n_x)
+
+    @property
+    def age_s(self) -> float:
+        """Age of the newest sample [s]."""
+        return (self.at_ns - self.captured_ns) * 1e-9
+
+
+class Plan(Record, frozen=True):
+    """An answer of the predictive controller, from `base_ns` on (one row a step Δt)."""
+
+    seq: int  # number of the step that asked for it
+    base_ns: int
+    captured_ns: int
+    status: SolveStatus
+    method: str
+    inputs: Matrix  # (H, n_u), in the plant's input units
+    states: Matrix  # (H+1, n_x), predicted mean
+    backoff_x: Matrix  # (H+1, rows of the state set)
+    backoff_u: Matrix  # (H, rows of the input set)
+    reference: Vector  # (n_x,), the equilibrium that the plan ends in
+    slack: float  # sum of all state-constraint slacks: what gave way
+    offset: float  # l1 distance of the reference from the target
+    terminal_miss: float  # l1 violation of the terminal equality (0 unless nothing else was left)
+    cost: float
+    cost_lower: float
+    gap: float
+    iterations: int
+    design_id: str
+
+
+class Setpoint(Record, frozen=True):
+    """What is sent to the vehicle, after the last gate."""
+
+    at_ns: int
+    accel_mps2: Vec3
+    yaw_rad: float | None = None
+    source: SetpointSource
+    limited: tuple[str, ...] = ()  # what the last gate changed, by name
+
+
+class Decision(Record, frozen=True):
+    """Everything that a tick knew and chose."""
+
+    tick: int
+    at_ns: int
+    step: int  # number of the Δt interval
+    boundary: bool  # a Δt boundary: age, plan and index are decided anew
+    mode: ControlMode
+    age_steps: int | None  # None before the first sample
+    news: bool  # a sample newer than the plan's was there
+    plan_seq: int | None
+    plan_index: int | None
+    solve: SolveStatus | None  # ending of this tick's solve, if there was one
+    input: Vector | None  # (n_u,), in the plant's input units, after the last gate
+    fresh: int  # fresh samples in a row since the last fallback
+    missed_ticks: int
+    accepted: int  # samples taken in this tick
+    rejected: int  # samples refused in this tick (invalid, duplicate, too old)
+    reason: str
+
+
+class VehicleStatus(Record, frozen=True):
+    """The vehicle as its heartbeats and status messages tell."""
+
+    at_ns: int
+    autopilot: str  # "px4", "ardupilot" or "unknown"
+    armed: bool
+    mode: str  # the autopilot's own name: "OFFBOARD", "GUIDED", "LAND" ...
+    external: bool  # in the mode that takes our setpoints
+    landed: bool | None = None
+    battery_v: float | None = None
+
+
+class Severity(StrEnum):
+    """How bad an event is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Event(Record, frozen=True):
+    """Something worth telling a person; `count` events of one kind are told once a second."""
+
+    at_ns: int
+    severity: Severity
+    code: str
+    text: str
+    count: int = 1
+
+
+class StepInput(Record, frozen=True):
+    """All that one control tick may know; recorded, and enough to replay the tick."""
+
+    tick: int
+    at_ns: int  # the tick's place on the grid, not the moment it ran
+    samples: tuple[PositionSample, ...] = ()
+    vehicle: VehicleStatus | None = None
+    missed_ticks: int = 0
+    stop: bool = False  # the operator asks for the hand-over
+
+
+class Timing(Record, frozen=True):
+    """What the shell measured; never an input of the core, never compared in a replay."""
+
+    tick: int
+    at_ns: int
+    lateness_ns: int  # tick deadline -> start of the tick
+    step_ns: int  # time in the core
+    send_ns: int  # tick deadline -> datagrams handed to the socket
+    capture_to_send_ns: int | None = None
+
+
+class Datagram(Record, frozen=True):
+    """Raw bytes as they crossed a connection; `link` is the connection's name."""
+
+    at_ns: int
+    link: str
+    outgoing: bool
+    data: bytes
+
+
+class LinkStats(Record, frozen=True):
+    """Counters of one connection since the start."""
+
+    at_ns: int
+    link: str
+    datagrams: int
+    messages: int
+    samples: int
+    bad: dict[str, int]  # reason -> count
+    clock_offset_ns: int | None
+    clock_source: str  # "timesync", "minimum" or "none"
+
+
+class Truth(Record, frozen=True):
+    """The simulator's own state (only in simulated flights)."""
+
+    at_ns: int
+    position_m: Vec3
+    velocity_mps: Vec3
+    state: Vector  # (n_x,) of the linear plant
+    input: Vector  # (n_u,) applied
+    sent: int  # positions sent so far
+    lost: int  # of which the channel lost
+    mode: str
+
+
+class Header(Record, frozen=True):
+    """First message of a recording: what is needed to decide alike."""
+
+    started_ns: int
+    started_utc: str
+    seed: int
+    command: str
+    config_toml: str
+    design_id: str
+    design: dict[str, object]
+    versions: dict[str, str]
+    cpu: str
+
+
+class Sink(Protocol):
+    """Takes records; never blocks, never raises into the control loop."""
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Record one value under a topic."""
+        ...
+
+
+class Outgoing(Record, frozen=True):
+    """Bytes for a connection."""
+
+    link: str
+    data: bytes
+
+
+class Flyer(Protocol):
+    """What flies: bytes in, bytes out, time as an argument. The simulator is given one."""
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+        """Take one datagram that arrived at `at_ns`."""
+        ...
+
+    def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
+        """Run the control tick of the grid time `at_ns`; returns the bytes to send."""
+        ...

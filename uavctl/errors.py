@@ -1,0 +1,45 @@
+"""One small tree of errors; each message says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class UavctlError(Exception):
+    """Base of all errors that are meant for a person."""
+
+    exit_code = 1
+
+
+class UsageError(UavctlError):
+    """The command line asks for something that cannot be."""
+
+    exit_code = 2
+
+
+class ConfigError(UavctlError):
+    """The configuration is wrong; holds every problem found, not only the first."""
+
+    exit_code = 2
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+class DesignError(UavctlError):
+    """No controller can be designed from this configuration."""
+
+    exit_code = 2
+
+    def __init__(self, key: str, reason: str, hint: str) -> None:
+        self.key = key
+        self.reason = reason
+        self.hint = hint
+        super().__init__(f"{key}: {reason}; {hint}")
+
+
+class ConnectionSpecError(UsageError):
+    """A connection URL cannot be understood or opened."""
+
+
+class RecordingError(UavctlError):
+    """A recording cannot be read, or not without loss."""
