@@ -51,7 +51,7 @@ class SetpointSource(StrEnum):
     HOLD = "hold"
 
 
-class PositionSample(Record, frozen=True):
+class PositionSample(Record, frozen=True, kw_only=True):
     """One external position, after frame and clock conversion."""
 
     captured_ns: int
@@ -63,7 +63,7 @@ class PositionSample(Record, frozen=True):
     seq: int
 
 
-class Estimate(Record, frozen=True):
+class Estimate(Record, frozen=True, kw_only=True):
     """State estimate at `at_ns`; `captured_ns` is the capture time of the newest sample in it."""
 
     at_ns: int
@@ -77,7 +77,7 @@ class Estimate(Record, frozen=True):
         return (self.at_ns - self.captured_ns) * 1e-9
 
 
-class Plan(Record, frozen=True):
+class Plan(Record, frozen=True, kw_only=True):
     """An answer of the predictive controller, from `base_ns` on (one row a step Δt)."""
 
     seq: int  # number of the step that asked for it
@@ -100,7 +100,7 @@ class Plan(Record, frozen=True):
     design_id: str
 
 
-class Setpoint(Record, frozen=True):
+class Setpoint(Record, frozen=True, kw_only=True):
     """What is sent to the vehicle, after the last gate."""
 
     at_ns: int
@@ -110,7 +110,7 @@ class Setpoint(Record, frozen=True):
     limited: tuple[str, ...] = ()  # what the last gate changed, by name
 
 
-class Decision(Record, frozen=True):
+class Decision(Record, frozen=True, kw_only=True):
     """Everything that a tick knew and chose."""
 
     tick: int
@@ -131,7 +131,7 @@ class Decision(Record, frozen=True):
     reason: str
 
 
-class VehicleStatus(Record, frozen=True):
+class VehicleStatus(Record, frozen=True, kw_only=True):
     """The vehicle as its heartbeats and status messages tell."""
 
     at_ns: int
@@ -151,7 +151,7 @@ class Severity(StrEnum):
     ERROR = "error"
 
 
-class Event(Record, frozen=True):
+class Event(Record, frozen=True, kw_only=True):
     """Something worth telling a person; `count` events of one kind are told once a second."""
 
     at_ns: int
@@ -161,7 +161,7 @@ class Event(Record, frozen=True):
     count: int = 1
 
 
-class StepInput(Record, frozen=True):
+class StepInput(Record, frozen=True, kw_only=True):
     """All that one control tick may know; recorded, and enough to replay the tick."""
 
     tick: int
@@ -172,7 +172,7 @@ class StepInput(Record, frozen=True):
     stop: bool = False  # the operator asks for the hand-over
 
 
-class Timing(Record, frozen=True):
+class Timing(Record, frozen=True, kw_only=True):
     """What the shell measured; never an input of the core, never compared in a replay."""
 
     tick: int
@@ -183,7 +183,7 @@ class Timing(Record, frozen=True):
     capture_to_send_ns: int | None = None
 
 
-class Datagram(Record, frozen=True):
+class Datagram(Record, frozen=True, kw_only=True):
     """Raw bytes as they crossed a connection; `link` is the connection's name."""
 
     at_ns: int
@@ -192,7 +192,7 @@ class Datagram(Record, frozen=True):
     data: bytes
 
 
-class LinkStats(Record, frozen=True):
+class LinkStats(Record, frozen=True, kw_only=True):
     """Counters of one connection since the start."""
 
     at_ns: int
@@ -205,7 +205,7 @@ class LinkStats(Record, frozen=True):
     clock_source: str  # "timesync", "minimum" or "none"
 
 
-class Truth(Record, frozen=True):
+class Truth(Record, frozen=True, kw_only=True):
     """The simulator's own state (only in simulated flights)."""
 
     at_ns: int
@@ -218,7 +218,7 @@ class Truth(Record, frozen=True):
     mode: str
 
 
-class Header(Record, frozen=True):
+class Header(Record, frozen=True, kw_only=True):
     """First message of a recording: what is needed to decide alike."""
 
     started_ns: int
@@ -240,7 +240,7 @@ class Sink(Protocol):
         ...
 
 
-class Outgoing(Record, frozen=True):
+class Outgoing(Record, frozen=True, kw_only=True):
     """Bytes for a connection."""
 
     link: str

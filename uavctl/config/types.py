@@ -24,7 +24,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all sections."""
 
 
-class PlantConfig(Section, frozen=True):
+class PlantConfig(Section, frozen=True, kw_only=True):
     """The plant x(k+1) = A x + B u + E w, w ~ N(0, W); states are ordered axis by axis."""
 
     model: Annotated[
@@ -67,7 +67,7 @@ class PlantConfig(Section, frozen=True):
     ] = ()
 
 
-class SetsConfig(Section, frozen=True):
+class SetsConfig(Section, frozen=True, kw_only=True):
     """Admissible boxes X and U; `inf` leaves a side open."""
 
     state_lower: Annotated[Floats, Meta(description="lower limits of the states (n_x) [m, m/s, m/s²]")]
@@ -76,14 +76,14 @@ class SetsConfig(Section, frozen=True):
     input_upper: Annotated[Floats, Meta(description="upper limits of the inputs (n_u) [input units]")]
 
 
-class CostConfig(Section, frozen=True):
+class CostConfig(Section, frozen=True, kw_only=True):
     """Stage cost (3), diagonal weights."""
 
     state: Annotated[Floats, Meta(description="diagonal of Q_x (n_x)")]
     input: Annotated[Floats, Meta(description="diagonal of Q_u (n_u)")]
 
 
-class SmpcConfig(Section, frozen=True):
+class SmpcConfig(Section, frozen=True, kw_only=True):
     """The paper's scheme."""
 
     horizon: Annotated[int, Meta(ge=2, le=60, description="prediction horizon H [steps]")]
@@ -108,13 +108,13 @@ class SmpcConfig(Section, frozen=True):
     ] = 1e5
 
 
-class ScheduleConfig(Section, frozen=True):
+class ScheduleConfig(Section, frozen=True, kw_only=True):
     """Information delays d_t: what feedback may be counted on in stage t."""
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
         Meta(
-            description="`fixed`: as given; `search`: least mean cost over search_states; `greedy`: greedy reading of (7)"
+            description="`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"
         ),
     ] = "fixed"
     delays: Annotated[
@@ -124,7 +124,7 @@ class ScheduleConfig(Section, frozen=True):
     search_states: Annotated[Rows, Meta(description="states (n_x each) over whose mean cost `search` minimises")] = ()
 
 
-class RiskConfig(Section, frozen=True):
+class RiskConfig(Section, frozen=True, kw_only=True):
     """How a likelihood becomes back-offs."""
 
     allocation: Annotated[
@@ -133,7 +133,7 @@ class RiskConfig(Section, frozen=True):
     ] = "ellipsoid"
 
 
-class SolverConfig(Section, frozen=True):
+class SolverConfig(Section, frozen=True, kw_only=True):
     """The solver of the decision problem."""
 
     method: Annotated[
@@ -152,7 +152,7 @@ class SolverConfig(Section, frozen=True):
     ] = 100
 
 
-class LinkConfig(Section, frozen=True):
+class LinkConfig(Section, frozen=True, kw_only=True):
     """The radio link that carries positions: the design's assumption, and the simulator's channel."""
 
     loss: Annotated[
@@ -183,7 +183,7 @@ class LinkConfig(Section, frozen=True):
     ] = ()
 
 
-class TargetConfig(Section, frozen=True):
+class TargetConfig(Section, frozen=True, kw_only=True):
     """Where to fly to."""
 
     position_m: Annotated[
@@ -191,7 +191,7 @@ class TargetConfig(Section, frozen=True):
     ]
 
 
-class FrameConfig(Section, frozen=True):
+class FrameConfig(Section, frozen=True, kw_only=True):
     """Camera frame to local NED."""
 
     convention: Annotated[Literal["ned", "enu"], Meta(description="axes of the source's positions")] = "ned"
@@ -208,7 +208,7 @@ class FrameConfig(Section, frozen=True):
     ] = 0.0
 
 
-class EstimatorConfig(Section, frozen=True):
+class EstimatorConfig(Section, frozen=True, kw_only=True):
     """Kalman filter."""
 
     position_std_m: Annotated[float, Meta(gt=0, description="standard deviation of a position sample, each axis [m]")]
@@ -228,7 +228,7 @@ class EstimatorConfig(Section, frozen=True):
     ] = 100.0
 
 
-class FallbackConfig(Section, frozen=True):
+class FallbackConfig(Section, frozen=True, kw_only=True):
     """What takes over when the age of information reaches H."""
 
     brake_gain_1ps: Annotated[float, Meta(gt=0, description="deceleration per predicted speed while braking [1/s]")] = (
@@ -240,7 +240,7 @@ class FallbackConfig(Section, frozen=True):
     recover_samples: Annotated[int, Meta(ge=1, description="fresh samples in a row before plans are flown again")] = 3
 
 
-class LimitsConfig(Section, frozen=True):
+class LimitsConfig(Section, frozen=True, kw_only=True):
     """The last gate on a setpoint."""
 
     accel_mps2: Annotated[
@@ -249,7 +249,7 @@ class LimitsConfig(Section, frozen=True):
     slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
 
 
-class SourceConfig(Section, frozen=True):
+class SourceConfig(Section, frozen=True, kw_only=True):
     """Which messages count as external positions."""
 
     messages: Annotated[
@@ -269,7 +269,7 @@ class SourceConfig(Section, frozen=True):
     ] = 0
 
 
-class ClockConfig(Section, frozen=True):
+class ClockConfig(Section, frozen=True, kw_only=True):
     """The source's clock."""
 
     latency_s: Annotated[
@@ -279,7 +279,7 @@ class ClockConfig(Section, frozen=True):
     future_tolerance_s: Annotated[float, Meta(ge=0, description="a stamp further in the future is refused [s]")] = 0.02
 
 
-class DaemonConfig(Section, frozen=True):
+class DaemonConfig(Section, frozen=True, kw_only=True):
     """The control loop and its connections."""
 
     tick_s: Annotated[float, Meta(gt=0, le=0.1, description="time between setpoints; divides Δt [s]")]
@@ -293,7 +293,7 @@ class DaemonConfig(Section, frozen=True):
     )
 
 
-class CameraConfig(Section, frozen=True):
+class CameraConfig(Section, frozen=True, kw_only=True):
     """Simulated motion capture."""
 
     rate_hz: Annotated[float, Meta(gt=0, description="samples a second [1/s]")]
@@ -307,7 +307,7 @@ class CameraConfig(Section, frozen=True):
     ] = "vision"
 
 
-class SimConfig(Section, frozen=True):
+class SimConfig(Section, frozen=True, kw_only=True):
     """The simulated side of the wire."""
 
     camera: CameraConfig
@@ -327,7 +327,7 @@ class SimConfig(Section, frozen=True):
     ] = 1.0
 
 
-class LogConfig(Section, frozen=True):
+class LogConfig(Section, frozen=True, kw_only=True):
     """Recording."""
 
     chunk_bytes: Annotated[int, Meta(ge=1024, le=16384, description="largest chunk of the recording [bytes]")] = 16384
@@ -339,7 +339,7 @@ class LogConfig(Section, frozen=True):
     )
 
 
-class Config(Section, frozen=True):
+class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
     name: Annotated[str, Meta(description="name of the configuration")]
