@@ -1,5 +1,6 @@
 """Configuration: TOML in, typed and checked values out."""
 
+from uavctl.config.load import Loaded, Source, dump_config, explain, load, load_config, parse, presets
 from uavctl.config.types import Config
 
-__all__ = ["Config"]
+__all__ = ["Config", "Loaded", "Source", "dump_config", "explain", "load", "load_config", "parse", "presets"]

@@ -113,9 +113,7 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
-        Meta(
-            description="`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"
-        ),
+        Meta(description="`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"),
     ] = "fixed"
     delays: Annotated[
         int | tuple[int, ...], Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]")

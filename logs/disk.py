@@ -1,0 +1,94 @@
+"""The disk under a recording: files that keep what they were given, names of segments, free space."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Protocol
+
+from uavctl.errors import RecordingError
+
+
+class OutputFile(Protocol):
+    """What a segment asks of a file; every method may raise OSError."""
+
+    def write(self, data: bytes) -> None:
+        """Hand all of `data` to the operating system."""
+        ...
+
+    def truncate(self, size: int) -> None:
+        """Cut the file to `size` bytes and go on writing there."""
+        ...
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+
+class DiskFile:
+    """A new file without a buffer of its own: what `write` took survives the end of the process.
+
+    Raises:
+        FileExistsError: a recording never overwrites.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+
+    def write(self, data: bytes) -> None:
+        """Hand all of `data` to the operating system."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(self._fd, rest) :]
+
+    def truncate(self, size: int) -> None:
+        """Cut the file to `size` bytes and go on writing there."""
+        os.ftruncate(self._fd, size)
+        os.lseek(self._fd, size, os.SEEK_SET)
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._fd)
+
+
+def segment_path(path: Path, segment: int) -> Path:
+    """File of a recording's segment; the first is the recording's own name."""
+    return path if segment == 1 else path.with_name(f"{path.stem}-{segment}{path.suffix}")
+
+
+def later_segments(path: Path) -> tuple[Path, ...]:
+    """Existing files named as later segments of the recording `path`, in order."""
+    pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
+    found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
+    return tuple(found[number] for number in sorted(found))
+
+
+def check_room(path: Path, free_bytes: int) -> int:
+    """Free space for the recording `path` [bytes].
+
+    Raises:
+        RecordingError: less than `free_bytes`, or the folder cannot be made or written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(path.parent).free
+    except OSError as error:
+        raise RecordingError(f"{path.parent}: no room for a recording ({error}); choose another folder") from error
+    if not os.access(path.parent, os.W_OK):
+        raise RecordingError(f"{path.parent}: not writable; choose another folder for the recording")
+    if free < free_bytes:
+        raise RecordingError(
+            f"{path.parent}: {free} bytes free, log.free_bytes asks for {free_bytes}; "
+            "make room, choose another folder, or lower log.free_bytes"
+        )
+    return free

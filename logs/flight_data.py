@@ -1,0 +1,203 @@
+"""A flight in memory: its records by type, and the arrays that summary and report are made from."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from logs.design_view import DesignView, Floats, design_view
+from uavctl.data import (
+    ControlMode,
+    Decision,
+    Estimate,
+    Event,
+    Header,
+    LinkStats,
+    Plan,
+    PositionSample,
+    Record,
+    Setpoint,
+    SolveStatus,
+    StepInput,
+    Timing,
+    Truth,
+    VehicleStatus,
+)
+from uavctl.errors import RecordingError
+
+R = TypeVar("R", bound=Record)
+
+FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
+FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
+
+
+@dataclass(frozen=True, eq=False)
+class FlightData:
+    """All records of a flight, by type, in the order in which they were written."""
+
+    header: Header
+    design: DesignView
+    step_inputs: tuple[StepInput, ...]
+    estimates: tuple[Estimate, ...]
+    plans: tuple[Plan, ...]
+    decisions: tuple[Decision, ...]
+    setpoints: tuple[Setpoint, ...]
+    vehicles: tuple[VehicleStatus, ...]
+    events: tuple[Event, ...]
+    timings: tuple[Timing, ...]
+    links: tuple[LinkStats, ...]
+    truths: tuple[Truth, ...]
+
+    @classmethod
+    def from_records(cls, records: Iterable[tuple[str, int, Record]]) -> Self:
+        """Sort (topic, log_time_ns, record) by record type; types that nobody reads here are left out.
+
+        Raises:
+            RecordingError: no header, no decision, or a design without the keys of `DesignView`.
+        """
+        found: defaultdict[type[Record], list[Record]] = defaultdict(list)
+        for _, _, record in records:
+            found[type(record)].append(record)
+
+        def take(kind: type[R]) -> tuple[R, ...]:
+            return tuple(record for record in found[kind] if isinstance(record, kind))
+
+        headers, decisions = take(Header), take(Decision)
+        if not headers:
+            raise RecordingError("the recording has no header; it is empty, or not one of uavctl")
+        if not decisions:
+            raise RecordingError("the recording has no decision: nothing was flown, so there is nothing to report")
+        return cls(
+            header=headers[0],
+            design=design_view(headers[0]),
+            step_inputs=take(StepInput),
+            estimates=take(Estimate),
+            plans=take(Plan),
+            decisions=decisions,
+            setpoints=take(Setpoint),
+            vehicles=take(VehicleStatus),
+            events=take(Event),
+            timings=take(Timing),
+            links=take(LinkStats),
+            truths=take(Truth),
+        )
+
+    @property
+    def origin_ns(self) -> int:
+        """Time of the first tick: the zero of every time axis."""
+        return self.decisions[0].at_ns
+
+    @property
+    def samples(self) -> tuple[PositionSample, ...]:
+        """Every position that reached a tick, also those that it refused."""
+        return tuple(sample for one in self.step_inputs for sample in one.samples)
+
+    @cached_property
+    def tick_ns(self) -> int:
+        """Time between two ticks; 0 when there was only one."""
+        first, last = self.decisions[0], self.decisions[-1]
+        return (last.at_ns - first.at_ns) // max(1, last.tick - first.tick)
+
+    @cached_property
+    def duration_s(self) -> float:
+        """From the first tick to the end of the last one [s]."""
+        return (self.decisions[-1].at_ns - self.origin_ns + self.tick_ns) * 1e-9
+
+    @cached_property
+    def flown_plans(self) -> dict[int, Plan]:
+        """Plans that were flown, by their number."""
+        seqs = {decision.plan_seq for decision in self.decisions}
+        return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
+
+    @cached_property
+    def steps(self) -> Steps:
+        """The flown Δt boundaries."""
+        return Steps.of(self)
+
+    def seconds(self, at_ns: Sequence[int]) -> Floats:
+        """Times on the report's axis (n,) [s]."""
+        return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
+
+    def spans(self, modes: Collection[ControlMode]) -> list[tuple[float, float]]:
+        """Spans of time [s] in which the mode was one of `modes`."""
+        spans: list[tuple[float, float]] = []
+        begun: int | None = None
+        for decision in self.decisions:
+            if decision.mode in modes and begun is None:
+                begun = decision.at_ns
+            elif decision.mode not in modes and begun is not None:
+                spans.append((self._second(begun), self._second(decision.at_ns)))
+                begun = None
+        if begun is not None:
+            spans.append((self._second(begun), self.duration_s))
+        return spans
+
+    def lost_at_s(self) -> Floats:
+        """When the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
+        times = [b.at_ns for a, b in pairwise(self.truths) for _ in range(b.lost - a.lost)]
+        return self.seconds(times)
+
+    def _second(self, at_ns: int) -> float:
+        return (at_ns - self.origin_ns) * 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """One row for each Δt boundary at which the controller flew (TRACK, BRAKE or HOLD)."""
+
+    decisions: tuple[Decision, ...]
+    t_s: Floats  # (n,)
+    state: Floats  # (n, n_x), the true one if known, else the estimate
+    input: Floats  # (n, n_u), applied during the step; NaN if unknown
+    from_truth: bool
+
+    def __len__(self) -> int:
+        return len(self.decisions)
+
+    @classmethod
+    def of(cls, flight: FlightData) -> Self:
+        """Collect the flown boundaries of a flight."""
+        decisions = tuple(d for d in flight.decisions if d.boundary and d.mode in FLOWN)
+        at_ns = np.array([d.at_ns for d in decisions], dtype=np.int64)
+        n_x, n_u = len(flight.design.target), len(flight.design.q_u)
+        known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
+        states = np.array([one.state if isinstance(one, Truth) else one.mean for one in known]).reshape(-1, n_x)
+        decided = np.array([d.input or (np.nan,) * n_u for d in decisions]).reshape(-1, n_u)
+        applied = _applied(flight, at_ns) if flight.truths else decided
+        near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
+        state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
+        return cls(decisions, flight.seconds(at_ns.tolist()), state, applied, bool(flight.truths))
+
+    @property
+    def decided(self) -> Floats:
+        """Inputs as decided (n, n_u), before the wire; NaN where there was none."""
+        width = self.input.shape[1]
+        return np.array([d.input or (np.nan,) * width for d in self.decisions]).reshape(-1, width)
+
+
+def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of the known time nearest to each wanted one (0 when nothing is known)."""
+    right = np.clip(np.searchsorted(known, wanted), 0, max(0, len(known) - 1))
+    left = np.maximum(right - 1, 0)
+    if not len(known):
+        return right
+    return np.where(np.abs(known[left] - wanted) < np.abs(known[right] - wanted), left, right)
+
+
+def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
+    """Input of the plant in each step (n, n_u).
+
+    The setpoint reaches the vehicle shortly after the boundary, so the last truth within the step
+    tells what was applied; the one at the boundary may still show the step before.
+    """
+    known = np.array([truth.at_ns for truth in flight.truths], dtype=np.int64)
+    inside = np.searchsorted(known, at_ns + flight.design.dt_ns) - 1
+    index = np.where(known[inside] > at_ns, inside, _nearest(known, at_ns))
+    return np.array([truth.input for truth in flight.truths])[index].reshape(len(at_ns), -1)

@@ -1,0 +1,250 @@
+"""One MCAP file of a recording, written a chunk at a time.
+
+Every chunk is one write of the operating system, so that a process killed between two of them
+leaves whole chunks only. Every chunk repeats the channels that it uses, so that it can be read when
+any other is damaged, and is stored uncompressed: its CRC-32 then catches each flipped byte for
+certain, and the writer's thread takes no time for packing from the control loop.
+
+The records are those of `mcap.records`. `mcap.writer.Writer` is not used: it names a channel in one
+chunk only, lets a chunk grow past its size by a message, and counts a chunk that failed to reach
+the disk into the checksum of the file, which could then not be closed.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import version
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, McapRecord, Schema, Statistics
+from mcap.records import SummaryOffset as Group
+
+from logs.disk import OutputFile
+from logs.topics import Definition
+
+MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_MESSAGE_FIELDS = 22  # bytes of a message record besides its data
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+_FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A message on its way to the disk."""
+
+    definition: Definition
+    sequence: int
+    at_ns: int
+    data: bytes
+
+
+class Segment:
+    """Writer of one MCAP file.
+
+    Args:
+        file: an empty file.
+        chunk_bytes: largest chunk [bytes]; only a single larger message makes a larger chunk.
+    """
+
+    def __init__(self, file: OutputFile, chunk_bytes: int) -> None:
+        self._file = file
+        self._chunk_bytes = chunk_bytes
+        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._counts: Counter[int] = Counter()
+        self._crc = 0
+        self._begin_chunk()
+        self.open_entries: list[Entry] = []  # not on the disk yet
+        self.messages = 0  # on the disk
+        self.bytes = 0  # on the disk
+
+    def add(self, entry: Entry) -> None:
+        """Take a message; writes the open chunk first if it would grow too large.
+
+        Raises:
+            OSError: the chunk could not be written; its messages and this one are in `open_entries`.
+        """
+        head = self._channel_records(entry.definition)
+        size = len(head) + _MESSAGE.size + len(entry.data)
+        full = self.open_entries and self._size + size > self._chunk_bytes
+        self.open_entries.append(entry)
+        if full:
+            self._commit(self.open_entries[:-1])
+            self.open_entries = [entry]
+            head = head or self._channel_records(entry.definition)
+        self._put(entry, head)
+
+    def commit(self) -> None:
+        """Write the open chunk, if there is anything in it.
+
+        Raises:
+            OSError: it could not be written; the file holds what it held before, or part of a chunk.
+        """
+        if self.open_entries:
+            self._commit(self.open_entries)
+            self.open_entries = []
+
+    def sync(self) -> None:
+        """Write the open chunk and wait for the disk."""
+        self.commit()
+        self._file.sync()
+
+    def finish(self) -> None:
+        """Write the open chunk, the index and the footer, and close the file."""
+        self.commit()
+        self._file.write(self._tail())
+        self._file.close()
+
+    def abandon(self) -> None:
+        """After a failed write: cut off what it left behind, add index and footer if there is room, close.
+
+        Raises:
+            OSError: not all of it could be done; the chunks written before are readable all the same.
+        """
+        try:
+            self._file.truncate(self.bytes)
+            try:
+                self._file.write(self._tail())
+            except OSError:
+                self._file.truncate(self.bytes)
+                raise
+        finally:
+            self._file.close()
+
+    def _begin_chunk(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
+
+    def _channel_records(self, definition: Definition) -> bytes:
+        """What the open chunk must hold before a message of this topic."""
+        channel = self._channels.get(definition.topic)
+        if channel is not None and channel.id in self._indexes:
+            return b""
+        schema = self._schemas.get(definition.schema_name)
+        new_schema = schema is None and definition.schema_encoding != ""
+        if new_schema:
+            schema = Schema(
+                id=len(self._schemas) + 1,
+                name=definition.schema_name,
+                encoding=definition.schema_encoding,
+                data=definition.schema,
+            )
+            self._schemas[definition.schema_name] = schema
+        if channel is None:
+            channel = Channel(
+                id=len(self._channels) + 1,
+                topic=definition.topic,
+                message_encoding=definition.encoding,
+                schema_id=0 if schema is None else schema.id,
+                metadata={},
+            )
+            self._channels[definition.topic] = channel
+        return _bytes(schema, channel) if schema is not None and new_schema else _bytes(channel)
+
+    def _put(self, entry: Entry, head: bytes) -> None:
+        channel_id = self._channels[entry.definition.topic].id
+        index = self._indexes.setdefault(channel_id, [])
+        index += (entry.at_ns, self._size + len(head))
+        length = _MESSAGE_FIELDS + len(entry.data)
+        fields = _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, entry.sequence, entry.at_ns, entry.at_ns)
+        self._parts += (head, fields, entry.data)
+        self._size += len(head) + len(fields) + len(entry.data)
+
+    def _commit(self, entries: list[Entry]) -> None:
+        content = b"".join(self._parts)
+        first, last = min(one.at_ns for one in entries), max(one.at_ns for one in entries)
+        chunk = _bytes(
+            Chunk(
+                compression="",
+                data=content,
+                message_start_time=first,
+                message_end_time=last,
+                uncompressed_crc=zlib.crc32(content),
+                uncompressed_size=len(content),
+            )
+        )
+        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        start = self.bytes + len(prefix)
+        offsets, at = {}, start + len(chunk)
+        indexes = []
+        for channel_id, flat in self._indexes.items():
+            offsets[channel_id] = at
+            indexes.append(
+                _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
+                + struct.pack(f"<{len(flat)}Q", *flat)
+            )
+            at += len(indexes[-1])
+        block = b"".join([prefix, chunk, *indexes])
+        self._file.write(block)
+        self._crc = zlib.crc32(block, self._crc)
+        self.bytes += len(block)
+        self._chunk_indexes.append(
+            ChunkIndex(
+                chunk_start_offset=start,
+                chunk_length=len(chunk),
+                compression="",
+                compressed_size=len(content),
+                uncompressed_size=len(content),
+                message_start_time=first,
+                message_end_time=last,
+                message_index_offsets=offsets,
+                message_index_length=at - start - len(chunk),
+            )
+        )
+        self.messages += len(entries)
+        self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
+        self._begin_chunk()
+
+    def _tail(self) -> bytes:
+        """End of the data, summary, footer."""
+        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
+        start = self.bytes + len(data_end)
+        groups: tuple[tuple[Opcode, list[McapRecord]], ...] = (
+            (Opcode.SCHEMA, [*self._schemas.values()]),
+            (Opcode.CHANNEL, [*self._channels.values()]),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, [*self._chunk_indexes]),
+        )
+        summary, offsets = b"", b""
+        for opcode, records in groups:
+            data = _bytes(*records)
+            if data:
+                offsets += _bytes(Group(group_opcode=opcode, group_start=start + len(summary), group_length=len(data)))
+            summary += data
+        offset_start = start + len(summary)
+        crc = zlib.crc32(summary + offsets + _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start))
+        footer = _bytes(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
+        return data_end + summary + offsets + footer + MAGIC
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunk_indexes),
+            message_count=self.messages,
+            message_start_time=min((one.message_start_time for one in self._chunk_indexes), default=0),
+            message_end_time=max((one.message_end_time for one in self._chunk_indexes), default=0),
+            metadata_count=0,
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]  # not annotated in mcap
+    return data
+
+
+def _library() -> str:
+    return f"uavctl mcap-records-{version('mcap')}"

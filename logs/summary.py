@@ -1,0 +1,224 @@
+"""What a flight came to: the figures that people and scripts look at."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+from rich.table import Table
+
+from logs.design_view import Floats
+from logs.flight_data import FALLBACK, FLOWN, FlightData
+from uavctl.data import ControlMode, Matrix, SolveStatus, Vector
+
+RELATIVE_TOLERANCE = 1e-9
+# MAVLink carries setpoints as 32-bit floats: an input at its limit may come out one rounding beyond.
+WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
+SLACK_TOLERANCE = 1e-6
+SETTLED_SHARE = 0.25
+
+
+class Spread(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles of a duration [µs]; None when nothing was measured."""
+
+    p50: float | None = None
+    p99: float | None = None
+    max: float | None = None
+
+
+class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one flight; the field names are the keys of `--json`.
+
+    A step is flown when the controller is in charge at its Δt boundary (tracking, braking or
+    holding); waiting, the vehicle's own landing and the time after the hand-over do not count.
+    """
+
+    steps: int  # flown Δt boundaries
+    duration_s: float  # first tick to the end of the last
+    received: int  # positions: sent - lost when simulated, else samples accepted
+    lost: int | None  # positions that the simulated channel lost; None for a real flight
+    max_age: int  # largest age of information at a flown boundary [steps]
+    fallbacks: int  # entries into braking, holding or landing
+    state_violations: int  # flown boundaries with the state outside its set
+    input_violations: int  # flown boundaries with the input outside its set
+    slack_used: int  # flown plans in which a constraint or the terminal equality gave way
+    cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru
+    recording: str | None
+    report: str | None
+    wall_s: float
+    decision_us: Spread  # time in the core, ticks with a solve (all ticks if there was none)
+    tick_lateness_us: Spread
+    state_source: str  # "truth", or "estimate" when the true state is unknown
+    real_time_factor: float | None  # duration_s / wall_s
+    accepted: int  # samples that the estimator took
+    rejected: int  # samples that it refused
+    solves: int
+    failed_solves: int  # ended otherwise than optimal
+    missed_ticks: int
+    max_age_s: float  # largest age of the newest sample at a flown tick
+    settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
+    final_error_m: float | None  # distance from the target at the last flown boundary
+    recorder_dropped: int  # records that the disk was too slow for
+
+
+def summarise(
+    flight: FlightData,
+    *,
+    wall_s: float,
+    recording: str | None = None,
+    report: str | None = None,
+    recorder_dropped: int = 0,
+) -> FlightSummary:
+    """Figures of a flight; `recording` and `report` are paths as the user should see them."""
+    steps = flight.steps
+    flown = [d for d in flight.decisions if d.mode in FLOWN]
+    flown_ns = {d.at_ns for d in flown}
+    accepted = sum(d.accepted for d in flight.decisions)
+    last = flight.truths[-1] if flight.truths else None
+    solves = [d.solve for d in flight.decisions if d.solve is not None]
+    error_m = position_error_m(flight)
+    settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
+    return FlightSummary(
+        steps=len(steps),
+        duration_s=round(flight.duration_s, 9),
+        received=accepted if last is None else last.sent - last.lost,
+        lost=None if last is None else last.lost,
+        max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
+        fallbacks=_fallback_entries([d.mode for d in flight.decisions]),
+        state_violations=int(np.count_nonzero(state_outside(flight))),
+        input_violations=int(np.count_nonzero(input_outside(flight))),
+        slack_used=sum(
+            plan.slack > SLACK_TOLERANCE or plan.terminal_miss > SLACK_TOLERANCE for plan in flight.flown_plans.values()
+        ),
+        cost=_cost(flight),
+        recording=recording,
+        report=report,
+        wall_s=wall_s,
+        decision_us=spread(decision_times_us(flight)),
+        tick_lateness_us=spread(np.array([timing.lateness_ns for timing in flight.timings]) * 1e-3),
+        state_source="truth" if steps.from_truth else "estimate",
+        real_time_factor=flight.duration_s / wall_s if wall_s > 0 else None,
+        accepted=accepted,
+        rejected=sum(d.rejected for d in flight.decisions),
+        solves=len(solves),
+        failed_solves=sum(status is not SolveStatus.OPTIMAL for status in solves),
+        missed_ticks=sum(d.missed_ticks for d in flight.decisions),
+        max_age_s=max((e.age_s for e in flight.estimates if e.at_ns in flown_ns), default=0.0),
+        settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
+        final_error_m=float(error_m[-1]) if len(error_m) else None,
+        recorder_dropped=recorder_dropped,
+    )
+
+
+def position_error_m(flight: FlightData) -> Floats:
+    """Distance from the target at each flown boundary (n,) [m]."""
+    index = list(flight.design.position_index)
+    target = np.array(flight.design.target)[index]
+    return np.asarray(np.linalg.norm(flight.steps.state[:, index] - target, axis=1))
+
+
+def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which flown boundaries have the state outside its set (n,); a state that is no number is outside."""
+    return _outside(flight.steps.state, flight.design.c_x, flight.design.b_x, RELATIVE_TOLERANCE)
+
+
+def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which flown boundaries have the input, as decided or as applied, outside its set (n,)."""
+    design, steps = flight.design, flight.steps
+    given = ~np.isnan(steps.decided).any(axis=1)
+    outside = given & _outside(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
+    if steps.from_truth:
+        outside |= _outside(steps.input, design.c_u, design.b_u, WIRE_TOLERANCE)
+    return outside
+
+
+def decision_times_us(flight: FlightData) -> Floats:
+    """Time in the core (n,) [µs] of the ticks that solved; of all ticks if none did."""
+    solved = {d.tick for d in flight.decisions if d.solve is not None}
+    times = [timing.step_ns for timing in flight.timings if timing.tick in solved]
+    return np.array(times or [timing.step_ns for timing in flight.timings]) * 1e-3
+
+
+def spread(values_us: Floats) -> Spread:
+    """Median, 99th percentile and maximum."""
+    if not len(values_us):
+        return Spread()
+    p50, p99 = np.percentile(values_us, [50, 99])
+    return Spread(p50=float(p50), p99=float(p99), max=float(values_us.max()))
+
+
+def render(summary: FlightSummary) -> Table:
+    """The summary as a table for a terminal."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in rows(summary):
+        table.add_row(name, value)
+    return table
+
+
+def rows(summary: FlightSummary) -> list[tuple[str, str]]:
+    """The summary as (name, value) for people."""
+    s = summary
+    lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
+    seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
+    speed = "" if s.real_time_factor is None else f" ({s.real_time_factor:.3g} × real time)"
+    found = [
+        ("Flown", f"{s.steps} steps; {s.duration_s:.4g} s in {s.wall_s:.4g} s{speed}"),
+        ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
+        ("Largest age", f"{s.max_age} steps ({s.max_age_s:.3g} s)"),
+        ("Fallbacks", str(s.fallbacks)),
+        ("State outside limits", f"{s.state_violations} steps{_share(s.state_violations, s.steps)}{seen}"),
+        ("Input outside limits", f"{s.input_violations} steps{_share(s.input_violations, s.steps)}"),
+        ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
+        ("Cost", f"{s.cost:.6g}{seen}"),
+        ("Distance from target", _distance(s)),
+        ("Decision time", _times(s.decision_us)),
+        ("Tick lateness", f"{_times(s.tick_lateness_us)}; {s.missed_ticks} ticks missed"),
+    ]
+    if s.recorder_dropped:
+        found.append(("Recording", f"{s.recorder_dropped} records dropped: the disk was too slow"))
+    found += [(name, path) for name, path in (("Recorded in", s.recording), ("Report", s.report)) if path]
+    return found
+
+
+def _distance(s: FlightSummary) -> str:
+    if s.final_error_m is None or s.settled_error_m is None:
+        return "not flown"
+    return f"{s.final_error_m:.3g} m at the end; {s.settled_error_m:.3g} m over the last quarter (rms)"
+
+
+def _share(part: int, whole: int) -> str:
+    return f" ({100 * part / whole:.3g} %)" if part and whole else ""
+
+
+def _times(times: Spread) -> str:
+    if times.p50 is None or times.p99 is None or times.max is None:
+        return "not measured"
+    return f"median {duration(times.p50)}, 99 % {duration(times.p99)}, largest {duration(times.max)}"
+
+
+def duration(value_us: float) -> str:
+    """A duration [µs] with a unit that suits it."""
+    return f"{value_us:.3g} µs" if value_us < 1000 else f"{value_us / 1000:.3g} ms"
+
+
+def _fallback_entries(modes: list[ControlMode]) -> int:
+    entered = sum(b in FALLBACK and a not in FALLBACK for a, b in pairwise(modes))
+    return entered + (modes[0] in FALLBACK)
+
+
+def _outside(values: Floats, c: Matrix, b: Vector, tolerance: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Rows of `values` (n, m) outside {v | c v <= b}, beyond a tolerance relative to the limit."""
+    normals = np.array(c).reshape(-1, values.shape[1])
+    limit = np.array(b)
+    return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
+
+
+def _cost(flight: FlightData) -> float:
+    """Closed-loop cost (3), summed over the flown boundaries."""
+    design, steps = flight.design, flight.steps
+    x = steps.state - np.array(design.target)
+    u = steps.input
+    return float(np.sum((x @ np.array(design.q_x)) * x) + np.sum((u @ np.array(design.q_u)) * u))

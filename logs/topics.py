@@ -1,0 +1,182 @@
+"""The topics of a recording: one row each.
+
+Raw MAVLink bytes have one topic a connection and direction; everything else is one record type,
+written as JSON with its JSON Schema.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import cast
+
+import msgspec
+
+from uavctl.data import (
+    Datagram,
+    Decision,
+    Estimate,
+    Event,
+    Header,
+    LinkStats,
+    Plan,
+    Record,
+    Setpoint,
+    StepInput,
+    Timing,
+    Truth,
+    VehicleStatus,
+)
+
+HEADER = "/uavctl/header"
+RECORDER = "/uavctl/recorder"
+
+
+class RecorderNote(Record, frozen=True, kw_only=True):
+    """What the recorder says of itself: at the start of a segment, after drops, and at the end."""
+
+    at_ns: int
+    segment: int  # 1 is the first file
+    written: int  # records in the segments so far
+    dropped: int  # records so far that found the queue full
+    refused: int  # records so far that could not be encoded
+    failures: int  # failed writes so far
+    text: str
+
+
+@dataclass(frozen=True)
+class Definition:
+    """How a topic is written: message encoding, and a schema unless the bytes speak for themselves."""
+
+    topic: str
+    encoding: str
+    schema_name: str = ""
+    schema_encoding: str = ""
+    schema: bytes = b""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of JSON records of one type."""
+
+    name: str
+    record: type[Record]
+    text: str
+
+    @cached_property
+    def definition(self) -> Definition:
+        """Encoding and JSON Schema; the schema's top level is the object itself, as viewers want it."""
+        return Definition(
+            topic=self.name,
+            encoding="json",
+            schema_name=f"uavctl.{self.record.__name__}",
+            schema_encoding="jsonschema",
+            schema=msgspec.json.encode(_schema(self.record)),
+        )
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic(HEADER, Header, "configuration, design, seed, versions; first message of every segment"),
+    Topic("/uavctl/step_input", StepInput, "all that a tick knew; replay starts from here"),
+    Topic("/uavctl/estimate", Estimate, "state estimate of a tick"),
+    Topic("/uavctl/plan", Plan, "answer of the predictive controller, when one was made"),
+    Topic("/uavctl/decision", Decision, "what a tick chose, and why"),
+    Topic("/uavctl/setpoint", Setpoint, "acceleration setpoint after the last gate"),
+    Topic("/uavctl/vehicle", VehicleStatus, "the vehicle's mode and state, as it tells"),
+    Topic("/uavctl/event", Event, "something worth telling a person"),
+    Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
+    Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
+    Topic("/sim/truth", Truth, "the simulator's own state, in simulated flights"),
+    Topic(RECORDER, RecorderNote, "the recorder's own account: segments, drops, failed writes"),
+)
+_BY_NAME = {topic.name: topic for topic in TOPICS}
+_RAW = re.compile(r"/raw/([^/]+)/(in|out)")
+_RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
+
+
+def raw_topic(link: str, *, outgoing: bool) -> str:
+    """Topic of a connection's raw bytes in one direction."""
+    return f"/raw/{link}/{'out' if outgoing else 'in'}"
+
+
+def raw_link(topic: str) -> tuple[str, bool] | None:
+    """Connection name and whether outgoing, of a raw topic; None for any other topic."""
+    match = _RAW.fullmatch(topic)
+    return None if match is None else (match[1], match[2] == "out")
+
+
+def record_type(topic: str) -> type[Record]:
+    """Record type of a topic.
+
+    Raises:
+        KeyError: there is no such topic.
+    """
+    return Datagram if raw_link(topic) is not None else _BY_NAME[topic].record
+
+
+def definition(topic: str) -> Definition:
+    """How a topic is written.
+
+    Raises:
+        KeyError: there is no such topic.
+    """
+    if raw_link(topic) is not None:
+        return Definition(topic=topic, encoding="mavlink")
+    return _BY_NAME[topic].definition
+
+
+def topics_page() -> str:
+    """The page docs/topics.md, made from the rows."""
+    lines = [
+        "# Topics of a recording",
+        "",
+        "MCAP, log times in nanoseconds of the recorder's monotonic clock. Numbers are written with the digits",
+        'that give the same float back; NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`;',
+        "`null` is only ever a missing value.",
+        "",
+        "| topic | record | encoding | what it is |",
+        "|---|---|---|---|",
+        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | mavlink | {_RAW_TEXT} |",
+        *(f"| `{topic.name}` | `{topic.record.__name__}` | json | {topic.text} |" for topic in TOPICS),
+        "",
+    ]
+    for topic in TOPICS:
+        lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
+        properties = cast("dict[str, dict[str, object]]", _schema(topic.record)["properties"])
+        lines += [f"| `{name}` | {_type_text(schema)} |" for name, schema in properties.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _schema(record: type[Record]) -> dict[str, object]:
+    (reference,), parts = msgspec.json.schema_components([record], schema_hook=_anything, ref_template="#/$defs/{name}")
+    name = cast("str", reference["$ref"]).rpartition("/")[2]
+    top: dict[str, object] = parts.pop(name)
+    return {**top, "$defs": parts} if parts else top
+
+
+def _anything(kind: type) -> dict[str, object]:
+    """Schema of a value of any type, which msgspec cannot make itself."""
+    if kind is object:
+        return {"description": "any JSON value"}
+    raise NotImplementedError(kind)
+
+
+def _type_text(schema: dict[str, object]) -> str:
+    """One field's type in words."""
+    if "$ref" in schema:
+        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`"
+    if "anyOf" in schema:
+        return " or ".join(_type_text(one) for one in cast("list[dict[str, object]]", schema["anyOf"]))
+    kind = cast("str", schema.get("type", "any"))
+    if kind == "array":
+        return f"array of {_type_text(_items(schema))}"
+    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
+        return f"object of {_type_text(cast('dict[str, object]', schema['additionalProperties']))}"
+    return kind
+
+
+def _items(schema: dict[str, object]) -> dict[str, object]:
+    fixed = cast("list[dict[str, object]]", schema.get("prefixItems", []))
+    return fixed[0] if fixed else cast("dict[str, object]", schema["items"])

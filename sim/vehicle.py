@@ -1,0 +1,234 @@
+"""The simulated vehicle's motion: the linear plant, advanced exactly in continuous time.
+
+Built from the configuration by the simulator's own code, not by the controller's plant, so that
+a mistake in one of them shows as a disagreement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm, logm
+
+from uavctl.config.types import Config, PlantConfig
+from uavctl.data import Vec3
+from uavctl.errors import DesignError
+
+Array = NDArray[np.float64]
+
+NED_AXES = ("north", "east", "down")
+# A setpoint beyond ten g is no acceleration that a multicopter can try; it is limited there, and
+# the numbers stay finite whatever a client sends.
+MAX_ACCEL_MPS2 = 100.0
+# Closeness of expm(logm(M)) to M that proves the continuous-time model, relative to |M|.
+LOGARITHM_TOLERANCE = 1e-9
+# Sub-steps kept at hand; a lockstep run needs fewer than ten, a run on sockets any number.
+CACHED_TRANSITIONS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """x(k+1) = A x + B u + E w, w ~ N(0, W), with the generator of its continuous-time flow.
+
+    Attributes:
+        a: A (n_x, n_x).
+        b: B (n_x, n_u).
+        e: E (n_x, n_w).
+        w_root: symmetric square root of W (n_w, n_w).
+        flow: G (n, n), n = n_x + n_u + n_w, with expm(G Δt) = [[A, B, E], [0, I]] [1/s].
+        dt_ns: Δt [ns].
+        axes: index in NED of each plant axis.
+        position_index: state index of each axis' position.
+        velocity_index: state index of each axis' velocity.
+        accel_per_input: (n_u,) acceleration setpoint per unit of input.
+    """
+
+    a: Array
+    b: Array
+    e: Array
+    w_root: Array
+    flow: Array
+    dt_ns: int
+    axes: tuple[int, ...]
+    position_index: tuple[int, ...]
+    velocity_index: tuple[int, ...]
+    accel_per_input: Array
+
+    def transition(self, duration_ns: int) -> tuple[Array, Array, Array]:
+        """A, B, E of a step of `duration_ns` with u and w held; those of the plant for Δt itself."""
+        if duration_ns == self.dt_ns:
+            return self.a, self.b, self.e
+        return _split(expm(self.flow * (duration_ns * 1e-9)), *self.b.shape)
+
+
+def _split(m: Array, n_x: int, n_u: int) -> tuple[Array, Array, Array]:
+    return m[:n_x, :n_x], m[:n_x, n_x : n_x + n_u], m[:n_x, n_x + n_u :]
+
+
+def linear_model(plant: PlantConfig) -> LinearModel:
+    """Build the model of either kind from its configuration.
+
+    Raises:
+        DesignError: the matrices have no real logarithm, so there is no motion between the steps.
+    """
+    if plant.model == "matrices":
+        a, b, e = (np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e))
+        w = np.array(plant.w, dtype=np.float64)
+        flow = _generator(a, b, e, plant.dt_s)
+        position, velocity, gain = plant.position_index, plant.velocity_index, plant.accel_per_input
+    else:
+        n = len(plant.axes)
+        flow = _drag_lag_flow(plant)
+        a, b, e = _split(expm(flow * plant.dt_s), 3 * n, n)
+        w = np.diag(np.square(plant.wind_std_mps2))
+        position, velocity, gain = tuple(range(0, 3 * n, 3)), tuple(range(1, 3 * n, 3)), (1.0,) * n
+    eigenvalues, vectors = np.linalg.eigh(w)
+    return LinearModel(
+        a=a,
+        b=b,
+        e=e,
+        w_root=(vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T,
+        flow=flow,
+        dt_ns=round(plant.dt_s * 1e9),
+        axes=tuple(NED_AXES.index(axis) for axis in plant.axes),
+        position_index=position,
+        velocity_index=velocity,
+        accel_per_input=np.array(gain, dtype=np.float64),
+    )
+
+
+def _drag_lag_flow(plant: PlantConfig) -> Array:
+    """Continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a, each axis."""
+    n = len(plant.axes)
+    axis = [[[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]] for c, lag in zip(plant.drag_1ps, plant.lag_s)]
+    flow = np.zeros((5 * n, 5 * n))
+    flow[: 3 * n, : 3 * n] = block_diag(*axis)
+    for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s)):
+        flow[3 * i + 2, 3 * n + i] = gain / lag
+        flow[3 * i + 1, 4 * n + i] = 1.0
+    return flow
+
+
+def _generator(a: Array, b: Array, e: Array, dt_s: float) -> Array:
+    """Matrix logarithm of [[A, B, E], [0, I]] over Δt."""
+    n_x, held = a.shape[0], b.shape[1] + e.shape[1]
+    m = np.block([[a, b, e], [np.zeros((held, n_x)), np.eye(held)]])
+    if np.linalg.matrix_rank(a) == n_x:
+        logarithm = np.asarray(logm(m))
+        real = np.ascontiguousarray(logarithm.real, dtype=np.float64)
+        if np.abs(expm(real) - m).max() <= LOGARITHM_TOLERANCE * np.abs(m).max():
+            return real / dt_s
+    raise DesignError(
+        "plant.a",
+        "has no real matrix logarithm, so the simulated vehicle has no motion within a step",
+        "use a plant whose A comes from a continuous-time model (no eigenvalue at or below 0)",
+    )
+
+
+class Vehicle:
+    """State of the plant at one moment, moved forward by `advance`.
+
+    w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
+    changed. Axes that the plant has not stay at their start position.
+    """
+
+    def __init__(self, config: Config, seed: np.random.SeedSequence, start_ns: int) -> None:
+        self.model = linear_model(config.plant)
+        self._rng = np.random.default_rng(seed)
+        self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
+        self._offset_m = config.sim.start_position_m
+        x = np.zeros(self.model.a.shape[0])
+        for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index):
+            x[p] = config.sim.start_position_m[axis]
+            x[v] = config.sim.start_velocity_mps[axis]
+        self._anchor_x: Array = x  # state at the last change of u or w
+        self._anchor_ns = start_ns
+        self._x: Array | None = x  # state now, once asked for
+        self._u: Array = np.zeros(self.model.b.shape[1])
+        self._w: Array = self._draw()
+        self._next_boundary_ns = start_ns + self.model.dt_ns
+        self.now_ns = start_ns
+        self.grounded = False
+
+    def _draw(self) -> Array:
+        return self.model.w_root @ self._rng.standard_normal(self.model.w_root.shape[0])
+
+    @property
+    def has_down(self) -> bool:
+        """Whether the plant can climb and descend."""
+        return NED_AXES.index("down") in self.model.axes
+
+    @property
+    def state(self) -> Array:
+        """State x (n_x,) now."""
+        if self._x is None:
+            a, b, e = self._transition(self.now_ns - self._anchor_ns)
+            self._x = a @ self._anchor_x + b @ self._u + e @ self._w
+        return self._x
+
+    @property
+    def input(self) -> Array:
+        """Input u (n_u,) that acts now, in the plant's units."""
+        return self._u
+
+    @property
+    def position_m(self) -> Vec3:
+        """Position in local NED [m]."""
+        return self._vec3(self.model.position_index, self._offset_m)
+
+    @property
+    def velocity_mps(self) -> Vec3:
+        """Velocity in local NED [m/s]; zero along axes that the plant has not."""
+        return self._vec3(self.model.velocity_index, (0.0, 0.0, 0.0))
+
+    def _vec3(self, index: tuple[int, ...], default: Vec3) -> Vec3:
+        values = list(default)
+        state = self.state
+        for axis, i in zip(self.model.axes, index):
+            values[axis] = float(state[i])
+        return values[0], values[1], values[2]
+
+    def advance(self, to_ns: int) -> None:
+        """Move on to `to_ns`, through every boundary up to and including it."""
+        if to_ns < self.now_ns:
+            raise ValueError(f"time cannot go back from {self.now_ns} to {to_ns} ns")
+        while self._next_boundary_ns <= to_ns:
+            self._move(self._next_boundary_ns)
+            self._re_anchor()
+            self._w = self._draw()
+            self._next_boundary_ns += self.model.dt_ns
+        self._move(to_ns)
+
+    def _move(self, to_ns: int) -> None:
+        if to_ns == self.now_ns:
+            return
+        self.now_ns = to_ns
+        if self.grounded:
+            self._anchor_ns = to_ns
+        else:
+            self._x = None
+
+    def _re_anchor(self) -> None:
+        self._anchor_x = self.state
+        self._anchor_ns = self.now_ns
+
+    def accelerate(self, accel_mps2: Vec3) -> None:
+        """Hold this acceleration setpoint from now on; axes that the plant has not ignore it."""
+        wanted = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
+        u = np.array(wanted) / self.model.accel_per_input
+        if not np.array_equal(u, self._u):
+            self._re_anchor()
+            self._u = u
+
+    def rest(self) -> None:
+        """Stand on the floor (z = 0): at rest, with no input, until `grounded` is cleared."""
+        x = np.zeros_like(self.state)
+        for axis, p in zip(self.model.axes, self.model.position_index):
+            x[p] = 0.0 if NED_AXES[axis] == "down" else self.state[p]
+        self._x = self._anchor_x = x
+        self._anchor_ns = self.now_ns
+        self._u = np.zeros_like(self._u)
+        self.grounded = True

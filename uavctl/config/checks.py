@@ -1,0 +1,250 @@
+"""Checks of a configuration that no single key's type can make: shapes, orders, fits.
+
+Each check takes sections that were decoded and yields every problem that it finds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from uavctl.config.types import (
+    CostConfig,
+    DaemonConfig,
+    Floats,
+    LimitsConfig,
+    LinkConfig,
+    PlantConfig,
+    Rows,
+    ScheduleConfig,
+    Section,
+    SetsConfig,
+    SmpcConfig,
+    TargetConfig,
+)
+
+_MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input")
+_DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
+_AXES = ("north", "east", "down")
+_RELATIVE = 1e-9  # asymmetry and negative eigenvalues below this share of W's size are rounding
+
+
+class Problem(NamedTuple):
+    """One thing that is wrong with a configuration."""
+
+    key: str
+    reason: str
+    todo: str
+
+
+def dimensions(plant: PlantConfig) -> tuple[int, int]:
+    """(n_x, n_u) that the other sections must fit."""
+    n_u = len(plant.axes)
+    return (len(plant.a) if plant.model == "matrices" else 3 * n_u), n_u
+
+
+def check(sections: Mapping[str, Section]) -> Iterator[Problem]:
+    """All problems among the sections that are there (a section that is not decoded is left out)."""
+    for names, check_one in _CHECKS:
+        if all(name in sections for name in names):
+            yield from check_one(*(sections[name] for name in names))
+
+
+def _length(key: str, values: Floats | tuple[int, ...], wanted: int, meaning: str) -> Iterator[Problem]:
+    if len(values) != wanted:
+        yield Problem(key, f"has {len(values)} entries, {meaning} = {wanted}", f"give {wanted} numbers")
+
+
+def _shape(key: str, rows: Rows, wanted: tuple[int, int], meaning: str) -> Iterator[Problem]:
+    lengths = {len(row) for row in rows}
+    todo = f"give {wanted[0]} rows of {wanted[1]} numbers"
+    if len(lengths) > 1:
+        yield Problem(key, f"rows have different lengths ({', '.join(map(str, sorted(lengths)))})", todo)
+        return
+    shape = (len(rows), lengths.pop() if lengths else 0)
+    if shape != wanted:
+        yield Problem(key, f"is {shape[0]} x {shape[1]}, {meaning} = {wanted[0]} x {wanted[1]}", todo)
+
+
+def _plant(plant: PlantConfig) -> Iterator[Problem]:
+    if list(plant.axes) != sorted(set(plant.axes), key=_AXES.index):
+        yield Problem(
+            "plant.axes", f"{list(plant.axes)} repeats or turns round axes", "keep the order north, east, down"
+        )
+    keys = {"matrices": _MATRIX_KEYS, "drag-lag": _DRAG_LAG_KEYS}
+    wanted = keys.pop(plant.model)
+    (foreign,) = keys.values()
+    missing = [key for key in wanted if not getattr(plant, key)]
+    for key in missing:
+        yield Problem(f"plant.{key}", f'is missing, and model "{plant.model}" needs it', "add it")
+    for key in foreign:
+        if getattr(plant, key):
+            yield Problem(
+                f"plant.{key}", f'has no meaning with model "{plant.model}"', "remove it, or change the model"
+            )
+    if not missing:
+        yield from _matrices(plant) if plant.model == "matrices" else _drag_lag(plant)
+
+
+def _matrices(plant: PlantConfig) -> Iterator[Problem]:
+    n_x, n_u = dimensions(plant)
+    n_w = len(plant.w)
+    yield from _shape("plant.a", plant.a, (n_x, n_x), "n_x x n_x")
+    yield from _shape("plant.b", plant.b, (n_x, n_u), "n_x x number of axes")
+    yield from _shape("plant.e", plant.e, (n_x, n_w), "n_x x n_w")
+    wrong_w = list(_shape("plant.w", plant.w, (n_w, n_w), "n_w x n_w"))
+    yield from wrong_w or _covariance(plant.w)
+    for key in ("position_index", "velocity_index"):
+        index = getattr(plant, key)
+        yield from _length(f"plant.{key}", index, n_u, "number of axes")
+        if any(not 0 <= i < n_x for i in index):
+            yield Problem(f"plant.{key}", f"{list(index)} names a state that is not there", f"give 0 to {n_x - 1}")
+    both = plant.position_index + plant.velocity_index
+    if len(set(both)) < len(both):
+        yield Problem("plant.velocity_index", "a state is named twice", "give each position and velocity its own state")
+    yield from _length("plant.accel_per_input", plant.accel_per_input, n_u, "number of axes")
+    if 0.0 in plant.accel_per_input:
+        yield Problem(
+            "plant.accel_per_input", "is 0 for an axis, which nothing could steer", "give a number other than 0"
+        )
+
+
+def _covariance(w: Rows) -> Iterator[Problem]:
+    matrix = np.array(w)
+    size = float(np.abs(matrix).max(initial=0.0))
+    if float(np.abs(matrix - matrix.T).max(initial=0.0)) > _RELATIVE * size:
+        yield Problem("plant.w", "is not symmetric", "a covariance has W[i][j] = W[j][i]")
+        return
+    smallest = float(np.linalg.eigvalsh(matrix).min(initial=0.0))
+    if smallest < -_RELATIVE * size:
+        yield Problem(
+            "plant.w",
+            f"is not positive semidefinite (smallest eigenvalue {smallest:.4g})",
+            "give a covariance matrix: variances on the diagonal, covariances at most their geometric mean",
+        )
+
+
+def _drag_lag(plant: PlantConfig) -> Iterator[Problem]:
+    n_u = len(plant.axes)
+    for key in _DRAG_LAG_KEYS:
+        values = getattr(plant, key)
+        yield from _length(f"plant.{key}", values, n_u, "number of axes")
+        positive = key in ("lag_s", "gain")
+        if any(value <= 0 if positive else value < 0 for value in values):
+            yield Problem(
+                f"plant.{key}", f"{list(values)} is out of range", f"give numbers {'> 0' if positive else '>= 0'}"
+            )
+
+
+def _sets(plant: PlantConfig, sets: SetsConfig) -> Iterator[Problem]:
+    for kind, size, name in zip(("state", "input"), dimensions(plant), ("n_x", "number of axes"), strict=True):
+        lower, upper = getattr(sets, f"{kind}_lower"), getattr(sets, f"{kind}_upper")
+        yield from _length(f"sets.{kind}_lower", lower, size, name)
+        yield from _length(f"sets.{kind}_upper", upper, size, name)
+        for i, (low, high) in enumerate(zip(lower, upper, strict=False)):
+            if not low < high:
+                yield Problem(
+                    f"sets.{kind}_lower[{i}]",
+                    f"lower limit {low:g} is not below sets.{kind}_upper[{i}] = {high:g}",
+                    "give a lower limit below the upper one",
+                )
+
+
+def _cost(plant: PlantConfig, cost: CostConfig) -> Iterator[Problem]:
+    n_x, n_u = dimensions(plant)
+    yield from _length("cost.state", cost.state, n_x, "n_x")
+    yield from _length("cost.input", cost.input, n_u, "number of axes")
+    if any(weight < 0 for weight in cost.state):
+        yield Problem("cost.state", "a weight is negative", "give numbers >= 0")
+    if any(weight <= 0 for weight in cost.input):
+        yield Problem("cost.input", "a weight is not positive, so the cost is not strictly convex", "give numbers > 0")
+
+
+def _smpc(plant: PlantConfig, smpc: SmpcConfig) -> Iterator[Problem]:
+    n_x, n_u = dimensions(plant)
+    yield from _shape("smpc.k_tau", smpc.k_tau, (n_u, n_x), "number of axes x n_x")
+    if smpc.tau >= smpc.horizon:
+        yield Problem(
+            "smpc.tau",
+            f"{smpc.tau} steps do not fit into the horizon of {smpc.horizon}",
+            "give a tau below smpc.horizon, or a longer horizon",
+        )
+
+
+def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) -> Iterator[Problem]:
+    n_x, _ = dimensions(plant)
+    delays = schedule.delays
+    if schedule.rule == "fixed":
+        if isinstance(delays, tuple):
+            yield from _length("schedule.delays", delays, smpc.horizon, "smpc.horizon")
+        if any(delay < 1 for delay in (delays if isinstance(delays, tuple) else (delays,))):
+            yield Problem(
+                "schedule.delays",
+                "a delay is below 1 step: feedback on what has not happened yet",
+                'give whole numbers >= 1, or rule = "search" or "greedy"',
+            )
+    if schedule.rule == "search" and not schedule.search_states:
+        yield Problem(
+            "schedule.search_states", 'is missing, and rule "search" needs it', f"add states of {n_x} numbers each"
+        )
+    for i, state in enumerate(schedule.search_states):
+        yield from _length(f"schedule.search_states[{i}]", state, n_x, "n_x")
+
+
+def _target(plant: PlantConfig, sets: SetsConfig, target: TargetConfig) -> Iterator[Problem]:
+    positions = plant.position_index if plant.model == "matrices" else tuple(range(0, 3 * len(plant.axes), 3))
+    for axis, i in zip(plant.axes, positions, strict=False):
+        if not 0 <= i < min(len(sets.state_lower), len(sets.state_upper)):
+            continue  # a problem of its own
+        place = target.position_m[_AXES.index(axis)]
+        low, high = sets.state_lower[i], sets.state_upper[i]
+        if not low <= place <= high:
+            yield Problem(
+                f"target.position_m[{_AXES.index(axis)}]",
+                f"{axis} {place:g} m is outside the admissible box [{low:g}, {high:g}]",
+                "move the target inside, or widen sets.state_lower and sets.state_upper",
+            )
+
+
+def _link(link: LinkConfig) -> Iterator[Problem]:
+    for i, (start, end) in enumerate(link.blackout):
+        if not 0 <= start < end:
+            yield Problem(
+                f"link.blackout[{i}]",
+                f"[{start:g}, {end:g}] is not a span of time",
+                "give [from_s, to_s] with 0 <= from_s < to_s",
+            )
+
+
+def _tick(plant: PlantConfig, daemon: DaemonConfig) -> Iterator[Problem]:
+    tick_ns, dt_ns = round(daemon.tick_s * 1e9), round(plant.dt_s * 1e9)
+    if tick_ns < 1 or dt_ns % tick_ns:
+        least = math.ceil(dt_ns / max(tick_ns, 1))
+        count = next((n for n in range(least, dt_ns) if dt_ns % n == 0), 1)
+        yield Problem(
+            "daemon.tick_s",
+            f"{daemon.tick_s:g} s does not divide plant.dt_s = {plant.dt_s:g} s",
+            f"give plant.dt_s / n with a whole n, for example {plant.dt_s / count:g}",
+        )
+
+
+def _limits(limits: LimitsConfig) -> Iterator[Problem]:
+    if any(limit <= 0 for limit in limits.accel_mps2):
+        yield Problem("limits.accel_mps2", "a limit is not positive", "give numbers > 0")
+
+
+_CheckFunction = Callable[..., Iterator[Problem]]
+_CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
+    (("plant",), _plant),
+    (("plant", "sets"), _sets),
+    (("plant", "cost"), _cost),
+    (("plant", "smpc"), _smpc),
+    (("plant", "smpc", "schedule"), _schedule),
+    (("plant", "sets", "target"), _target),
+    (("link",), _link),
+    (("plant", "daemon"), _tick),
+    (("limits",), _limits),
+)

@@ -1,0 +1,279 @@
+"""TOML and overrides in, a checked `Config` out; every problem at once, with its place."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, cast, get_args, get_origin
+
+import msgspec
+import tomlkit
+from msgspec import NODEFAULT
+from msgspec.structs import FieldInfo
+
+from uavctl.config.checks import Problem, check
+from uavctl.config.index import key_lines
+from uavctl.config.reference import description, is_section, type_text
+from uavctl.config.types import Config, Section
+from uavctl.errors import ConfigError, DesignError
+
+_SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
+_DECODE_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
+_WORDS = {
+    "`float`": "a number",
+    "`int`": "a whole number",
+    "`array`": "a list",
+    "`str`": "a string",
+    "`bool`": "a truth",
+}
+_MAY_BE_INFINITE = "sets."  # an open side; everything else is finite
+_LONGEST_VALUE = 40
+_UNKNOWN = "unknown key"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a configuration came from: enough to say where each key stands.
+
+    Attributes:
+        file: The file, as a person finds it.
+        lines: Key path -> line in the file.
+        overrides: (key path, text as typed) of each override, in order.
+    """
+
+    file: str
+    lines: Mapping[str, int]
+    overrides: tuple[tuple[str, str], ...] = ()
+
+    def where(self, key: str) -> str:
+        """The override that set `key`, else `file:line` of the key or of the nearest table around it."""
+        for path, text in reversed(self.overrides):
+            if key == path or key.startswith((f"{path}.", f"{path}[")):
+                return f"--set {text}"
+        around = key
+        while around and around not in self.lines:
+            around = around[: max(around.rfind("."), around.rfind("["), 0)]
+        return f"{self.file}:{self.lines.get(around, 1)}"
+
+    def tell(self, problem: Problem) -> str:
+        """One line: place, key, what is wrong, what to do."""
+        return f"{self.where(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A configuration together with its places."""
+
+    config: Config
+    source: Source
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("uavctl") / "presets"
+    return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
+
+
+def load(name_or_path: str, overrides: Sequence[str] = ()) -> Loaded:
+    """Load a preset or a TOML file, apply `key.path=value` overrides, check everything.
+
+    Raises:
+        ConfigError: With all problems found, one a line: place, key, reason, what to do.
+    """
+    file, text = _read(name_or_path)
+    return parse(text, file, overrides)
+
+
+def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> Config:
+    """The configuration alone; see `load`."""
+    return load(name_or_path, overrides).config
+
+
+def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
+    """The same from TOML text; `file` is the name that messages show.
+
+    Raises:
+        ConfigError: With all problems found.
+    """
+    table = _parse_toml(text, file)
+    problems: list[str] = []
+    applied = tuple(_override(table, override, problems) for override in overrides)
+    source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
+    found: list[Problem] = []
+    sections: dict[str, Section] = {}
+    config = _decode(Config, table, "", found, sections)
+    found.extend(check(sections))
+    problems.extend(source.tell(problem) for problem in found)
+    if problems or config is None:
+        raise ConfigError(tuple(problems))
+    return Loaded(cast("Config", config), source)
+
+
+def dump_config(config: Config) -> str:
+    """TOML text with every key; `parse` gives an equal configuration back."""
+    return tomlkit.dumps(msgspec.to_builtins(config))
+
+
+def explain(source: Source, error: DesignError) -> str:
+    """A refused design as the loader's own problems are told: place, key, reason, what to do."""
+    return source.tell(Problem(error.key, error.reason, error.hint))
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    match = difflib.get_close_matches(name, names, n=1)
+    return f' (nearest valid name "{match[0]}")' if match else ""
+
+
+def _read(name_or_path: str) -> tuple[str, str]:
+    if name_or_path in presets():
+        entry = resources.files("uavctl") / "presets" / f"{name_or_path}.toml"
+        return str(entry), entry.read_text(encoding="utf-8")
+    try:
+        return name_or_path, Path(name_or_path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        known = presets()
+        raise ConfigError(
+            (
+                f"{name_or_path}: no such file or preset{_nearest(name_or_path, known)}; "
+                f"give a TOML file, or a preset: {', '.join(known)}",
+            )
+        ) from error
+    except OSError as error:
+        raise ConfigError((f"{name_or_path}: cannot be read ({error.strerror}); give a TOML file",)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError((f"{name_or_path}: is not UTF-8 text; save it as UTF-8",)) from error
+
+
+def _parse_toml(text: str, file: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        place = _SYNTAX_PLACE.search(message)
+        line = place["line"] if place and place["line"] else str(text.count("\n") + 1)
+        reason = _SYNTAX_PLACE.sub("", message)
+        raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; mend the line",)) from error
+
+
+def _override(table: dict[str, Any], text: str, problems: list[str]) -> tuple[str, str] | None:
+    """Write one override into the table; its key path and text, or None if it is no override."""
+    path, equals, value = text.partition("=")
+    parts = path.strip().split(".")
+    if not equals or not all(parts):
+        problems.append(f"--set {text}: is not an override; write key.path=value, as in link.loss=0.3")
+        return None
+    inner = table
+    for depth, part in enumerate(parts[:-1], 1):
+        inner = inner.setdefault(part, {})
+        if not isinstance(inner, dict):
+            problems.append(f"--set {text}: {'.'.join(parts[:depth])} is a value, not a table; override it as a whole")
+            return None
+    inner[parts[-1]] = _override_value(value.strip())
+    return ".".join(parts), text
+
+
+def _override_value(text: str) -> object:
+    """A value as TOML writes it; what is none is a string without its quotes."""
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return parsed["value"] if len(parsed) == 1 else text
+
+
+def _decode(
+    section: type[Section], table: Mapping[str, Any], path: str, found: list[Problem], sections: dict[str, Section]
+) -> Section | None:
+    """Decode one table; its problems go to `found`, whole first-level sections to `sections`."""
+    fields = {field.encode_name: field for field in msgspec.structs.fields(section)}
+    before = len(found)
+    found.extend(_unknown(path + key, key, tuple(fields), path) for key in table if key not in fields)
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        key, value = path + name, table.get(name)
+        if name not in table:
+            if field.default is NODEFAULT:
+                found.append(_missing(key, field))
+        elif not is_section(field.type):
+            wrong = next(_wrong(key, value, field), None)
+            if wrong is None:
+                values[name] = msgspec.convert(value, field.type)
+            else:
+                found.append(wrong)
+        elif isinstance(value, dict):
+            inner = _decode(field.type, value, f"{key}.", found, sections)
+            if inner is not None:
+                values[name] = sections[key] = inner
+        else:
+            found.append(Problem(key, f"expected a table, got {_short(value)}", f"write [{key}] and its keys below"))
+    usable = all(problem.reason.startswith(_UNKNOWN) for problem in found[before:])
+    return section(**values) if usable else None
+
+
+def _unknown(path: str, key: str, names: Sequence[str], table: str) -> Problem:
+    nearest = _nearest(key, names)
+    where = f"[{table[:-1]}]" if table else "the top level"
+    return Problem(
+        path,
+        f"{_UNKNOWN}{nearest}",
+        "rename or remove it" if nearest else f"remove it; {where} knows {', '.join(names)}",
+    )
+
+
+def _missing(key: str, field: FieldInfo) -> Problem:
+    if is_section(field.type):
+        return Problem(key, "missing table", f"add [{key}]; the presets are complete examples")
+    return Problem(key, "missing key", f"add it: {type_text(field.type)}, {description(field)}")
+
+
+def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
+    """What is wrong with a value by its type, if anything."""
+    todo = f"give {type_text(field.type)}: {description(field)}"
+    try:
+        msgspec.convert(value, field.type)
+    except msgspec.ValidationError as error:
+        message = str(error)
+        place = _DECODE_PLACE.search(message)
+        path = place["path"] if place else ""
+        got = value
+        for number in re.findall(r"\[(\d+)\]", path):
+            got = cast("Sequence[object]", got)[int(number)]
+        yield Problem(key + path, _reason(_DECODE_PLACE.sub("", message), got, field), todo)
+    else:
+        for path, number in _numbers(key, value):
+            if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):
+                yield Problem(path, f"{number} is not a finite number", todo)
+
+
+def _reason(message: str, got: object, field: FieldInfo) -> str:
+    if message.startswith("Invalid enum value"):
+        return f"{_short(got)} is not a choice{_nearest(str(got), _choices(field.type))}"
+    for word, text in _WORDS.items():
+        message = message.replace(word, text)
+    wanted = message.partition(", got ")[0]
+    return f"{wanted[0].lower()}{wanted[1:]}, got {_short(got)}"
+
+
+def _choices(annotation: Any) -> tuple[str, ...]:
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return tuple(choice for argument in get_args(annotation) for choice in _choices(argument))
+
+
+def _numbers(path: str, value: object) -> Iterator[tuple[str, float]]:
+    if isinstance(value, float):
+        yield path, value
+    elif isinstance(value, list):
+        for i, element in enumerate(value):
+            yield from _numbers(f"{path}[{i}]", element)
+
+
+def _short(value: object) -> str:
+    text = f'"{value}"' if isinstance(value, str) else str(value)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"

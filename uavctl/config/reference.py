@@ -1,0 +1,99 @@
+"""The reference page of all configuration keys, made from the types; `make docs` writes it."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import msgspec
+from msgspec import NODEFAULT, Meta
+from msgspec.structs import FieldInfo
+
+from uavctl.config.types import Config, Section
+
+_HEAD = """# Configuration
+
+This page is generated from the types in `uavctl/config/types.py` (`make docs`); do not edit it.
+
+A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`: complete examples in
+`uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides any key, with a value as TOML writes
+it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string needs no quotes.
+Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are refused before anything starts,
+all at once, each with file, line and key (exit code 2).
+
+States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`).
+n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
+"""
+
+_SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
+
+
+def is_section(annotation: object) -> bool:
+    """Whether a field's type is a table of its own."""
+    return isinstance(annotation, type) and issubclass(annotation, Section)
+
+
+def type_text(annotation: Any) -> str:
+    """A field's type with its limits, in words."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return type_text(arguments[0]) + "".join(_limits(meta) for meta in arguments[1:] if isinstance(meta, Meta))
+    if origin is Literal:
+        return " or ".join(f'"{choice}"' for choice in arguments)
+    if origin in (Union, types.UnionType):
+        return ", or ".join(type_text(argument) for argument in arguments)
+    if origin is tuple:
+        count = "" if arguments[1:] == (Ellipsis,) else f"{len(arguments)} "
+        return f"list of {count}{_plural(type_text(arguments[0]))}"
+    return _SCALARS[annotation]
+
+
+def _plural(text: str) -> str:
+    return text.replace("list", "lists", 1) if text.startswith("list") else text.replace("number", "numbers", 1)
+
+
+def description(field: FieldInfo) -> str:
+    """Unit and meaning of a field; empty for a table."""
+    metas = (meta for meta in get_args(field.type)[1:] if isinstance(meta, Meta))
+    return next((meta.description for meta in metas if meta.description), "")
+
+
+def render() -> str:
+    """The whole page, as Markdown."""
+    return "\n".join((_HEAD, *_tables(Config, "")))
+
+
+def _limits(meta: Meta) -> str:
+    bounds = [f"{sign} {value:g}" for sign, value in _bounds(meta) if value is not None]
+    lengths = [
+        f"{word} {value}"
+        for word, value in (("entries: at least", meta.min_length), ("at most", meta.max_length))
+        if value is not None
+    ]
+    return f" ({', '.join(bounds + lengths)})" if bounds or lengths else ""
+
+
+def _bounds(meta: Meta) -> tuple[tuple[str, float | None], ...]:
+    return ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))
+
+
+def _tables(section: type[Section], path: str) -> Iterator[str]:
+    fields = msgspec.structs.fields(section)
+    title = f"`[{path}]`" if path else "Top level"
+    yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
+    yield "| key | type | meaning | default |\n|---|---|---|---|"
+    for field in fields:
+        if not is_section(field.type):
+            cells = (f"`{field.encode_name}`", type_text(field.type), description(field), _default(field))
+            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    yield ""
+    for field in fields:
+        if is_section(field.type):
+            yield from _tables(field.type, f"{path}.{field.encode_name}" if path else field.encode_name)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.default is NODEFAULT:
+        return "required"
+    return f"`{msgspec.json.encode(field.default).decode()}`"

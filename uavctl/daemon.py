@@ -1,0 +1,58 @@
+"""The flight daemon: wait, receive, step, send, record; nothing else.
+
+The loop stops sending when it dies: there is no other thread that could re-send a setpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from uavctl.clock import Ticker, monotonic_ns
+from uavctl.loop import ControlLoop
+from uavctl.transport import Connection, wait
+
+
+def fly(
+    loop: ControlLoop,
+    connections: Mapping[str, Connection],
+    ticker: Ticker,
+    stop_requested: Callable[[], bool],
+    *,
+    duration_s: float | None = None,
+    stop_limit_s: float = 10.0,
+) -> None:
+    """Run the control loop in real time until it has handed the vehicle over.
+
+    Args:
+        loop: the loop, which records whatever it sees and does.
+        connections: open connections by link name.
+        ticker: the grid of ticks.
+        stop_requested: asked once a tick; the first True begins the hand-over.
+        duration_s: the hand-over begins by itself after this time [s]; None flies on.
+        stop_limit_s: the hand-over is cut off after this time [s].
+    """
+    first_ns: int | None = None
+    stop_ns: int | None = None
+    while not loop.finished:
+        due = ticker.next()
+        _receive_until(loop, connections, due.at_ns)
+        started_ns = monotonic_ns()
+        first_ns = due.at_ns if first_ns is None else first_ns
+        over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
+        if stop_ns is None and (over or stop_requested()):
+            stop_ns = due.at_ns
+        if stop_ns is not None and due.at_ns - stop_ns > stop_limit_s * 1e9:
+            return
+        for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):
+            connections[message.link].send(message.data)
+        loop.timing(due.tick, due.at_ns, started_ns - due.at_ns, monotonic_ns() - due.at_ns)
+
+
+def _receive_until(loop: ControlLoop, connections: Mapping[str, Connection], deadline_ns: int) -> None:
+    """Hand on datagrams as they arrive, until the tick's deadline."""
+    while True:
+        for name in wait(connections, deadline_ns):
+            for data, received_ns in connections[name].receive():
+                loop.receive(name, data, received_ns)
+        if monotonic_ns() >= deadline_ns:
+            return

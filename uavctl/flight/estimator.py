@@ -1,0 +1,178 @@
+"""Estimate from samples that come at any time, late or out of order.
+
+A sorted history of samples and input changes starts at an anchor that follows the time at a distance
+of `window_s`. Each entry keeps the belief after it, so that a sample in order costs one update, and a
+late one a recomputation from its place on: the result is the same to the last bit.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uavctl.data import Estimate, PositionSample
+from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, first_belief, predicted, updated
+
+DUPLICATE = "sample-duplicate"
+TOO_OLD = "sample-too-old"
+
+# Order of what happens at one instant; a sample sees the input before its change, which is the same state.
+_SAMPLE, _INPUT, _MARK = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """What is known after an entry: the belief (None before the first sample) and the input that acts."""
+
+    belief: Belief | None
+    input: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One happening: a sample, an input change, or neither (a boundary, where a belief is kept)."""
+
+    key: tuple[int, int, str, int]  # time, kind, source, capture time as stamped
+    sample: PositionSample | None
+    input: Array | None
+    after: Node
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """State of the filter; immutable.
+
+    Attributes:
+        origin_ns: A boundary of the Δt grid [ns].
+        horizon_ns: Everything up to here is in the anchor; older samples are refused [ns].
+        anchor: What was known at the horizon.
+        entries: What happened since, sorted by key.
+    """
+
+    origin_ns: int
+    horizon_ns: int
+    anchor: Node
+    entries: tuple[Entry, ...] = ()
+
+    @property
+    def newest(self) -> Node:
+        """What is known after everything."""
+        return self.entries[-1].after if self.entries else self.anchor
+
+    @property
+    def captured_ns(self) -> int | None:
+        """Capture time of the newest sample, None before the first."""
+        belief = self.newest.belief
+        return None if belief is None else belief.captured_ns
+
+
+def begin(kalman: Kalman, origin_ns: int, at_ns: int) -> History:
+    """An empty history at `at_ns`, on the grid of boundaries origin_ns + n Δt."""
+    return History(
+        origin_ns=origin_ns,
+        horizon_ns=_horizon_ns(kalman, at_ns),
+        anchor=Node(belief=None, input=np.zeros(kalman.n_u)),
+    )
+
+
+def absorb(
+    kalman: Kalman, history: History, at_ns: int, samples: Sequence[PositionSample]
+) -> tuple[History, tuple[PositionSample, ...], tuple[str, ...]]:
+    """Move the window up to `at_ns` and take samples of any age and order.
+
+    Args:
+        kalman: The filter.
+        history: State before.
+        at_ns: Time now [ns]; no sample may be captured or received later.
+        samples: Valid samples (see `uavctl.flight.samples`).
+
+    Returns:
+        The new state, the samples that were taken, and the reason for each one that was refused.
+    """
+    horizon_ns = max(history.horizon_ns, _horizon_ns(kalman, at_ns))
+    known = {entry.key[2:] for entry in history.entries} if samples else set()
+    taken: list[PositionSample] = []
+    refused: list[str] = []
+    new: list[Entry] = []
+    for sample in samples:
+        identity = (sample.source, sample.captured_ns)
+        key = (captured_ns(sample), _SAMPLE, *identity)
+        if key[0] <= horizon_ns:
+            refused.append(TOO_OLD)
+        elif identity in known:
+            refused.append(DUPLICATE)
+        else:
+            known.add(identity)
+            taken.append(sample)
+            new.append(Entry(key=key, sample=sample, input=None, after=history.anchor))
+    dt_ns = kalman.propagation.dt_ns
+    boundary_ns = at_ns - (at_ns - history.origin_ns) % dt_ns
+    mark = (boundary_ns, _MARK, "", boundary_ns)
+    if boundary_ns > horizon_ns and (not history.entries or history.entries[-1].key < mark):
+        new.append(Entry(key=mark, sample=None, input=None, after=history.anchor))
+    history = _trimmed(_inserted(kalman, history, new), horizon_ns)
+    return history, tuple(taken), tuple(refused)
+
+
+def set_input(kalman: Kalman, history: History, at_ns: int, u: Array) -> History:
+    """Note that input `u` (n_u,) acts from `at_ns` on; `at_ns` never goes back."""
+    if np.array_equal(history.newest.input, u):
+        return history
+    entry = Entry(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=history.anchor)
+    return _inserted(kalman, history, [entry])
+
+
+def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
+    """Estimate at `at_ns` from all that had happened by then; None before the first sample.
+
+    A time before the newest entry leaves out what came after it; a time before the window has no estimate.
+    """
+    place = bisect_right(history.entries, at_ns, key=lambda entry: entry.key[0])
+    node = history.entries[place - 1].after if place else history.anchor
+    if node.belief is None or node.belief.at_ns > at_ns:
+        return None
+    belief = predicted(kalman, history.origin_ns, node.belief, node.input, at_ns)
+    n_x = kalman.n_x
+    return Estimate(
+        at_ns=at_ns,
+        captured_ns=belief.captured_ns,
+        mean=tuple(belief.mean[:n_x].tolist()),
+        cov=tuple(map(tuple, belief.cov[:n_x, :n_x].tolist())),
+    )
+
+
+def _horizon_ns(kalman: Kalman, at_ns: int) -> int:
+    return at_ns - round(kalman.parameters.window_s * 1e9)
+
+
+def _inserted(kalman: Kalman, history: History, new: list[Entry]) -> History:
+    """Sort entries in and recompute the belief of each from the earliest new one on."""
+    if not new:
+        return history
+    earliest = min(entry.key for entry in new)
+    place = bisect_right(history.entries, earliest, key=lambda entry: entry.key)
+    node = history.entries[place - 1].after if place else history.anchor
+    entries = list(history.entries[:place])
+    for entry in sorted((*history.entries[place:], *new), key=lambda entry: entry.key):
+        node = _after(kalman, history.origin_ns, node, entry)
+        entries.append(replace(entry, after=node))
+    return replace(history, entries=tuple(entries))
+
+
+def _trimmed(history: History, horizon_ns: int) -> History:
+    """Move the anchor up to the horizon."""
+    place = bisect_right(history.entries, horizon_ns, key=lambda entry: entry.key[0])
+    anchor = history.entries[place - 1].after if place else history.anchor
+    return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[place:])
+
+
+def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry) -> Node:
+    belief = node.belief
+    if belief is not None:
+        belief = predicted(kalman, origin_ns, belief, node.input, entry.key[0])
+    if entry.sample is not None:
+        belief = first_belief(kalman, entry.sample) if belief is None else updated(kalman, belief, entry.sample)
+    return Node(belief=belief, input=node.input if entry.input is None else entry.input)

@@ -1,0 +1,163 @@
+"""Kalman filter in continuous time over a piecewise constant disturbance: the Gaussian part, without a memory.
+
+Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W); it is redrawn at each
+boundary. So the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w:
+mean 0, covariance W, uncorrelated with x. With u piecewise constant this is exact at any instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import PositionSample, Vec3
+from uavctl.flight.limits import AXES
+from uavctl.flight.propagation import Propagation, make_propagation
+from uavctl.smpc.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EstimatorParameters:
+    """What the filter believes of its samples.
+
+    Attributes:
+        position_std_m: Least standard deviation of a position sample, each axis [m]; a sample may claim more.
+        velocity_std_mps: Standard deviation of a velocity sample, each axis [m/s].
+        initial_std: Standard deviation of the states that the first sample does not show.
+        window_s: Samples later than this are refused [s].
+        max_position_m: Largest plausible position, each axis [m].
+        max_velocity_mps: Largest plausible velocity, each axis [m/s].
+    """
+
+    position_std_m: float
+    velocity_std_mps: float
+    initial_std: float
+    window_s: float
+    max_position_m: float
+    max_velocity_mps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Kalman:
+    """The constant part of the filter: model, noise and indices.
+
+    Attributes:
+        propagation: F and G of z = (x, w).
+        w: Covariance W (n_w, n_w).
+        n_x: Number of states.
+        n_u: Number of inputs.
+        axes: Index (0 north, 1 east, 2 down) of each axis that the plant has.
+        shown: State index of each axis' position, then of each axis' velocity.
+        parameters: Noise and window.
+    """
+
+    propagation: Propagation
+    w: Array
+    n_x: int
+    n_u: int
+    axes: tuple[int, ...]
+    shown: NDArray[np.intp]
+    parameters: EstimatorParameters
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Gaussian of z = (x, w) at `at_ns`, with the capture time of the newest sample in it."""
+
+    at_ns: int
+    captured_ns: int
+    mean: Array  # (n_x + n_w,)
+    cov: Array  # (n_x + n_w, n_x + n_w)
+
+
+def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
+    """The filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
+    return Kalman(
+        propagation=make_propagation(plant, dt_ns),
+        w=plant.w,
+        n_x=plant.n_x,
+        n_u=plant.n_u,
+        axes=tuple(AXES.index(axis) for axis in plant.axes),
+        shown=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
+        parameters=parameters,
+    )
+
+
+def captured_ns(sample: PositionSample) -> int:
+    """Capture time that is believed: never after the arrival, where a clock offset's error may put the stamp."""
+    return min(sample.captured_ns, sample.received_ns)
+
+
+def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array, at_ns: int) -> Belief:
+    """The belief at `at_ns`; the grid's boundaries cut the way at the same places whatever came in."""
+    now_ns, mean, cov = belief.at_ns, belief.mean, belief.cov
+    dt_ns, n_x = kalman.propagation.dt_ns, kalman.n_x
+    while now_ns < at_ns:
+        boundary_ns = now_ns - (now_ns - origin_ns) % dt_ns + dt_ns
+        stop_ns = min(at_ns, boundary_ns)
+        f, g = kalman.propagation.over(stop_ns - now_ns)
+        mean = f @ mean + g @ u
+        cov = _symmetric(f @ cov @ f.T)
+        if stop_ns == boundary_ns:
+            mean[n_x:] = 0.0
+            cov[:n_x, n_x:] = 0.0
+            cov[n_x:, :n_x] = 0.0
+            cov[n_x:, n_x:] = kalman.w
+        now_ns = stop_ns
+    return Belief(at_ns=now_ns, captured_ns=belief.captured_ns, mean=mean, cov=cov)
+
+
+def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
+    """The belief after the first sample: what it shows, and zero for what it does not."""
+    n_x, n_w = kalman.n_x, kalman.w.shape[0]
+    values, variances = _shown(kalman, sample)
+    index = kalman.shown[: len(values)]
+    mean = np.zeros(n_x + n_w)
+    mean[index] = values
+    diagonal = np.full(n_x, kalman.parameters.initial_std**2)
+    diagonal[index] = variances
+    cov = np.zeros((n_x + n_w, n_x + n_w))
+    cov[:n_x, :n_x] = np.diag(diagonal)
+    cov[n_x:, n_x:] = kalman.w
+    at_ns = captured_ns(sample)
+    return Belief(at_ns=at_ns, captured_ns=at_ns, mean=mean, cov=cov)
+
+
+def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
+    """Kalman update; the covariance in Joseph's form, which stays symmetric and positive semidefinite."""
+    values, variances = _shown(kalman, sample)
+    index = kalman.shown[: len(values)]
+    noise = np.diag(variances)
+    ph = belief.cov[:, index]
+    gain = np.linalg.solve(ph[index] + noise, ph.T).T
+    keep = np.eye(len(belief.mean))
+    keep[:, index] -= gain
+    return Belief(
+        at_ns=belief.at_ns,
+        captured_ns=captured_ns(sample),
+        mean=belief.mean + gain @ (values - belief.mean[index]),
+        cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+    )
+
+
+def _shown(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
+    """Values that a sample shows (positions, then velocities if it has them) and their variances."""
+    parameters, axes = kalman.parameters, kalman.axes
+    values = _of_axes(sample.position_m, axes)
+    variances = [max(sample.std_m, parameters.position_std_m) ** 2] * len(axes)
+    if sample.velocity_mps is not None:
+        values += _of_axes(sample.velocity_mps, axes)
+        variances += [parameters.velocity_std_mps**2] * len(axes)
+    return np.array(values), np.array(variances)
+
+
+def _of_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
+    return [vector[axis] for axis in axes]
+
+
+def _symmetric(matrix: Array) -> Array:
+    return (matrix + matrix.T) * 0.5

@@ -1,0 +1,67 @@
+"""Exact propagation of state and disturbance over any part of a Δt interval, fast enough for every tick."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.plant import Plant
+
+Array = NDArray[np.float64]
+
+# exp(G Δt s) is entire in s: this many Chebyshev terms on [0, 1] reach rounding for any plant whose
+# fastest time constant is above a twentieth of Δt.
+_TERMS = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation:
+    """z(t + dt) = F(dt) z(t) + G(dt) u for z = (x, w), u and w held; 0 < dt <= Δt.
+
+    Attributes:
+        dt_ns: Δt [ns].
+        whole: F and G side by side over Δt (n_x + n_w, n_x + n_w + n_u).
+        series: Chebyshev coefficients of the same in 2 dt/Δt - 1 (terms, its entries).
+    """
+
+    dt_ns: int
+    whole: Array
+    series: Array
+
+    def over(self, dt_ns: int) -> tuple[Array, Array]:
+        """(F, G) over `dt_ns`, 0 < dt_ns <= Δt."""
+        if dt_ns == self.dt_ns:
+            joint = self.whole
+        else:
+            angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
+            joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
+        n_z = joint.shape[0]
+        return joint[:, :n_z], joint[:, n_z:]
+
+
+_ORDERS = np.arange(_TERMS, dtype=np.float64)
+
+
+def make_propagation(plant: Plant, dt_ns: int) -> Propagation:
+    """Sample `plant.transition` at the Chebyshev nodes of (0, Δt) and fit the series.
+
+    `plant.transition` takes a matrix exponential each time; a tick cannot afford that.
+    """
+    angles = (np.arange(_TERMS) + 0.5) * math.pi / _TERMS
+    samples = np.array([_joint(plant, plant.dt_s * 0.5 * (1.0 + math.cos(angle))).ravel() for angle in angles])
+    series = 2.0 / _TERMS * np.cos(np.outer(_ORDERS, angles)) @ samples
+    series[0] *= 0.5
+    whole = _joint(plant, plant.dt_s)
+    for array in (series, whole):
+        array.flags.writeable = False
+    return Propagation(dt_ns=dt_ns, whole=whole, series=series)
+
+
+def _joint(plant: Plant, dt_s: float) -> Array:
+    """[[A, E, B], [0, I, 0]] over dt_s."""
+    a, b, e = plant.transition(dt_s)
+    n_w = plant.n_w
+    return np.block([[a, e, b], [np.zeros((n_w, plant.n_x)), np.eye(n_w), np.zeros((n_w, plant.n_u))]])

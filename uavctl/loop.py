@@ -1,0 +1,182 @@
+"""The control loop without its clock and sockets: bytes in, decisions, bytes out.
+
+The daemon runs it in real time, the simulator in lockstep, and replay from a recording. Whatever
+it learns and chooses goes to the sink, in the order in which it happened.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from uavctl.config import Config
+from uavctl.data import (
+    ControlMode,
+    Datagram,
+    Decision,
+    Estimate,
+    Event,
+    Outgoing,
+    Plan,
+    PositionSample,
+    Record,
+    Sink,
+    StepInput,
+    Timing,
+    VehicleStatus,
+)
+from uavctl.flight.step import Controller, StepOutput, initial_state, step
+from uavctl.mavlink.link import Link
+from uavctl.mavlink.mode import HandOver, Sending
+
+VEHICLE = "vehicle"
+MOCAP = "mocap"
+SECOND_NS = 1_000_000_000
+
+
+def raw_topic(link: str, *, outgoing: bool) -> str:
+    """Topic of a connection's raw bytes in one direction."""
+    return f"/raw/{link}/{'out' if outgoing else 'in'}"
+
+
+def make_links(config: Config) -> dict[str, Link]:
+    """The connections' protocol states: one for both roles when the two URLs are the same."""
+    shared = config.daemon.vehicle == config.daemon.mocap
+    names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
+    return {
+        name: Link(
+            name,
+            roles=frozenset(roles),
+            daemon=config.daemon,
+            frame=config.frame,
+            clock=config.clock,
+            source=config.source,
+            estimator=config.estimator,
+        )
+        for name, roles in names.items()
+    }
+
+
+class ControlLoop:
+    """One vehicle's controller with its MAVLink links; implements `uavctl.data.Flyer`.
+
+    `stopwatch` gives nanoseconds for the timing records only; no decision depends on it.
+    """
+
+    def __init__(self, config: Config, controller: Controller, sink: Sink, stopwatch: Callable[[], int]) -> None:
+        self._controller = controller
+        self._sink = sink
+        self._stopwatch = stopwatch
+        self._links = make_links(config)
+        self._hand_over = HandOver()
+        self._state = initial_state(controller)
+        self._inbox: deque[tuple[int, PositionSample | VehicleStatus]] = deque()
+        self._next_stats_ns: int | None = None
+        self.vehicle: VehicleStatus | None = None
+        self.decision: Decision | None = None
+        self.estimate: Estimate | None = None
+        self.plan: Plan | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the vehicle has been handed over and nothing more will be sent."""
+        return self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+        """Take one datagram that arrived at `at_ns`; ticks before that time will not see it."""
+        self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
+        for item in self._links[link].receive(data, at_ns):
+            if isinstance(item, Event):
+                self._put("/uavctl/event", at_ns, item)
+            else:
+                self._inbox.append((at_ns, item))
+
+    def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> tuple[Outgoing, ...]:
+        """Run the control tick of grid time `at_ns`; returns the bytes to send."""
+        begun = self._stopwatch()
+        inp = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=self._take_due(at_ns),
+            vehicle=self.vehicle,
+            missed_ticks=missed_ticks,
+            stop=stop,
+        )
+        self._put("/uavctl/step_input", at_ns, inp)
+        self._state, out = step(self._state, inp, self._controller)
+        step_ns = self._stopwatch() - begun
+        self._remember(out)
+        self._record(out, at_ns)
+        outgoing = self._outgoing(out, at_ns)
+        for one in outgoing:
+            sent = Datagram(at_ns=at_ns, link=one.link, outgoing=True, data=one.data)
+            self._put(raw_topic(one.link, outgoing=True), at_ns, sent)
+        self._record_stats(at_ns)
+        self._last_step_ns = step_ns
+        return outgoing
+
+    def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
+        """Record what the shell measured around the last tick."""
+        estimate = self.estimate
+        self._put(
+            "/uavctl/timing",
+            at_ns,
+            Timing(
+                tick=tick,
+                at_ns=at_ns,
+                lateness_ns=lateness_ns,
+                step_ns=self._last_step_ns,
+                send_ns=send_ns,
+                capture_to_send_ns=None if estimate is None else at_ns + send_ns - estimate.captured_ns,
+            ),
+        )
+
+    def _take_due(self, at_ns: int) -> tuple[PositionSample, ...]:
+        """Samples that arrived up to `at_ns`; vehicle states among them are taken over."""
+        samples = []
+        while self._inbox and self._inbox[0][0] <= at_ns:
+            item = self._inbox.popleft()[1]
+            if isinstance(item, VehicleStatus):
+                self.vehicle = item
+                self._put("/uavctl/vehicle", item.at_ns, item)
+            else:
+                samples.append(item)
+        return tuple(samples)
+
+    def _remember(self, out: StepOutput) -> None:
+        self.decision = out.decision
+        self.estimate = out.estimate
+        self.plan = out.plan or self.plan
+
+    def _record(self, out: StepOutput, at_ns: int) -> None:
+        if out.estimate is not None:
+            self._put("/uavctl/estimate", at_ns, out.estimate)
+        if out.plan is not None:
+            self._put("/uavctl/plan", at_ns, out.plan)
+        self._put("/uavctl/decision", at_ns, out.decision)
+        if out.setpoint is not None:
+            self._put("/uavctl/setpoint", at_ns, out.setpoint)
+        for event in out.events:
+            self._put("/uavctl/event", at_ns, event)
+
+    def _outgoing(self, out: StepOutput, at_ns: int) -> tuple[Outgoing, ...]:
+        sending, events = self._hand_over.update(at_ns, self.vehicle, ready=out.setpoint is not None, land=out.land)
+        for event in events:
+            self._put("/uavctl/event", at_ns, event)
+        messages = [Outgoing(link=name, data=data) for name, link in self._links.items() for data in link.due(at_ns)]
+        if sending is Sending.SETPOINTS and out.setpoint is not None:
+            messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].setpoint(out.setpoint)))
+        if sending is Sending.LAND:
+            messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].land(at_ns)))
+        return tuple(messages)
+
+    def _record_stats(self, at_ns: int) -> None:
+        if self._next_stats_ns is None:
+            self._next_stats_ns = at_ns
+        if at_ns >= self._next_stats_ns:
+            self._next_stats_ns += SECOND_NS
+            for link in self._links.values():
+                self._put("/uavctl/link", at_ns, link.stats(at_ns))
+
+    def _put(self, topic: str, at_ns: int, record: Record) -> None:
+        self._sink.put(topic, at_ns, record)

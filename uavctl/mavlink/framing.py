@@ -1,0 +1,136 @@
+"""Raw MAVLink frames in bytes: where one begins and ends, and whether its checksum is right.
+
+Frame layout: https://mavlink.io/en/guide/serialization.html. Whatever is no frame is skipped and
+counted by reason, and the search goes on at the next byte that could begin one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+_HEADER_V1, _HEADER_V2, _CHECKSUM = 6, 10, 2
+_INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
+_MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
+
+
+class BadBytes(StrEnum):
+    """Why bytes were skipped."""
+
+    CRC = "crc"  # a frame with a wrong checksum
+    TRUNCATED = "truncated"  # a frame that the data ends in
+    GARBAGE = "garbage"  # a run of bytes that no frame begins in
+    OVERSIZE = "oversize"  # a datagram longer than any that peers send
+    UNKNOWN = "unknown-message"  # an id that the dialect has not: passed over by its length
+
+
+class RawFrame(NamedTuple):
+    """One whole frame with a right checksum."""
+
+    data: bytes
+    message_id: int
+
+
+@dataclass
+class Scan:
+    """What a scan found: frames, skips by reason, and the number of bytes it is done with."""
+
+    frames: list[RawFrame] = field(default_factory=list)
+    bad: Counter[str] = field(default_factory=Counter)
+    consumed: int = 0
+
+
+class _Shape(NamedTuple):
+    """What the first bytes of a frame promise."""
+
+    length: int
+    message_id: int
+    signature: int  # bytes after the checksum
+
+
+def _shape(data: bytes, at: int) -> _Shape | None:
+    """Shape of the frame at `at`; None while too few bytes are there to tell. `data[at]` is a magic byte."""
+    if data[at] == mavlink.PROTOCOL_MARKER_V1:
+        if len(data) - at < _HEADER_V1:
+            return None
+        return _Shape(_HEADER_V1 + data[at + 1] + _CHECKSUM, data[at + 5], 0)
+    if len(data) - at < _HEADER_V2:
+        return None
+    signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
+    message_id = int.from_bytes(data[at + 7 : at + 10], "little")
+    return _Shape(_HEADER_V2 + data[at + 1] + _CHECKSUM + signature, message_id, signature)
+
+
+def _is_foreign(data: bytes, at: int) -> bool:
+    """Whether a version 2 header has incompatibility flags that nobody has defined."""
+    return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
+
+
+def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
+    """Whether the checksum of a frame of a known id is right."""
+    end = shape.length - shape.signature - _CHECKSUM
+    crc = mavlink.x25crc(frame[1:end])
+    crc.accumulate(bytes((mavlink.mavlink_map[shape.message_id].crc_extra,)))
+    return crc.crc == int.from_bytes(frame[end : end + _CHECKSUM], "little")
+
+
+def scan(data: bytes, *, final: bool) -> Scan:
+    """Find the frames in some bytes.
+
+    Args:
+        data: a datagram, or what has come of a stream.
+        final: whether the data ends here. If not, a frame that it ends in is left for later.
+
+    Returns:
+        Frames in order, what was skipped, and how many bytes need not be seen again.
+    """
+    result = Scan()
+    at, skipping = 0, False
+    while at < len(data):
+        reason = _take(data, at, final=final, result=result)
+        if reason is _WAIT:
+            break
+        if reason is None:
+            at, skipping = result.consumed, False
+            continue
+        # One broken frame or one run of garbage counts once, however many bytes of it are tried.
+        if not skipping:
+            result.bad[reason] += 1
+        at, skipping = _next_magic(data, at + 1), True
+        result.consumed = at
+    return result
+
+
+_WAIT = "wait"
+
+
+def _take(data: bytes, at: int, *, final: bool, result: Scan) -> str | None:
+    """Try for a frame at `at`: None if it was taken, else the reason to skip a byte, or `_WAIT` for more data."""
+    if data[at] not in _MAGIC or _is_foreign(data, at):
+        return BadBytes.GARBAGE
+    shape = _shape(data, at)
+    if shape is None or at + shape.length > len(data):
+        return BadBytes.TRUNCATED if final else _WAIT
+    frame = data[at : at + shape.length]
+    end = at + shape.length
+    if shape.message_id not in mavlink.mavlink_map:
+        # Nothing but the length can be checked: believe it only if a frame, or nothing, follows.
+        if end < len(data) and data[end] not in _MAGIC:
+            return BadBytes.GARBAGE
+        result.bad[BadBytes.UNKNOWN] += 1
+    elif _checksum_fits(frame, shape):
+        result.frames.append(RawFrame(frame, shape.message_id))
+    else:
+        return BadBytes.CRC
+    result.consumed = end
+    return None
+
+
+def _next_magic(data: bytes, start: int) -> int:
+    """Index of the next byte that could begin a frame, or the end."""
+    found = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
+    return min(found, default=len(data))

@@ -1,0 +1,185 @@
+"""Stacked prediction of one component: means, disturbance feedback, covariance cost.
+
+x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ and
+rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the entries
+of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from uavctl.errors import DesignError
+from uavctl.smpc.components import Component
+from uavctl.smpc.schedule import Schedule
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Affine:
+    """offset + matrix θ, a vector (m,) affine in θ."""
+
+    offset: Array
+    matrix: sparse.csr_array
+
+    def at(self, theta: Array) -> Array:
+        """Value (m,) at θ."""
+        value: Array = self.offset + self.matrix @ theta
+        return value
+
+
+class Horizon:
+    """Prediction of one component over H steps.
+
+    Attributes:
+        component: The component.
+        steps: H.
+        tau: Delay τ of the terminal law.
+        free: N = H - τ, the number of stages with a free mean input.
+        gains: (t, r, input, disturbance) of each entry of θ.
+        phi: Φ_t (H+1, n_x, n_x).
+        gamma: Γ_t (H+1, n_x, N n_u).
+        gamma_eq: Γ^eq_t (H+1, n_x, n_y).
+        p: Hessian (n_θ, n_θ) of the covariance cost ½ θᵀPθ + qᵀθ + c_0.
+        q: Its linear term (n_θ,).
+        c_0: Its constant: open-loop disturbances, terminal weight included.
+    """
+
+    def __init__(self, component: Component, steps: int, tau: int, schedule: Schedule) -> None:
+        """Predict `component` over `steps` steps.
+
+        Raises:
+            DesignError: The schedule feeds back a disturbance r >= N, for which the reduced terminal condition does
+                not hold.
+        """
+        self.component = component
+        self.steps = steps
+        self.tau = tau
+        self.free = steps - tau
+        n_u, self._n_w = component.b.shape[1], component.e.shape[1]
+        self.gains = tuple(
+            (t, r, i, j)
+            for t in range(steps)
+            for r in _fed_back(t, int(schedule.delays[t]), self.free)
+            for i in range(n_u)
+            for j in range(self._n_w)
+        )
+        powers = [np.eye(component.a.shape[0])]
+        for _ in range(steps):
+            powers.append(component.a @ powers[-1])
+        self.phi = np.array(powers)
+        self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
+        self._spread = component.e @ _root(component.w)
+        self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i E W^½
+        # θ multiplies w, not ω = W^-½ w: each gain acts on a row of W^½.
+        self._root_w = _root(component.w)
+        self.gamma, self.gamma_eq = self._means()
+        self.p, self.q, self.c_0 = self._covariance_cost()
+
+    @property
+    def n_theta(self) -> int:
+        """Number of gains."""
+        return len(self.gains)
+
+    def state_noise(self, t: int, c: Array) -> Affine:
+        """c x_t without its mean, c (m, n_x), as coefficients of ω: (m H n_w,), row by row."""
+        m = c.shape[0]
+        offset = np.zeros((m, self.steps, self._n_w))
+        for r in range(t):
+            offset[:, r] = c @ self._open[t - 1 - r]
+        effect = {s: c @ self._response[t - 1 - s] for s in range(t)}
+        return self._affine(offset, effect)
+
+    def input_noise(self, t: int, c: Array) -> Affine:
+        """c u_t without its mean, c (m, n_u), as coefficients of ω: (m H n_w,), row by row."""
+        return self._affine(np.zeros((c.shape[0], self.steps, self._n_w)), {t: c})
+
+    def terminal_noise(self) -> Affine:
+        """z = (x_N, u_N … u_{H-1}) as coefficients of the N older disturbances: (n_z N n_w,), row by row."""
+        n_x, n_u = self.component.b.shape
+        parts = [self.state_noise(self.free, np.eye(n_x))]
+        parts += [self.input_noise(t, np.eye(n_u)) for t in range(self.free, self.steps)]
+        stacked = _stack(parts)
+        columns = np.arange(stacked.offset.size) % (self.steps * self._n_w)
+        old = np.flatnonzero(columns < self.free * self._n_w)  # no gain acts on the others, nor do they reach z
+        return Affine(stacked.offset[old], stacked.matrix[old])
+
+    def _affine(self, offset: Array, effect: dict[int, Array]) -> Affine:
+        """Add the gains: `effect[s]` (m, n_u) is what u_s does to the rows."""
+        m, width = offset.shape[0], self.steps * self._n_w
+        rows: list[int] = []
+        columns: list[int] = []
+        values: list[float] = []
+        for k, (s, r, i, j) in enumerate(self.gains):
+            if s not in effect:
+                continue
+            for row in range(m):
+                for l in np.flatnonzero(self._root_w[j]):
+                    rows.append(row * width + r * self._n_w + int(l))
+                    columns.append(k)
+                    values.append(float(effect[s][row, i] * self._root_w[j, l]))
+        matrix = sparse.csr_array((values, (rows, columns)), shape=(m * width, self.n_theta))
+        matrix.eliminate_zeros()
+        return Affine(offset.ravel(), matrix)
+
+    def _means(self) -> tuple[Array, Array]:
+        n_x, n_u = self.component.b.shape
+        gamma = np.zeros((self.steps + 1, n_x, self.free * n_u))
+        gamma_eq = np.zeros((self.steps + 1, n_x, self.component.u_eq.shape[1]))
+        for t in range(self.steps):
+            gamma[t + 1] = self.component.a @ gamma[t]
+            gamma_eq[t + 1] = self.component.a @ gamma_eq[t]
+            if t < self.free:
+                gamma[t + 1, :, t * n_u : (t + 1) * n_u] += self.component.b
+            else:
+                gamma_eq[t + 1] += self.component.b @ self.component.u_eq
+        return gamma, gamma_eq
+
+    def _covariance_cost(self) -> tuple[Array, Array, float]:
+        """E of the stage costs (3) and of the terminal cost in (18), means taken off."""
+        part = self.component
+        state, control, terminal = _root(part.q_x), _root(part.q_u), _root(part.p_xi)
+        terms = [self.state_noise(t, state) for t in range(self.steps)]
+        terms += [self.input_noise(t, control) for t in range(self.steps)]
+        n_x = part.a.shape[0]
+        stacked = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
+        width = self.steps * self._n_w
+        weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(width), format="csr")
+        xi = _stack(stacked)
+        terms.append(Affine(weight @ xi.offset, sparse.csr_array(weight @ xi.matrix)))
+        everything = _stack(terms)
+        gram = (everything.matrix.T @ everything.matrix).toarray()
+        linear = everything.matrix.T @ everything.offset
+        return 2.0 * gram, 2.0 * linear, float(everything.offset @ everything.offset)
+
+
+def _fed_back(t: int, delay: int, free: int) -> range:
+    """Disturbances r that M_{t,r} feeds back."""
+    if t >= free and t - delay >= free:
+        raise DesignError(
+            "schedule.delays",
+            f"delay {delay} in stage {t} feeds back a disturbance of the last {t - free + 1} stages of the terminal law",
+            f"use at least {t - free + 1} there",
+        )
+    return range(max(0, min(t - delay + 1, free)))
+
+
+def _root(matrix: Array) -> Array:
+    """Symmetric root of a positive semi-definite matrix; diagonal stays diagonal."""
+    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
+        return np.diag(np.sqrt(np.diagonal(matrix)))
+    values, vectors = np.linalg.eigh(matrix)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root
+
+
+def _stack(parts: list[Affine]) -> Affine:
+    return Affine(
+        np.concatenate([part.offset for part in parts]),
+        sparse.csr_array(sparse.vstack([part.matrix for part in parts])),
+    )
