@@ -72,7 +72,7 @@ class Segment:
         """
         head = self._channel_records(entry.definition)
         size = len(head) + _MESSAGE.size + len(entry.data)
-        full = self.open_entries and self._size + size > self._chunk_bytes
+        full = bool(self.open_entries) and self._size + size > self._chunk_bytes
         self.open_entries.append(entry)
         if full:
             self._commit(self.open_entries[:-1])

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-import matplotlib
+from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 # role -> (light, dark). Okabe and Ito's colours, which colour-blind people can tell apart; lifted for dark pages.
@@ -33,7 +32,7 @@ RAMP = ((0x2A, 0x86, 0xD1), (0x8B, 0x74, 0xC9), (0xCF, 0x6A, 0x94), (0xE0, 0x7B,
 WIDTH_IN = 4.7
 FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 
-_STYLE = {
+_STYLE: dict[str, object] = {
     "svg.fonttype": "none",
     "text.parse_math": False,
     "font.size": 9,
@@ -112,19 +111,18 @@ class Canvas:
 @contextmanager
 def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[Canvas]:
     """A styled figure; `key` keeps its ids apart from those of the page's other figures."""
-    style: dict[str, object] = {**_STYLE, **{name: colour(role) for name, role in _ROLES.items()}}
-    with matplotlib.rc_context({**style, "svg.hashsalt": key}):
+    with style.context([_STYLE, {name: colour(role) for name, role in _ROLES.items()}, {"svg.hashsalt": key}]):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         one = Canvas(figure)
         yield one
         out = io.StringIO()
-        FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
         one.svg = _inline(out.getvalue(), key)
 
 
 def standalone(svg: str, label: str) -> str:
     """An SVG file of its own from an inline one: colours, background and fonts come with it."""
-    style = (
+    look = (
         f"<style>:root{{{css_variables(False)}}}"
         f"@media (prefers-color-scheme:dark){{:root{{{css_variables(True)}}}}}"
         f"text{{font-family:{FONT}!important}}</style>"
@@ -132,7 +130,7 @@ def standalone(svg: str, label: str) -> str:
     )
     opened = svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" role="img" ', 1)
     head, _, tail = opened.partition(">")
-    return f"{head}>{style}{tail}"
+    return f"{head}>{look}{tail}"
 
 
 def _inline(text: str, key: str) -> str:

@@ -45,9 +45,7 @@ class Pilot:
         failsafe: whether the external mode was lost to silence.
     """
 
-    def __init__(
-        self, kind: Personality, vehicle: Vehicle, start_ns: int, *, timeout_ns: int, airborne: bool
-    ) -> None:
+    def __init__(self, kind: Personality, vehicle: Vehicle, start_ns: int, *, timeout_ns: int, airborne: bool) -> None:
         self._kind = kind
         self._vehicle = vehicle
         self._timeout_ns = timeout_ns

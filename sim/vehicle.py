@@ -103,10 +103,13 @@ def linear_model(plant: PlantConfig) -> LinearModel:
 def _drag_lag_flow(plant: PlantConfig) -> Array:
     """Continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a, each axis."""
     n = len(plant.axes)
-    axis = [[[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]] for c, lag in zip(plant.drag_1ps, plant.lag_s)]
+    axis = [
+        np.array([[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]])
+        for c, lag in zip(plant.drag_1ps, plant.lag_s, strict=True)
+    ]
     flow = np.zeros((5 * n, 5 * n))
     flow[: 3 * n, : 3 * n] = block_diag(*axis)
-    for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s)):
+    for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s, strict=True)):
         flow[3 * i + 2, 3 * n + i] = gain / lag
         flow[3 * i + 1, 4 * n + i] = 1.0
     return flow
@@ -141,7 +144,7 @@ class Vehicle:
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
         self._offset_m = config.sim.start_position_m
         x = np.zeros(self.model.a.shape[0])
-        for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index):
+        for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
             x[p] = config.sim.start_position_m[axis]
             x[v] = config.sim.start_velocity_mps[axis]
         self._anchor_x: Array = x  # state at the last change of u or w
@@ -187,7 +190,7 @@ class Vehicle:
     def _vec3(self, index: tuple[int, ...], default: Vec3) -> Vec3:
         values = list(default)
         state = self.state
-        for axis, i in zip(self.model.axes, index):
+        for axis, i in zip(self.model.axes, index, strict=True):
             values[axis] = float(state[i])
         return values[0], values[1], values[2]
 
@@ -226,7 +229,7 @@ class Vehicle:
     def rest(self) -> None:
         """Stand on the floor (z = 0): at rest, with no input, until `grounded` is cleared."""
         x = np.zeros_like(self.state)
-        for axis, p in zip(self.model.axes, self.model.position_index):
+        for axis, p in zip(self.model.axes, self.model.position_index, strict=True):
             x[p] = 0.0 if NED_AXES[axis] == "down" else self.state[p]
         self._x = self._anchor_x = x
         self._anchor_ns = self.now_ns

@@ -5,7 +5,7 @@ A state machine of four modes, each with a time limit:
     BRAKE --slow enough, or brake_s over--> HOLD --hold_s over, if land--> LAND --next tick--> STOPPED
     BRAKE --the same, but the operator asked for the hand-over--> LAND if configured, else STOPPED
 
-The way back to TRACK is not decided here; `recoverable` says from where there is one.
+The way back to TRACK, from BRAKE and HOLD only, is decided at Δt boundaries (`uavctl.flight.decide`).
 """
 
 from __future__ import annotations
@@ -50,11 +50,6 @@ class Fallback:
     mode: ControlMode
     since_ns: int
     stopping: bool = False
-
-    @property
-    def recoverable(self) -> bool:
-        """Whether fresh samples may lead back to TRACK."""
-        return self.mode in (ControlMode.BRAKE, ControlMode.HOLD) and not self.stopping
 
     @property
     def ended(self) -> bool:

@@ -37,11 +37,19 @@ class RawFrame(NamedTuple):
 
 @dataclass
 class Scan:
-    """What a scan found: frames, skips by reason, and the number of bytes it is done with."""
+    """What a scan found.
+
+    Attributes:
+        frames: whole frames in order.
+        bad: skips by reason.
+        consumed: number of bytes that need not be seen again.
+        in_step: whether the last bytes seen were a frame, so that the next byte should begin one.
+    """
 
     frames: list[RawFrame] = field(default_factory=list)
     bad: Counter[str] = field(default_factory=Counter)
     consumed: int = 0
+    in_step: bool = True
 
 
 class _Shape(NamedTuple):
@@ -78,56 +86,54 @@ def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
     return crc.crc == int.from_bytes(frame[end : end + _CHECKSUM], "little")
 
 
-def scan(data: bytes, *, final: bool) -> Scan:
+def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
     """Find the frames in some bytes.
 
     Args:
         data: a datagram, or what has come of a stream.
         final: whether the data ends here. If not, a frame that it ends in is left for later.
+        in_step: whether the first byte should begin a frame (see `Scan`).
 
     Returns:
-        Frames in order, what was skipped, and how many bytes need not be seen again.
+        What was found. One broken frame, or one run of garbage, counts once.
     """
-    result = Scan()
-    at, skipping = 0, False
-    while at < len(data):
-        reason = _take(data, at, final=final, result=result)
+    result = Scan(in_step=in_step)
+    while result.consumed < len(data):
+        end, reason = _try_frame(data, result, final=final)
         if reason is _WAIT:
             break
-        if reason is None:
-            at, skipping = result.consumed, False
-            continue
-        # One broken frame or one run of garbage counts once, however many bytes of it are tried.
-        if not skipping:
-            result.bad[reason] += 1
-        at, skipping = _next_magic(data, at + 1), True
-        result.consumed = at
+        if end is None:
+            if result.in_step:
+                result.bad[reason] += 1
+            end = _next_magic(data, result.consumed + 1)
+        result.in_step = reason is _TAKEN
+        result.consumed = end
     return result
 
 
-_WAIT = "wait"
+_TAKEN, _WAIT = "taken", "wait"
 
 
-def _take(data: bytes, at: int, *, final: bool, result: Scan) -> str | None:
-    """Try for a frame at `at`: None if it was taken, else the reason to skip a byte, or `_WAIT` for more data."""
+def _try_frame(data: bytes, result: Scan, *, final: bool) -> tuple[int | None, str]:
+    """Try for a frame at `result.consumed`: (its end, `_TAKEN`), or (None, why not)."""
+    at = result.consumed
     if data[at] not in _MAGIC or _is_foreign(data, at):
-        return BadBytes.GARBAGE
+        return None, BadBytes.GARBAGE
     shape = _shape(data, at)
     if shape is None or at + shape.length > len(data):
-        return BadBytes.TRUNCATED if final else _WAIT
-    frame = data[at : at + shape.length]
+        return None, BadBytes.TRUNCATED if final else _WAIT
     end = at + shape.length
     if shape.message_id not in mavlink.mavlink_map:
-        # Nothing but the length can be checked: believe it only if a frame, or nothing, follows.
-        if end < len(data) and data[end] not in _MAGIC:
-            return BadBytes.GARBAGE
+        # Nothing but the length can be checked: believe it only between frames.
+        if not result.in_step or (end < len(data) and data[end] not in _MAGIC):
+            return None, BadBytes.GARBAGE
         result.bad[BadBytes.UNKNOWN] += 1
-    elif _checksum_fits(frame, shape):
-        result.frames.append(RawFrame(frame, shape.message_id))
-    else:
-        return BadBytes.CRC
-    result.consumed = end
-    return None
+        return end, _TAKEN
+    frame = data[at:end]
+    if not _checksum_fits(frame, shape):
+        return None, BadBytes.CRC
+    result.frames.append(RawFrame(frame, shape.message_id))
+    return end, _TAKEN
 
 
 def _next_magic(data: bytes, start: int) -> int:

@@ -120,8 +120,7 @@ class Program:
 
     def _add_cost(self) -> None:
         horizon, part, design, layout = self.horizon, self.part, self.design, self.layout
-        state, control = np.linalg.cholesky(part.q_u), _factor(part.q_x)
-        state, control = control, state.T
+        state, control = _factor(part.q_x), _factor(part.q_u)
         x_s, u_s = part.x_eq @ self._y, part.u_eq @ self._y
         n_u = part.b.shape[1]
         for t in range(horizon.free):

@@ -1,0 +1,252 @@
+"""What a recording's file still holds: whole chunks, and where it is damaged.
+
+Nothing of a chunk is used before its checksum was right. After damage the search goes on byte by
+byte for the next whole chunk, since a flipped length would lead astray.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from logs.segment import MAGIC
+from logs.topics import Definition, definition
+from uavctl.errors import RecordingError
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
+_CHUNK_FIELDS = _CHUNK.size - _RECORD.size
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
+_DATA_END = struct.Struct("<BQI")
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message whose chunk has the right checksum."""
+
+    definition: Definition
+    sequence: int
+    at_ns: int
+    data: bytes
+    offset: int  # of its chunk in the file
+    repeated: bool = False  # the header, once more, at the start of a later segment
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes of a file that cannot be trusted."""
+
+    path: Path
+    offset: int
+    length: int
+    reason: str
+    torn: bool = False  # the file just ends too early
+
+    def __str__(self) -> str:
+        return f"{self.path}, offset {self.offset}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class End:
+    """The file is read; `finished` if it has its index and footer."""
+
+    finished: bool
+
+
+class _BadRecordError(Exception):
+    """What stands here is not the record that it should be."""
+
+
+Buffer = bytes | mmap.mmap
+
+
+def scan(path: Path) -> Iterator[Message | Damage | End]:
+    """Messages and damage of one file in file order, and then its `End`.
+
+    Raises:
+        RecordingError: the file cannot be read, or is no recording at all.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:  # ended between creating and first writing
+                yield End(finished=False)
+                return
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                yield from _scan(path, data)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
+    size = len(data)
+    at = len(MAGIC)
+    damaged = False
+    if data[:at] != MAGIC:
+        if MAGIC.startswith(data[:at]):
+            yield Damage(path, 0, size, "torn in the first bytes", torn=True)
+            yield End(finished=False)
+            return
+        first = _next_chunk(data, 0)
+        if first is None:
+            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk)")
+        yield Damage(path, 0, first, "damaged before the first whole chunk")
+        at, damaged = first, True
+    contents = _Contents()
+    while at < size:
+        opcode = data[at]
+        try:
+            length = _whole(data, at)
+            if opcode == Opcode.CHUNK:
+                yield from contents.messages(_chunk(data, at, length), at)
+            if opcode == Opcode.DATA_END:
+                stored = _DATA_END.unpack_from(data, at)[2]
+                if not damaged and stored != _crc(data, at):
+                    yield Damage(path, at, 0, "every chunk is whole, but something between them is damaged")
+                yield End(finished=_summary_ok(data, at + length))
+                return
+            at += length
+        except _BadRecordError as error:
+            later = _next_chunk(data, at + 1)
+            if later is None:
+                later = _data_end(data)
+            torn = later is None and data[-len(MAGIC) :] != MAGIC
+            later = size if later is None else later
+            yield Damage(path, at, later - at, f"chunk or index {error}", torn=torn)
+            at, damaged = later, True
+    yield End(finished=False)
+
+
+class _Contents:
+    """Messages of chunks; remembers the schemas that it has seen."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, Schema] = {}
+        self._known: dict[bytes, tuple[int, Definition]] = {}
+
+    def messages(self, content: bytes, offset: int) -> Iterator[Message]:
+        """Messages of one chunk, whose checksum is right."""
+        channels: dict[int, Definition] = {}
+        at = 0
+        while at < len(content):
+            opcode, length = _RECORD.unpack_from(content, at)
+            at += _RECORD.size
+            if opcode == Opcode.MESSAGE:
+                channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
+                yield Message(channels[channel], sequence, at_ns, content[at + _MESSAGE.size : at + length], offset)
+            elif opcode == Opcode.CHANNEL:
+                channel, channels[channel] = self._channel(content[at : at + length])
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
+                self._schemas[schema.id] = schema
+            at += length
+
+    def _channel(self, record: bytes) -> tuple[int, Definition]:
+        if record not in self._known:
+            channel = Channel.read(ReadDataStream(BytesIO(record)))
+            schema = self._schemas.get(channel.schema_id)
+            self._known[record] = (channel.id, _definition(channel, schema))
+        return self._known[record]
+
+
+def _definition(channel: Channel, schema: Schema | None) -> Definition:
+    if schema is not None:
+        return Definition(channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
+    try:
+        return definition(channel.topic)  # the chunk with its schema is damaged
+    except KeyError:
+        return Definition(channel.topic, channel.message_encoding)
+
+
+def _whole(data: Buffer, at: int) -> int:
+    """Length of the record at `at`, its head included, if it may stand between chunks and is not torn."""
+    if at + _RECORD.size > len(data):
+        raise _BadRecordError("is torn")
+    opcode, length = _RECORD.unpack_from(data, at)
+    if at + _RECORD.size + length > len(data):
+        raise _BadRecordError("is torn")
+    inner = at + _RECORD.size
+    if opcode == Opcode.CHUNK:
+        good = length >= _CHUNK_FIELDS
+    elif opcode == Opcode.MESSAGE_INDEX:
+        good = length >= 6 and struct.unpack_from("<I", data, inner + 2)[0] == length - 6
+    elif opcode == Opcode.DATA_END:
+        good = length == _DATA_END.size - _RECORD.size
+    elif opcode == Opcode.HEADER:
+        good = at == len(MAGIC) and _header_length(data, inner, length) == length
+    else:
+        good = False
+    if not good:
+        raise _BadRecordError("is damaged")
+    return int(_RECORD.size + length)
+
+
+def _header_length(data: Buffer, inner: int, length: int) -> int:
+    """Length of a header record as its two strings tell; -1 if they do not fit."""
+    if length < 8:
+        return -1
+    (profile,) = struct.unpack_from("<I", data, inner)
+    if profile > length - 8:
+        return -1
+    return int(8 + profile + struct.unpack_from("<I", data, inner + 4 + profile)[0])
+
+
+def _chunk(data: Buffer, at: int, length: int) -> bytes:
+    """Content of the chunk at `at`, if its checksum is right."""
+    _, _, first, last, size, crc, name, inner = _CHUNK.unpack_from(data, at)
+    if name != 0 or inner != length - _CHUNK.size or size != inner or first > last:
+        raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
+    content = data[at + _CHUNK.size : at + length]
+    if zlib.crc32(content) != crc:
+        raise _BadRecordError("has a wrong checksum")
+    return content
+
+
+def _next_chunk(data: Buffer, start: int) -> int | None:
+    """Offset of the next whole chunk from `start` on."""
+    at = data.find(bytes([Opcode.CHUNK]), start)
+    while 0 <= at <= len(data) - _CHUNK.size:
+        try:
+            _chunk(data, at, _whole(data, at))
+        except _BadRecordError:
+            at = data.find(bytes([Opcode.CHUNK]), at + 1)
+        else:
+            return at
+    return None
+
+
+def _data_end(data: Buffer) -> int | None:
+    """Offset of the end of data as the footer tells, if the footer and what it points to are whole."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < 0:
+        return None
+    opcode, _, start, _, _ = _FOOTER.unpack_from(data, at)
+    end = start - _DATA_END.size
+    if opcode != Opcode.FOOTER or not len(MAGIC) <= end < at or data[end] != Opcode.DATA_END:
+        return None
+    return int(end) if _summary_ok(data, start) else None
+
+
+def _crc(data: Buffer, end: int) -> int:
+    """CRC-32 of everything before `end`."""
+    with memoryview(data) as view:
+        return zlib.crc32(view[:end])
+
+
+def _summary_ok(data: Buffer, start: int) -> bool:
+    """Whether all from `start` to the end is a summary with the right checksum, footer and magic."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < start or data[at + _FOOTER.size :] != MAGIC:
+        return False
+    opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
+    covered = data[start : at + _FOOTER.size - 4]
+    return bool(opcode == Opcode.FOOTER and length == 20 and summary_start == start and crc == zlib.crc32(covered))

@@ -1,0 +1,238 @@
+"""Where it flew: the path within its limits, each axis over time, and plans against what was flown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from logs.design_view import AXIS_NUMBER, DesignView, Floats
+from logs.flight_data import FALLBACK, FlightData
+from logs.summary import position_error_m, state_outside
+from logs.svg import Drawing, canvas, colour
+from uavctl.data import Plan
+
+POINTS = 1200
+PLANS_SHOWN = 6
+ARRIVED_SHARE = 0.1
+DASHED = (0, (5, 3))
+# Axes as people see them: down is drawn as height, upwards.
+SEEN = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("height", -1.0)}
+RATE = {"north": "speed north", "east": "speed east", "down": "climb rate"}
+
+
+def path(flight: FlightData) -> Iterator[Drawing]:
+    """The path from above, and from the side if the plant moves vertically."""
+    yield path_view(flight, "path-above", "From above", ("east", "north"))
+    if "down" in flight.design.axes:
+        yield path_view(flight, "path-side", "From the south", ("east", "down"))
+
+
+def path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, str]) -> Drawing:
+    """Path, samples, limits, start and target in one plane."""
+    (x_name, _), (y_name, _) = (SEEN[axis] for axis in axes_shown)
+    with canvas(key, 3.7) as one:
+        ax = one.axes(title, f"{x_name} [m]", f"{y_name} [m]")
+        draw_path(ax, flight, axes_shown)
+    label = f"Path seen {title[0].lower()}{title[1:]}: {x_name} and {y_name} in metres, within the position limits"
+    return Drawing(key, one.svg, label)
+
+
+def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None:
+    """Path, samples, limits, start and target on given axes, to scale."""
+    pick = [AXIS_NUMBER[axis] for axis in axes_shown]
+    sign = np.array([SEEN[axis][1] for axis in axes_shown])
+
+    def seen(positions: Floats) -> Floats:
+        return np.asarray(_thin(positions.reshape(-1, 3))[:, pick] * sign)
+
+    design = flight.design
+    samples = seen(np.array([s.position_m for s in flight.samples]))
+    estimate = seen(np.array([design.position_of(e.mean) for e in flight.estimates]))
+    truth = seen(np.array([t.position_m for t in flight.truths]))
+    target = seen(np.array([design.target_m]))
+    _draw_room(ax, design, axes_shown)
+    ax.plot(*samples.T, ".", ms=3.5, color=colour("sample"), alpha=0.8, zorder=2)
+    ax.plot(*estimate.T, color=colour("estimate"), lw=1.2, zorder=3)
+    ax.plot(*truth.T, color=colour("truth"), lw=1.5, zorder=4)
+    flown = truth if len(truth) else estimate
+    ax.plot(*flown[:1].T, "o", ms=6, mfc=colour("card"), mec=colour("truth"), mew=1.5, zorder=5)
+    ax.plot(*target.T, "*", ms=12, color=colour("target"), mec=colour("card"), mew=0.6, zorder=6)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.06)
+
+
+def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> None:
+    """Position limits as a frame; an open side is left open."""
+    (x0, x1), (y0, y1) = (_limits(design, axis) for axis in axes_shown)
+    if np.isfinite([x0, x1, y0, y1]).all():
+        corners = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
+        ax.plot(*corners, color=colour("limit"), lw=1.2, ls=DASHED, zorder=1)
+        return
+    for draw, sides in ((ax.axvline, (x0, x1)), (ax.axhline, (y0, y1))):
+        for side in sides:
+            if np.isfinite(side):
+                draw(side, color=colour("limit"), lw=1.2, ls=DASHED, zorder=1)
+
+
+def _limits(design: DesignView, axis: str) -> tuple[float, float]:
+    """Limits of an axis' position as it is drawn; infinite if open."""
+    if axis not in design.axes:
+        return -np.inf, np.inf
+    index = design.position_index[design.axes.index(axis)]
+    sides = sorted(SEEN[axis][1] * side for side in (design.state_box.lower[index], design.state_box.upper[index]))
+    return float(sides[0]), float(sides[1])
+
+
+def axes_over_time(flight: FlightData) -> Iterator[Drawing]:
+    """Position and velocity of each axis against their limits."""
+    for axis, position, velocity in zip(
+        flight.design.axes, flight.design.position_index, flight.design.velocity_index, strict=True
+    ):
+        yield _state_over_time(flight, axis, position, f"{SEEN[axis][0]} [m]", SEEN[axis][0].capitalize())
+        yield _state_over_time(flight, axis, velocity, f"{RATE[axis]} [m/s]", RATE[axis].capitalize())
+
+
+def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, title: str) -> Drawing:
+    key, sign = f"state-{index}", SEEN[axis][1]
+    outside = state_outside(flight)
+    with canvas(key, 2.3) as one:
+        ax = one.axes(title, "time [s]", y_label)
+        shade_fallback(ax, flight)
+        _draw_limits(ax, flight, index, sign)
+        estimate_s, estimate = thin(
+            flight.seconds([e.at_ns for e in flight.estimates]),
+            np.array([sign * e.mean[index] for e in flight.estimates]),
+        )
+        ax.plot(estimate_s, estimate, color=colour("estimate"), lw=1.2)
+        truth_s, truth = thin(
+            flight.seconds([t.at_ns for t in flight.truths]), np.array([sign * t.state[index] for t in flight.truths])
+        )
+        ax.plot(truth_s, truth, color=colour("truth"), lw=1.3)
+        ax.axhline(sign * flight.design.target[index], color=colour("target"), lw=1.1, ls=(0, (1, 1.6)))
+        steps = flight.steps
+        ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
+        span(ax, flight)
+    return Drawing(key, one.svg, f"{title} over time against its limits")
+
+
+def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
+    """Limits of a state, and the reserve that each plan keeps from them at its far end."""
+    box = flight.design.state_box
+    plans = list(flight.flown_plans.values())
+    t_s = flight.seconds([plan.base_ns for plan in plans])
+    for side, row, inwards in (
+        (box.lower[index], box.row_lower[index], 1.0),
+        (box.upper[index], box.row_upper[index], -1.0),
+    ):
+        if row < 0:
+            continue
+        ax.axhline(sign * side, color=colour("limit"), lw=1.2, ls=DASHED)
+        scale = abs(flight.design.c_x[row][index])
+        reserve = np.array([max(stage[row] for stage in plan.backoff_x) for plan in plans]) / scale
+        if len(plans):
+            kept = sign * (side + inwards * reserve)
+            ax.fill_between(t_s, sign * side, kept, step="post", color=colour("limit"), alpha=0.13, lw=0)
+
+
+def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
+    """A handful of plans over what was then flown, axis by axis."""
+    chosen = _choose_plans(flight)
+    if not chosen:
+        return
+    end_s = max(_plan_times(flight, plan)[-1] for plan in chosen)
+    for axis, index in zip(flight.design.axes, flight.design.position_index, strict=True):
+        name, sign = SEEN[axis]
+        key = f"plan-{index}"
+        with canvas(key, 2.5) as one:
+            ax = one.axes(name.capitalize(), "time [s]", f"{name} [m]")
+            for plan in chosen:
+                _draw_plan(ax, flight, plan, index, sign)
+            known = flight.truths or flight.estimates
+            t_s = flight.seconds([k.at_ns for k in known])
+            flown = np.array([sign * x for x in _component(flight, index)])
+            shown = t_s <= end_s
+            ax.plot(*thin(t_s[shown], flown[shown]), color=colour("truth"), lw=1.5, zorder=4)
+            ax.set_xlim(0, end_s)
+        yield Drawing(
+            key, one.svg, f"{name.capitalize()}: {len(chosen)} plans with their back-off against what was flown"
+        )
+
+
+def _component(flight: FlightData, index: int) -> list[float]:
+    if flight.truths:
+        return [truth.state[index] for truth in flight.truths]
+    return [estimate.mean[index] for estimate in flight.estimates]
+
+
+def _draw_plan(ax: Axes, flight: FlightData, plan: Plan, index: int, sign: float) -> None:
+    """Predicted mean, and the back-off that the plan keeps for what it cannot know."""
+    t_s = _plan_times(flight, plan)
+    mean = np.array([state[index] for state in plan.states])
+    box, rows = flight.design.state_box, np.array(plan.backoff_x)
+    below, above = (
+        rows[:, row] / abs(flight.design.c_x[row][index]) if row >= 0 else np.zeros(len(mean))
+        for row in (box.row_lower[index], box.row_upper[index])
+    )
+    ax.fill_between(t_s, sign * (mean - below), sign * (mean + above), color=colour("plan"), alpha=0.16, lw=0)
+    ax.plot(t_s, sign * mean, "-", color=colour("plan"), lw=1.3, marker=".", ms=3, zorder=3)
+    ax.plot(t_s[0], sign * mean[0], "o", ms=4.5, color=colour("plan"), zorder=5)
+
+
+def _plan_times(flight: FlightData, plan: Plan) -> Floats:
+    return np.asarray(flight.seconds([plan.base_ns])[0] + flight.design.dt_s * np.arange(len(plan.states)))
+
+
+def _choose_plans(flight: FlightData) -> list[Plan]:
+    """Within the way to the target: of each sixth, the plan that was played out the longest."""
+    steps, plans = flight.steps, flight.flown_plans
+    error_m = position_error_m(flight)
+    if not plans or not len(steps):
+        return []
+    near = np.flatnonzero(error_m <= ARRIVED_SHARE * error_m[0])
+    arrived_s = float(steps.t_s[near[0] if len(near) else -1])
+    window_s = max(arrived_s * 1.2, PLANS_SHOWN * flight.design.horizon * flight.design.dt_s * 0.6)
+    played: dict[int, int] = {}
+    for decision in steps.decisions:
+        if decision.plan_seq in plans and decision.plan_index is not None:
+            played[decision.plan_seq] = max(played.get(decision.plan_seq, 0), decision.plan_index)
+    best: dict[int, Plan] = {}
+    for seq, index in played.items():
+        part = int(flight.seconds([plans[seq].base_ns])[0] / window_s * PLANS_SHOWN)
+        if part < PLANS_SHOWN and (part not in best or index > played[best[part].seq]):
+            best[part] = plans[seq]
+    return list(best.values())
+
+
+def shade_fallback(ax: Axes, flight: FlightData) -> None:
+    """Spans of time in which the fallback flew."""
+    for begun_s, ended_s in flight.spans(FALLBACK):
+        ax.axvspan(begun_s, ended_s, color=colour("fallback"), alpha=0.22, lw=0)
+
+
+def span(ax: Axes, flight: FlightData) -> None:
+    """Time axis over the whole flight."""
+    ax.set_xlim(0, max(flight.duration_s, flight.design.dt_s))
+
+
+def thin(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """At most about POINTS points, keeping each bucket's smallest and largest value; no NaN, no infinity."""
+    kept = np.isfinite(values)
+    t_s, values = t_s[kept], values[kept]
+    if len(values) <= POINTS:
+        return t_s, values
+    width = -(-len(values) // (POINTS // 2))
+    index = [
+        start + place
+        for start in range(0, len(values), width)
+        for bucket in (values[start : start + width],)
+        for place in sorted({int(bucket.argmin()), int(bucket.argmax())})
+    ]
+    return t_s[index], values[index]
+
+
+def _thin(points: Floats) -> Floats:
+    """At most about POINTS rows, evenly; none that is not finite."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return finite[:: max(1, -(-len(finite) // POINTS))]

@@ -1,0 +1,122 @@
+"""Reader of recordings: all segments as one, in file order, nothing without its checksum.
+
+A file that was not finished is read to its last whole chunk; a damaged one is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from logs.chunks import Damage, End, Message, scan
+from logs.disk import later_segments
+from logs.encoding import decode
+from logs.topics import HEADER, RECORDER, RecorderNote, record_type
+from uavctl.data import Header, Record
+from uavctl.errors import RecordingError
+
+R = TypeVar("R", bound=Record)
+
+
+def segment_files(path: Path) -> tuple[Path, ...]:
+    """Files of a recording in order: the named one, and those that go on after a failed write.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    files = tuple(one for one in later_segments(path) if _continues(one))
+    if path.exists():
+        files = (path, *files)
+    if not files:
+        raise RecordingError(f"{path}: no such recording")
+    return files
+
+
+def walk(path: Path) -> Iterator[Message | Damage | End]:
+    """Messages and damage of all segments; the header that later segments repeat is marked.
+
+    Raises:
+        RecordingError: there is no such recording, or a file of it is none.
+    """
+    first: bytes | None = None
+    for file in segment_files(path):
+        for item in scan(file):
+            if isinstance(item, Message) and item.definition.topic == HEADER:
+                yield replace(item, repeated=item.data == first)
+                first = first or item.data
+            else:
+                yield item
+
+
+def read(path: Path) -> Iterator[tuple[str, int, Record]]:
+    """Topic, log time [ns] and record of each message, in file order.
+
+    Raises:
+        RecordingError: no recording, or damaged; names file and offset. What came before is good.
+    """
+    for message in _good(path):
+        topic = message.definition.topic
+        yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
+
+
+def records(path: Path, kind: type[R]) -> Iterator[R]:
+    """The records of one type, in file order.
+
+    Raises:
+        RecordingError: as `read`.
+    """
+    for message in _good(path):
+        topic = message.definition.topic
+        if _is(topic, kind):
+            record = decode(topic, message.data, message.at_ns)
+            assert isinstance(record, kind)  # the topic's type
+            yield record
+
+
+def header(path: Path) -> Header:
+    """The recording's header.
+
+    Raises:
+        RecordingError: as `read`, or it has none.
+    """
+    for record in records(path, Header):
+        return record
+    raise RecordingError(f"{path}: no header; it was ended before its first chunk was written")
+
+
+def _good(path: Path) -> Iterator[Message]:
+    expected: int | None = None
+    for item in walk(path):
+        if isinstance(item, Damage) and not item.torn:
+            raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
+        if isinstance(item, Message):
+            if expected is not None and item.sequence != expected:
+                raise RecordingError(
+                    f"{path}: message {item.sequence} where {expected} should be (is a segment file gone?); "
+                    f"`uavctl log recover {path} OUT` restores the rest"
+                )
+            expected = item.sequence + 1
+            if not item.repeated:
+                yield item
+
+
+def _is(topic: str, kind: type[Record]) -> bool:
+    try:
+        return issubclass(record_type(topic), kind)
+    except KeyError:
+        return False
+
+
+def _continues(path: Path) -> bool:
+    """Whether a file goes on with another one (and is no recording of its own with such a name)."""
+    for count, item in enumerate(scan(path)):
+        if not isinstance(item, Message):
+            return True  # empty or damaged: better told than passed over
+        if item.definition.topic == RECORDER:
+            note = decode(RECORDER, item.data, item.at_ns)
+            return isinstance(note, RecorderNote) and note.segment > 1
+        if count == 1:
+            break
+    return False

@@ -1,0 +1,134 @@
+"""Restores what a torn or damaged recording still holds into a clean one."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import msgspec
+
+from logs.chunks import Damage, End, Message
+from logs.disk import DiskFile
+from logs.encoding import encode
+from logs.reader import walk
+from logs.segment import Entry, Segment
+from logs.topics import RECORDER, RecorderNote, definition
+from uavctl.errors import RecordingError
+
+CHUNK_BYTES = 16384
+
+
+class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What was restored, and what was not."""
+
+    messages: int  # restored
+    messages_lost: int  # by their running numbers; those after the last restored one cannot be known
+    lost_bytes: int  # damaged bytes that held messages, or may have
+    chunks_bad: int  # damaged places, a torn end included
+    finished: bool  # every file of the recording had been closed in order
+    damage: tuple[str, ...]  # in words: file, offset, reason
+
+    @property
+    def lossless(self) -> bool:
+        """Whether everything that the files held is restored."""
+        return self.messages_lost == 0 and self.lost_bytes == 0
+
+
+class _Tally:
+    """Counts losses while the messages go by."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self.messages_lost = 0
+        self.lost_bytes = 0
+        self.damage: list[Damage] = []
+        self.finished = True
+        self._next: int | None = None
+        self._doubtful_bytes = 0  # damaged since the last message
+
+    def message(self, item: Message) -> None:
+        # A first message of another number than 1 means that those before it are gone.
+        missing = item.sequence - (self._next or 1)
+        if missing != 0:
+            self.messages_lost += max(0, missing)
+            self.lost_bytes += self._doubtful_bytes
+        self._doubtful_bytes = 0  # without a gap nothing was in them: an index, or the file's head
+        self._next = item.sequence + 1
+        self.messages += not item.repeated
+
+    def damaged(self, item: Damage) -> None:
+        self.damage.append(item)
+        self._doubtful_bytes += item.length
+
+    def end(self) -> None:
+        self.lost_bytes += self._doubtful_bytes
+        self._doubtful_bytes = 0
+
+
+def recover(src: Path, dst: Path) -> RecoverResult:
+    """Write all whole chunks' messages of `src` (with its later segments) to the new file `dst`.
+
+    Messages keep their bytes, times and order; they are numbered anew. If anything was lost, the
+    last message, from the recorder, says so.
+
+    Raises:
+        RecordingError: `src` is no recording or holds no whole chunk, `dst` exists, or it cannot be
+            written (what was written of it is removed).
+    """
+    try:
+        file = DiskFile(dst)
+    except FileExistsError as error:
+        raise RecordingError(f"{dst} exists and a recording is never overwritten; choose another name") from error
+    except OSError as error:
+        raise RecordingError(f"{dst}: {error.strerror}; choose another place") from error
+    try:
+        result = _copy(src, Segment(file, CHUNK_BYTES))
+        if result.messages == 0:
+            raise RecordingError(f"{src}: no whole chunk in it; nothing can be restored")
+    except (OSError, RecordingError) as error:
+        with contextlib.suppress(OSError):
+            dst.unlink()
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{dst}: {error.strerror}; make room or choose another place") from error
+    return result
+
+
+def _copy(src: Path, segment: Segment) -> RecoverResult:
+    tally = _Tally()
+    at_ns = 0
+    for item in walk(src):
+        if isinstance(item, Damage):
+            tally.damaged(item)
+        elif isinstance(item, End):
+            tally.finished &= item.finished
+        else:
+            tally.message(item)
+            at_ns = item.at_ns
+            if not item.repeated:
+                segment.add(Entry(item.definition, tally.messages, item.at_ns, item.data))
+    tally.end()
+    result = RecoverResult(
+        messages=tally.messages,
+        messages_lost=tally.messages_lost,
+        lost_bytes=tally.lost_bytes,
+        chunks_bad=len(tally.damage),
+        finished=tally.finished,
+        damage=tuple(map(str, tally.damage)),
+    )
+    if not result.lossless:
+        segment.add(Entry(definition(RECORDER), tally.messages + 1, at_ns, encode(_note(src, result, at_ns))))
+    segment.finish()
+    return result
+
+
+def _note(src: Path, result: RecoverResult, at_ns: int) -> RecorderNote:
+    return RecorderNote(
+        at_ns=at_ns,
+        segment=1,
+        written=result.messages,
+        dropped=0,
+        refused=0,
+        failures=0,
+        text=f"recovered from {src.name}: {result.messages_lost} messages and {result.lost_bytes} bytes lost",
+    )

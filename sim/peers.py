@@ -1,0 +1,125 @@
+"""Everything on the other side of the wire, under one clock that the caller moves."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from sim.autopilot import Autopilot
+from sim.channel import Channel
+from sim.mocap import Cameras
+from sim.vehicle import Vehicle
+from uavctl.config.types import Config
+from uavctl.data import Truth
+
+VEHICLE, MOCAP = "vehicle", "mocap"
+Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
+
+
+class Peers:
+    """Vehicle, autopilot, cameras and the radio channel that carries positions.
+
+    The vehicle's link is a wire: no loss, no delay. Positions go through the channel. With
+    `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel.
+
+    `on_truth` gets one `Truth` for every boundary start_ns + k Δt: the state x(k), and the input that acts
+    from there on. It is therefore called when time moves *past* the boundary: what arrives at the
+    boundary's own instant is already in it, what arrives later (on real sockets, a fraction of a
+    millisecond) is not.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        start_ns: int,
+        *,
+        airborne: bool = True,
+        shared_link: bool = False,
+        on_truth: Callable[[Truth], None] | None = None,
+    ) -> None:
+        for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
+        self.vehicle = Vehicle(config, for_vehicle, start_ns)
+        self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
+        self.channel = Channel(config.link, for_channel, start_ns)
+        self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+        self._mocap_link = VEHICLE if shared_link else MOCAP
+        self._on_truth = on_truth
+        self._truth_ns = start_ns  # boundary of the next truth
+        self._wire: deque[Due] = deque()  # in order of time
+
+    @property
+    def now_ns(self) -> int:
+        """How far time has come [ns]."""
+        return self.vehicle.now_ns
+
+    @property
+    def next_ns(self) -> int:
+        """Time of the next event [ns]: something to send, a sample, or the vehicle's own doing."""
+        times = [self._cameras.next_ns, self._truth_ns + 1, self.autopilot.next_ns, self.channel.next_ns]
+        if self._wire:
+            times.append(self._wire[0][0])
+        return min(at_ns for at_ns in times if at_ns is not None)
+
+    def advance(self, to_ns: int) -> list[Due]:
+        """Move time on; returns the datagrams due up to and including `to_ns`, in order of time."""
+        self._run(to_ns)
+        due = [*self._wire, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
+        self._wire.clear()
+        due.sort(key=lambda one: one[0])  # stable: the vehicle first
+        return due
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+        """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
+        self._run(at_ns)
+        if link == VEHICLE:
+            self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
+
+    def truth(self) -> Truth:
+        """The true state now, and the input acting from now on."""
+        return Truth(
+            at_ns=self.now_ns,
+            position_m=self.vehicle.position_m,
+            velocity_mps=self.vehicle.velocity_mps,
+            state=tuple(self.vehicle.state.tolist()),
+            input=tuple(self.vehicle.input.tolist()),
+            sent=self.channel.counters.sent,
+            lost=self.channel.counters.lost,
+            mode=self.autopilot.mode_name,
+        )
+
+    def flush(self) -> None:
+        """Tell the truth of a boundary that time has reached but not passed; for the end of a run."""
+        if self._truth_ns == self.now_ns:
+            self._tell()
+
+    def _run(self, to_ns: int) -> None:
+        while True:
+            autopilot_ns = self.autopilot.next_ns
+            at_ns = min(self._cameras.next_ns, to_ns if autopilot_ns is None else autopilot_ns)
+            if at_ns > to_ns:
+                break
+            at_ns = max(at_ns, self.now_ns)
+            self._move(at_ns)
+            busy = False
+            if autopilot_ns is not None and autopilot_ns <= at_ns:
+                self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
+                busy = True
+            if self._cameras.next_ns <= at_ns:
+                self.channel.push(*self._cameras.capture(self.vehicle.position_m, self.vehicle.velocity_mps))
+                busy = True
+            if not busy:
+                break
+        self._move(to_ns)
+
+    def _move(self, to_ns: int) -> None:
+        while self._truth_ns < to_ns:
+            self.vehicle.advance(self._truth_ns)
+            self._tell()
+        self.vehicle.advance(to_ns)
+
+    def _tell(self) -> None:
+        self._truth_ns += self.vehicle.model.dt_ns
+        if self._on_truth is not None:
+            self._on_truth(self.truth())

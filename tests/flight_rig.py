@@ -1,0 +1,201 @@
+"""A small plant, a stub solver and a runner for tests of the control tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm
+
+from uavctl.data import PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.flight.fallback import FallbackParameters
+from uavctl.flight.kalman import EstimatorParameters
+from uavctl.flight.limits import LimitsParameters
+from uavctl.flight.step import Controller, ControlState, StepOutput, initial_state, step
+from uavctl.smpc.answer import Answer
+from uavctl.smpc.plant import Plant
+
+Array = NDArray[np.float64]
+
+MS = 1_000_000
+DT_NS = 200 * MS
+TICK_NS = 50 * MS
+TICKS = DT_NS // TICK_NS
+HORIZON = 4
+START_NS = 7_000_000_000
+
+
+def drag_lag_generator(drag: float, lag: float) -> Array:
+    """Generator of (p, v, a, w, u) of one axis: p' = v, v' = a - c v + w, T a' = u - a."""
+    g = np.zeros((5, 5))
+    g[0, 1] = 1.0
+    g[1, 1:4] = [-drag, 1.0, 1.0]
+    g[2, 2], g[2, 4] = -1.0 / lag, 1.0 / lag
+    return g
+
+
+def small_plant(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, dt_s: float = DT_NS * 1e-9) -> Plant:
+    """Drag-lag axes from the matrix exponential, independent of the project's own plants."""
+    n = len(axes)
+    one = expm(drag_lag_generator(0.3, 0.25) * dt_s)
+    return Plant(
+        a=block_diag(*[one[:3, :3]] * n),
+        b=block_diag(*[one[:3, 4:5]] * n),
+        e=block_diag(*[one[:3, 3:4]] * n),
+        w=np.eye(n) * wind_std**2,
+        dt_s=dt_s,
+        axes=axes,
+        position_index=tuple(3 * i for i in range(n)),
+        velocity_index=tuple(3 * i + 1 for i in range(n)),
+        accel_per_input=np.ones(n),
+    )
+
+
+def estimator_parameters(**changes: float) -> EstimatorParameters:
+    base = EstimatorParameters(
+        position_std_m=0.005,
+        velocity_std_mps=0.05,
+        initial_std=0.3,
+        window_s=2.0,
+        max_position_m=1000.0,
+        max_velocity_mps=100.0,
+    )
+    return replace(base, **changes)
+
+
+def answer_of(plant: Plant, seq: int, x: Array, inputs: Array, status: SolveStatus = SolveStatus.OPTIMAL) -> Answer:
+    states = [x]
+    for u in inputs:
+        states.append(plant.a @ states[-1] + plant.b @ u)
+    return Answer(
+        seq=seq,
+        status=status,
+        method="stub",
+        inputs=inputs,
+        states=np.array(states),
+        backoff_x=np.zeros((len(inputs) + 1, 2)),
+        backoff_u=np.zeros((len(inputs), 2)),
+        reference=np.zeros(plant.n_x),
+        slack=0.0,
+        offset=0.0,
+        terminal_miss=0.0,
+        cost=1.0,
+        cost_lower=1.0,
+        gap=0.0,
+        iterations=1,
+    )
+
+
+@dataclass
+class StubSolver:
+    """Plays a distinct input in each stage; `faults` maps a step to what happens there instead."""
+
+    plant: Plant
+    horizon: int = HORIZON
+    faults: Mapping[int, Callable[[Answer], Answer]] = field(default_factory=dict)
+    asked: list[tuple[int, Array]] = field(default_factory=list)
+
+    def solve(self, seq: int, x: Array, target: Array) -> Answer:
+        self.asked.append((seq, x))
+        answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
+        fault = self.faults.get(seq)
+        return answer if fault is None else fault(answer)
+
+
+def stub_inputs(seq: int, horizon: int, n_u: int) -> Array:
+    """0.01 a stage and 0.1 a step (modulo 10), so that every input tells where it comes from."""
+    return np.repeat(0.1 * (seq % 10) + 0.01 * np.arange(horizon)[:, None], n_u, axis=1)
+
+
+def make_controller(
+    solver: StubSolver | None = None, *, horizon: int = HORIZON, land: bool = True, **changes: float
+) -> Controller:
+    plant = solver.plant if solver is not None else small_plant()
+    fallback = FallbackParameters(brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, land=land, recover_samples=3)
+    return Controller(
+        plant=plant,
+        design_id="stub",
+        horizon=horizon,
+        solver=solver or StubSolver(plant, horizon),
+        target=np.zeros(plant.n_x),
+        estimator=estimator_parameters(**changes),
+        fallback=fallback,
+        limits=LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=100.0),
+        dt_ns=DT_NS,
+        tick_ns=TICK_NS,
+    )
+
+
+def sample(
+    captured_ns: int,
+    received_ns: int | None = None,
+    position_m: Vec3 = (0.0, 0.0, 0.0),
+    velocity_mps: Vec3 | None = None,
+    source: str = "camera",
+    std_m: float = 0.005,
+) -> PositionSample:
+    return PositionSample(
+        captured_ns=captured_ns,
+        received_ns=captured_ns if received_ns is None else received_ns,
+        position_m=position_m,
+        velocity_mps=velocity_mps,
+        std_m=std_m,
+        source=source,
+        seq=0,
+    )
+
+
+def vehicle(*, armed: bool = True, external: bool = True) -> VehicleStatus:
+    return VehicleStatus(at_ns=START_NS, autopilot="px4", armed=armed, mode="OFFBOARD", external=external)
+
+
+def boundary_ns(number: int) -> int:
+    return START_NS + number * DT_NS
+
+
+def one_a_step(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 * MS) -> list[PositionSample]:
+    """A sample 50 ms before each boundary (arriving before it), but for those of the lost steps."""
+    missing = set(lost)
+    kept = [number for number in range(steps) if number not in missing]
+    return [sample(boundary_ns(number) - 50 * MS, boundary_ns(number) - 50 * MS + delay_ns) for number in kept]
+
+
+def inputs_of(
+    ticks: Iterable[int],
+    samples: Iterable[PositionSample],
+    *,
+    stop_from: int | None = None,
+    status: Callable[[int], VehicleStatus | None] = lambda tick: vehicle(),
+) -> list[StepInput]:
+    """Tick inputs: every sample in the first tick after its arrival; left-out ticks count as missed."""
+    waiting = sorted(samples, key=lambda one: one.received_ns)
+    result: list[StepInput] = []
+    place, before = 0, None
+    for tick in ticks:
+        at_ns = START_NS + tick * TICK_NS
+        begin = place
+        while place < len(waiting) and waiting[place].received_ns <= at_ns:
+            place += 1
+        result.append(
+            StepInput(
+                tick=tick,
+                at_ns=at_ns,
+                samples=tuple(waiting[begin:place]),
+                vehicle=status(tick),
+                missed_ticks=0 if before is None else tick - before - 1,
+                stop=stop_from is not None and tick >= stop_from,
+            )
+        )
+        before = tick
+    return result
+
+
+def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState | None = None) -> list[StepOutput]:
+    outputs = []
+    state = initial_state(controller) if state is None else state
+    for inp in inputs:
+        state, output = step(state, inp, controller)
+        outputs.append(output)
+    return outputs

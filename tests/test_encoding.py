@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import json
+import math
+import types
+import typing
+from enum import Enum
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from logs.encoding import EncodingError, decode, encode
+from logs.topics import TOPICS, Topic
+from uavctl.data import Datagram, Estimate, Event, Record, Setpoint, SetpointSource, Severity, Truth
+from uavctl.errors import RecordingError
+
+
+def values(kind: object) -> st.SearchStrategy[object]:
+    """Any value of a field's type; texts look like spelled floats now and then."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        return st.one_of(*map(values, args))
+    if origin is tuple and args[-1] is Ellipsis:
+        return st.lists(values(args[0]), max_size=3).map(tuple)
+    if origin is tuple:
+        return st.tuples(*map(values, args))
+    if origin is dict:
+        return st.dictionaries(st.text(max_size=3), values(args[1]), max_size=3)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return st.sampled_from(list(kind))
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return st.builds(kind, **{field.name: values(field.type) for field in msgspec.structs.fields(kind)})
+    plain: dict[object, st.SearchStrategy[object]] = {
+        float: st.floats() | st.sampled_from([math.nan, math.inf, -math.inf, -0.0, 5e-324]),
+        int: st.integers(-(2**63), 2**63 - 1),
+        bool: st.booleans(),
+        str: st.text(max_size=5) | st.sampled_from(["NaN", "Infinity", "-Infinity", "null", 'x"NaN"']),
+        type(None): st.none(),
+        object: st.recursive(
+            st.none() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=3),
+            lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=2), inner, max_size=2),
+            max_leaves=4,
+        ),
+    }
+    return plain[kind]
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
+    @given(values(topic.record))
+    def check(record: object) -> None:
+        assert isinstance(record, Record)
+        data = encode(record)
+        json.loads(data, parse_constant=pytest.fail)  # plain JSON, no bare NaN
+        # repr tells every float apart, the sign of zero and NaN included
+        assert repr(decode(topic.name, data, 0)) == repr(record)
+
+    check()
+
+
+def test_spelling_of_non_finite_floats() -> None:
+    record = Setpoint(at_ns=1, accel_mps2=(math.nan, math.inf, -math.inf), source=SetpointSource.HOLD)
+    plain = json.loads(encode(record))
+    assert plain["accel_mps2"] == ["NaN", "Infinity", "-Infinity"]
+    assert plain["yaw_rad"] is None
+
+
+def test_text_is_left_alone() -> None:
+    record = Event(at_ns=1, severity=Severity.INFO, code="NaN", text="Infinity")
+    assert decode("/uavctl/event", encode(record), 0) == record
+
+
+def test_numpy_values_become_plain_numbers() -> None:
+    row = typing.cast("tuple[float, ...]", np.array([1.5, math.nan, -0.0]))
+    one = typing.cast("float", np.float64(math.inf))
+    record = Estimate(at_ns=1, captured_ns=1, mean=row, cov=((one,), (typing.cast("float", np.float32(0.5)),)))
+    plain = Estimate(at_ns=1, captured_ns=1, mean=(1.5, math.nan, -0.0), cov=((math.inf,), (0.5,)))
+    assert repr(decode("/uavctl/estimate", encode(record), 0)) == repr(plain)
+
+
+def test_datagram_is_its_bytes() -> None:
+    record = Datagram(at_ns=77, link="mocap", outgoing=False, data=b"\xfd\x00null")
+    assert encode(record) == record.data
+    assert decode("/raw/mocap/in", record.data, 77) == record
+
+
+@pytest.mark.parametrize("value", [object(), 1j, "\ud800"])
+def test_what_cannot_be_written_is_refused(value: object) -> None:
+    record = Event(at_ns=1, severity=Severity.INFO, code="x", text=typing.cast("str", value))
+    with pytest.raises(EncodingError, match="Event"):
+        encode(record)
+
+
+@pytest.mark.parametrize(
+    ("topic", "data"),
+    [
+        ("/uavctl/unknown", b"{}"),
+        ("/sim/truth", b"{"),
+        ("/sim/truth", b'{"at_ns": 1}'),
+        ("/uavctl/setpoint", b'{"at_ns":1,"accel_mps2":["NaN",0],"source":"hold"}'),
+        ("/uavctl/setpoint", b'{"at_ns":1,"accel_mps2":["NaN",0,"1.0"],"source":"hold"}'),
+        ("/uavctl/setpoint", b'{"at_ns":"NaN","accel_mps2":[0,0,0],"source":"hold"}'),
+    ],
+)
+def test_foreign_bytes_are_refused(topic: str, data: bytes) -> None:
+    with pytest.raises(RecordingError, match=topic):
+        decode(topic, data, 0)
+
+
+def test_finite_truth_has_no_text_for_numbers() -> None:
+    record = Truth(
+        at_ns=1,
+        position_m=(0.1, 0.2, 0.3),
+        velocity_mps=(0.0, -0.0, 1e300),
+        state=(1 / 3,),
+        input=(),
+        sent=0,
+        lost=0,
+        mode="x",
+    )
+    assert json.loads(encode(record))["velocity_mps"] == [0.0, -0.0, 1e300]

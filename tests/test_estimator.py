@@ -1,0 +1,296 @@
+"""The filter against brute-force conditioning, the Riccati equation, and itself with another order of arrival."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from flight_rig import (
+    DT_NS,
+    MS,
+    START_NS,
+    TICK_NS,
+    TICKS,
+    boundary_ns,
+    drag_lag_generator,
+    estimator_parameters,
+    sample,
+    small_plant,
+)
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_discrete_are
+
+from uavctl.data import Estimate, PositionSample
+from uavctl.flight.estimator import DUPLICATE, TOO_OLD, History, absorb, begin, estimate, set_input
+from uavctl.flight.kalman import Kalman, make_kalman
+from uavctl.flight.propagation import make_propagation
+from uavctl.smpc.plant import Plant
+
+Array = NDArray[np.float64]
+S = 1_000_000_000
+
+
+def make(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, **changes: float) -> tuple[Kalman, History]:
+    kalman = make_kalman(small_plant(axes, wind_std), estimator_parameters(**changes), DT_NS)
+    return kalman, begin(kalman, START_NS, START_NS)
+
+
+def fly(
+    kalman: Kalman, samples: Sequence[PositionSample], inputs: Sequence[float], ticks: int
+) -> list[Estimate | None]:
+    """Tick by tick: the samples that have arrived, then this tick's input; the estimate of each tick."""
+    history = begin(kalman, START_NS, START_NS)
+    result = []
+    for tick in range(ticks):
+        at_ns = START_NS + tick * TICK_NS
+        due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
+        history, _, _ = absorb(kalman, history, at_ns, due)
+        result.append(estimate(kalman, history, at_ns))
+        history = set_input(kalman, history, at_ns, np.full(kalman.n_u, inputs[tick]))
+    return result
+
+
+def test_propagation_is_the_matrix_exponential_over_any_part_of_a_step() -> None:
+    propagation = make_propagation(small_plant(), DT_NS)
+    generator = drag_lag_generator(0.3, 0.25)
+    for dt_ns in (1, 3 * MS, 77 * MS, 100 * MS, DT_NS - 1, DT_NS):
+        f, g = propagation.over(dt_ns)
+        want = expm(generator * dt_ns * 1e-9)
+        np.testing.assert_allclose(f, want[:4, :4], rtol=0, atol=2e-12)
+        np.testing.assert_allclose(g, want[:4, 4:], rtol=0, atol=2e-12)
+
+
+def brute_force(
+    samples: Sequence[PositionSample], inputs: Sequence[tuple[int, float]], at_ns: int, wind_std: float
+) -> tuple[Array, Array]:
+    """Condition the joint Gaussian of (x at the first sample, one w a Δt) on all other samples at once.
+
+    Each state is written as an affine function of those; the input changes and boundaries cut the time.
+    """
+    ordered = sorted(samples, key=lambda one: one.captured_ns)
+    begin_ns = ordered[0].captured_ns
+    first_interval = (begin_ns - START_NS) // DT_NS
+    draws = (at_ns - START_NS) // DT_NS - first_interval + 1
+    prior = np.diag([0.005**2, 0.3**2, 0.3**2, *[wind_std**2] * draws])
+    offset = np.array([ordered[0].position_m[0], 0.0, 0.0])
+    linear = np.hstack([np.eye(3), np.zeros((3, draws))])
+    cuts = {begin_ns, at_ns, *(one.captured_ns for one in ordered), *(when for when, _ in inputs)}
+    cuts |= {START_NS + (first_interval + n) * DT_NS for n in range(draws + 1)}
+    times = sorted(t for t in cuts if begin_ns <= t <= at_ns)
+    rows, values, variances = [], [], []
+
+    def observe(when: int) -> None:
+        for one in ordered[1:]:
+            if one.captured_ns == when:
+                rows.append(linear[0])
+                values.append(one.position_m[0] - offset[0])
+                variances.append(one.std_m**2)
+
+    for earlier, later in itertools.pairwise(times):
+        observe(earlier)
+        step = expm(drag_lag_generator(0.3, 0.25) * (later - earlier) * 1e-9)
+        u = next((value for when, value in reversed(inputs) if when <= earlier), 0.0)
+        draw = np.zeros(3 + draws)
+        draw[3 + (earlier - START_NS) // DT_NS - first_interval] = 1.0
+        linear = step[:3, :3] @ linear + np.outer(step[:3, 3], draw)
+        offset = step[:3, :3] @ offset + step[:3, 4] * u
+    observe(times[-1])
+    h = np.array(rows)
+    gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + np.diag(variances))
+    posterior = prior - gain @ h @ prior
+    return offset + linear @ gain @ np.array(values), linear @ posterior @ linear.T
+
+
+def test_equals_conditioning_the_joint_gaussian_at_once() -> None:
+    captured = [30, 61, 200, 255, 390, 401, 555, 600, 715]  # within steps, twice in one, and on boundaries [ms]
+    positions = [0.10, 0.14, 0.11, 0.19, 0.22, 0.20, 0.28, 0.33, 0.30]
+    samples = [
+        sample(START_NS + t * MS, position_m=(p, 9.0, 9.0), std_m=0.02 if t == 390 else 0.005)
+        for t, p in zip(captured, positions, strict=True)
+    ]
+    ticks = 17
+    values = [0.0, 0.5, 0.5, -0.3, *[1.0] * 6, *[0.2] * 7]
+    changes = [(START_NS + tick * TICK_NS, values[tick]) for tick in range(ticks)]
+    kalman, _ = make()
+    flown = fly(kalman, samples, values, ticks)[-1]
+    assert flown is not None
+    mean, cov = brute_force(samples, changes, START_NS + (ticks - 1) * TICK_NS, wind_std=0.15)
+    np.testing.assert_allclose(flown.mean, mean, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(flown.cov, cov, rtol=1e-8, atol=1e-13)
+
+
+def test_reaches_the_steady_state_of_the_riccati_equation() -> None:
+    plant = small_plant()
+    kalman, history = make()
+    for number in range(200):
+        at_ns = boundary_ns(number)
+        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)])
+    h = np.array([[1.0, 0.0, 0.0]])
+    predicted = solve_discrete_are(plant.a.T, h.T, plant.e @ plant.w @ plant.e.T, np.array([[0.005**2]]))
+    gain = predicted @ h.T / (predicted[0, 0] + 0.005**2)
+    steady = estimate(kalman, history, boundary_ns(199))
+    assert steady is not None
+    np.testing.assert_allclose(steady.cov, predicted - gain @ h @ predicted, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_late_samples_give_the_same_bits_as_samples_in_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ticks = 60
+    captured = np.sort(rng.choice(np.arange(-100, 50 * (ticks - 30)), size=40, replace=False))
+    boundaries = rng.choice(np.arange(1, 7), size=2, replace=False) * (DT_NS // MS)  # some exactly on the grid
+    stamps = sorted({*map(int, captured), *map(int, boundaries)})
+    positions = rng.normal(size=(len(stamps), 3))
+    delays = rng.integers(0, 1400, size=len(stamps))
+    inputs = rng.normal(size=ticks)
+    kalman, _ = make(("north", "east", "down"))
+
+    def arriving(delayed: bool) -> list[Estimate | None]:
+        samples = [
+            sample(
+                START_NS + t * MS,
+                START_NS + (t + int(delay) * delayed) * MS,
+                (p[0], p[1], p[2]),
+                velocity_mps=(p[1], p[2], p[0]) if t % 3 == 0 else None,
+                source="left" if t % 2 else "right",
+            )
+            for t, p, delay in zip(stamps, positions, delays, strict=True)
+            if t >= 0
+        ]
+        return fly(kalman, samples, list(inputs), ticks)
+
+    in_order, late = arriving(False), arriving(True)
+    assert in_order[-1] is not None
+    assert in_order[-1] == late[-1]
+    assert in_order[10] != late[10]  # the delays did matter on the way
+
+
+def test_a_late_sample_may_turn_out_to_be_the_first() -> None:
+    kalman, history = make()
+    early, later = sample(START_NS + 10 * MS, position_m=(1.0, 0, 0)), sample(START_NS + 90 * MS)
+    at_ns = START_NS + 100 * MS
+    one, _, _ = absorb(kalman, history, at_ns, [later])
+    one, taken, _ = absorb(kalman, one, at_ns, [early])
+    both, _, _ = absorb(kalman, history, at_ns, [early, later])
+    assert taken == (early,)
+    assert estimate(kalman, one, at_ns) == estimate(kalman, both, at_ns)
+
+
+def test_duplicates_and_samples_beyond_the_window_are_refused_with_the_reason() -> None:
+    kalman, history = make()
+    at_ns = START_NS + 3 * S
+    good = sample(at_ns - 10 * MS)
+    same_time_elsewhere = sample(at_ns - 10 * MS, source="second")
+    old = sample(at_ns - 2 * S)
+    just_young_enough = sample(at_ns - 2 * S + 1)
+    history, taken, refused = absorb(kalman, history, at_ns, [good, good, same_time_elsewhere, old, just_young_enough])
+    assert taken == (good, same_time_elsewhere, just_young_enough)
+    assert refused == (DUPLICATE, TOO_OLD)
+    before = estimate(kalman, history, at_ns)
+    history, taken, refused = absorb(kalman, history, at_ns, [good])
+    assert (taken, refused) == ((), (DUPLICATE,))
+    assert estimate(kalman, history, at_ns) == before
+
+
+def test_nothing_is_known_before_the_first_sample() -> None:
+    kalman, history = make()
+    history, _, _ = absorb(kalman, history, START_NS, [])
+    history = set_input(kalman, history, START_NS, np.array([1.0]))
+    assert estimate(kalman, history, START_NS) is None
+    assert history.captured_ns is None
+
+
+def test_first_sample_sets_what_it_shows_and_leaves_the_rest_at_zero() -> None:
+    kalman, history = make(("east", "down"))
+    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, position_m=(7.0, 1.5, -0.5))])
+    first = estimate(kalman, history, START_NS)
+    assert first is not None
+    assert first.mean == (1.5, 0.0, 0.0, -0.5, 0.0, 0.0)
+    np.testing.assert_allclose(np.diag(first.cov), [0.005**2, 0.09, 0.09] * 2, rtol=1e-12)
+
+
+def test_exact_samples_with_velocity_give_the_measured_state_back() -> None:
+    dt_ns = S
+    plant = Plant(
+        a=np.array([[1.0, 0.79], [0.0, 0.61]]),
+        b=np.array([[0.21], [0.39]]),
+        e=np.array([[0.5], [1.0]]),
+        w=np.array([[0.6]]),
+        dt_s=1.0,
+        axes=("north",),
+        position_index=(0,),
+        velocity_index=(1,),
+        accel_per_input=np.array([0.49429632181478]),
+    )
+    kalman = make_kalman(plant, estimator_parameters(position_std_m=1e-5, velocity_std_mps=1e-5), dt_ns)
+    history = begin(kalman, START_NS, START_NS)
+    rng = np.random.default_rng(3)
+    x = np.array([35.0, -2.0])
+    for number in range(20):
+        at_ns = START_NS + number * dt_ns
+        one = sample(at_ns, position_m=(x[0], 0.0, 0.0), velocity_mps=(x[1], 0.0, 0.0), std_m=1e-5)
+        history, _, _ = absorb(kalman, history, at_ns, [one])
+        measured = estimate(kalman, history, at_ns)
+        assert measured is not None
+        np.testing.assert_allclose(measured.mean, x, rtol=0, atol=1e-5)
+        u = rng.uniform(-7.5, 7.5, size=1)
+        history = set_input(kalman, history, at_ns, u)
+        x = plant.a @ x + plant.b @ u + plant.e @ rng.normal(scale=0.6**0.5, size=1)
+
+
+def test_a_sample_may_claim_to_be_worse_than_configured_but_not_better() -> None:
+    kalman, history = make()
+    variances = []
+    for std in (1e-12, 0.005, 0.5):
+        one, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, std_m=std)])
+        result = estimate(kalman, one, START_NS)
+        assert result is not None
+        variances.append(result.cov[0][0])
+    np.testing.assert_allclose(variances, [0.005**2, 0.005**2, 0.25])
+
+
+def test_covariance_stays_symmetric_and_positive_semidefinite() -> None:
+    rng = np.random.default_rng(11)
+    kalman, history = make(("north", "east", "down"), position_std_m=1e-6, velocity_std_mps=1e-6)
+    for tick in range(400):
+        at_ns = START_NS + tick * TICK_NS
+        due = [sample(at_ns - int(rng.integers(0, 40)) * MS, at_ns, velocity_mps=(0, 0, 0), std_m=1e-6)]
+        history, _, _ = absorb(kalman, history, at_ns, due if rng.random() < 0.4 else [])
+        result = estimate(kalman, history, at_ns)
+        if result is not None:
+            cov = np.array(result.cov)
+            assert (cov == cov.T).all()
+            assert np.linalg.eigvalsh(cov).min() > -1e-12 * np.abs(cov).max()
+
+
+def test_silence_is_prediction_and_the_history_stays_within_the_window() -> None:
+    kalman, history = make()
+    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, velocity_mps=(1.0, 0, 0))])
+    for tick in range(1, 400):
+        history, _, _ = absorb(kalman, history, START_NS + tick * TICK_NS, [])
+    assert len(history.entries) <= 2 * S // DT_NS
+    result = estimate(kalman, history, START_NS + 399 * TICK_NS)
+    assert result is not None
+    want = expm(drag_lag_generator(0.3, 0.25) * 399 * TICK_NS * 1e-9)[:3, 1]
+    np.testing.assert_allclose(result.mean, want, rtol=1e-8, atol=1e-9)
+    assert result.captured_ns == START_NS
+
+
+def test_an_estimate_of_an_earlier_time_leaves_out_what_came_after() -> None:
+    kalman, history = make()
+    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS)])
+    at_ns = boundary_ns(1) + TICK_NS
+    alone, _, _ = absorb(kalman, history, at_ns, [])
+    more, _, _ = absorb(kalman, history, at_ns, [sample(boundary_ns(1) + 1, position_m=(1.0, 0.0, 0.0))])
+    assert estimate(kalman, more, boundary_ns(1)) == estimate(kalman, alone, boundary_ns(1))
+    assert estimate(kalman, more, at_ns) != estimate(kalman, alone, at_ns)
+    assert estimate(kalman, more, START_NS - 1) is None
+
+
+def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
+    kalman, history = make()
+    at_ns = START_NS + TICKS * TICK_NS
+    history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns + 5 * MS, at_ns - 3 * MS)])
+    assert history.captured_ns == at_ns - 3 * MS

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from recording_fakes import record_flight, write_two_segments
+
+from logs.info import info
+
+
+def test_figures_of_a_flight(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 61)
+    found = info(path)
+    assert (found.finished, found.damage, found.missing, found.messages) == (True, (), 0, 64)
+    # 61 records 10 ms apart
+    assert found.start_ns == 1_000_000_000
+    assert found.duration_s == pytest.approx(0.6)
+    topics = {one.topic: one for one in found.topics}
+    setpoint = topics["/uavctl/setpoint"]
+    assert (setpoint.messages, setpoint.encoding) == (20, "json")
+    assert setpoint.rate_hz == pytest.approx(1 / 0.03)
+    assert setpoint.longest_gap_s == pytest.approx(0.03)
+    assert topics["/raw/vehicle/in"].encoding == "mavlink"
+    assert topics["/raw/vehicle/in"].bytes == 40 * topics["/raw/vehicle/in"].messages
+    assert found.bytes == path.stat().st_size
+    assert found.origin is not None
+    assert (found.origin.config, found.origin.seed, found.origin.command) == ("room", 7, "uavctl loopback")
+
+
+def test_failed_write_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    write_two_segments(path)
+    found = info(path)
+    assert len(found.files) == 2
+    assert (found.failures, found.dropped, found.missing) == (1, 0, 0)
+    assert found.messages == 101 + 3  # notes: begin, after a failed write, end
+
+
+def test_damage_is_told_not_raised(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 60)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"number 29")] ^= 1
+    path.write_bytes(data)
+    found = info(path)
+    assert found.finished
+    assert len(found.damage) == 1
+    assert found.missing == 63 - found.messages
+    assert found.missing > 0
+    gap = next(one for one in found.topics if one.topic == "/uavctl/event")
+    assert gap.longest_gap_s > 0.05
+    assert 0.1 < gap.longest_gap_at_s < 0.3
+
+
+def test_torn_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 30)
+    path.write_bytes(path.read_bytes()[:-200])
+    assert not info(path).finished
+    path.write_bytes(b"")
+    found = info(path)
+    assert (found.finished, found.messages, found.duration_s, found.origin, found.topics) == (False, 0, 0.0, None, ())

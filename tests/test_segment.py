@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+from recording_fakes import record_flight
+
+from logs.disk import DiskFile, check_room, later_segments, segment_path
+from logs.segment import Entry, Segment
+from logs.topics import definition
+from uavctl.errors import RecordingError
+
+
+def chunks(path: Path) -> list[Chunk]:
+    with path.open("rb") as file:
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True)
+        return [record for record in reader.records if isinstance(record, Chunk)]
+
+
+def test_the_format_s_own_readers_take_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    count = len(record_flight(path, 100))
+    with path.open("rb") as file:
+        seeking = make_reader(file, validate_crcs=True)
+        summary = seeking.get_summary()
+        by_time = [(channel.topic, message.log_time, message.data) for _, channel, message in seeking.iter_messages()]
+        some = list(seeking.iter_messages(topics=["/uavctl/setpoint"], starting_at=1_500_000_000))
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(by_time) == count + 2  # and two notes
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) == len(chunks(path)) > 5
+    assert len(some) == 16
+    assert all(schema is not None and schema.encoding == "jsonschema" for schema, _, _ in some)
+    with path.open("rb") as file:
+        stream = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        in_order = [(channel.topic, message.log_time, message.data) for _, channel, message in stream]
+    assert sorted(in_order, key=lambda one: one[1]) == by_time
+
+
+def test_index_points_at_the_messages(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 60)
+    data = path.read_bytes()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    seen = 0
+    for index in summary.chunk_indexes:
+        content = index.chunk_start_offset + 9 + 40
+        for channel, at in index.message_index_offsets.items():
+            opcode, _, named, size = struct.unpack_from("<BQHI", data, at)
+            assert (opcode, named) == (7, channel)
+            for log_time, offset in struct.iter_unpack("<QQ", data[at + 15 : at + 15 + size]):
+                opcode, _, owner, _, message_time = struct.unpack_from("<BQHIQ", data, content + offset)
+                assert (opcode, owner, message_time) == (5, channel, log_time)
+                seen += 1
+    assert seen == 63
+
+
+def test_chunks_stay_within_their_size(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 300, chunk_bytes=2048)
+    found = chunks(path)
+    sizes = [chunk.uncompressed_size for chunk in found]
+    assert max(sizes) <= 2048
+    assert min(sizes[1:-1]) > 1024  # the first has the header and goes out at once
+    for chunk in found:  # a chunk is read without any other
+        named = {
+            record.id for record in breakup_chunk(chunk) if not isinstance(record, Message) and hasattr(record, "id")
+        }
+        assert {record.channel_id for record in breakup_chunk(chunk) if isinstance(record, Message)} <= named
+
+
+def test_message_larger_than_a_chunk_has_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "big.mcap"
+    segment = Segment(DiskFile(path), 1024)
+    for number, size in enumerate((10, 5000, 10, 10), 1):
+        segment.add(Entry(definition("/raw/vehicle/in"), number, number, bytes(size)))
+    segment.finish()
+    counts = [sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks(path)]
+    assert counts == [1, 1, 2]
+
+
+def test_empty_segment_is_a_valid_file(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    Segment(DiskFile(path), 1024).finish()
+    with path.open("rb") as file:
+        assert list(make_reader(file, validate_crcs=True).iter_messages()) == []
+
+
+def test_never_overwrites(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(FileExistsError):
+        DiskFile(path)
+    assert path.read_bytes() == b"precious"
+
+
+def test_segment_names_in_numeric_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.b[1].mcap"
+    for number in (1, 2, 3, 10, 11):
+        segment_path(path, number).touch()
+    for other in ("a.b[1]-1.mcap", "a.b[1]-02.mcap", "a.b[1]-x.mcap", "xa.b[1]-2.mcap", "a.b[1]-2.mcap.bak"):
+        (tmp_path / other).touch()
+    assert [one.name for one in later_segments(path)] == [f"a.b[1]-{number}.mcap" for number in (2, 3, 10, 11)]
+
+
+def test_room_is_checked_before_a_flight(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "flight.mcap"
+    assert check_room(path, 0) > 0
+    with pytest.raises(RecordingError, match=r"bytes free, log\.free_bytes asks for"):
+        check_room(path, 2**62)
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="choose another folder"):
+        check_room(tmp_path / "file" / "flight.mcap", 0)

@@ -1,0 +1,165 @@
+"""The channel's statistics against closed forms; its effects one by one."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sim.channel import Channel
+from uavctl.config.types import LinkConfig
+
+MS = 1_000_000
+N = 50_000
+
+
+def channel(seed: int = 3, start_ns: int = 0, **link: object) -> Channel:
+    return Channel(LinkConfig(**link), np.random.SeedSequence(seed), start_ns)  # type: ignore[arg-type]  # keys of the record
+
+
+def packet(i: int) -> bytes:
+    return i.to_bytes(8, "little") + bytes(24)
+
+
+def arrivals(ch: Channel, n: int = N, period_ns: int = 10 * MS) -> list[tuple[int, bytes]]:
+    for i in range(n):
+        ch.push(i * period_ns, packet(i))
+    return ch.pop_due(10**18)
+
+
+def numbers(got: list[tuple[int, bytes]]) -> list[int]:
+    return [int.from_bytes(data[:8], "little") for _, data in got]
+
+
+def test_a_perfect_link_delivers_everything_at_once_and_in_order() -> None:
+    ch = channel()
+    got = arrivals(ch, 100)
+    assert got == [(i * 10 * MS, packet(i)) for i in range(100)]
+    assert (ch.counters.sent, ch.counters.lost, ch.next_ns) == (100, 0, None)
+
+
+def test_bernoulli_loses_the_share_asked_for_independently() -> None:
+    ch = channel(loss=0.3)
+    got = set(numbers(arrivals(ch)))
+    assert len(got) == N - ch.counters.lost
+    assert abs(ch.counters.lost / N - 0.3) < 4 * math.sqrt(0.3 * 0.7 / N)
+    lost = np.array([i not in got for i in range(N)])
+    # two in a row: p², with the standard error of N - 1 dependent pairs bounded by that of pairs doubled
+    assert abs(float(np.mean(lost[1:] & lost[:-1])) - 0.09) < 4 * math.sqrt(2 * 0.09 * 0.91 / N)
+
+
+def test_gilbert_elliott_loss_rate_and_burst_length() -> None:
+    enter, leave, in_good, in_bad = 0.05, 0.25, 0.02, 1.0
+    ch = channel(model="gilbert-elliott", loss=in_good, burst_enter=enter, burst_leave=leave, burst_loss=in_bad)
+    got = set(numbers(arrivals(ch)))
+    bad = enter / (enter + leave)
+    rate = (1 - bad) * in_good + bad * in_bad
+    memory = 1 - enter - leave  # second eigenvalue of the chain
+    error = math.sqrt(bad * (1 - bad) * (1 + memory) / (1 - memory) / N + rate * (1 - rate) / N)
+    assert abs(ch.counters.lost / N - rate) < 4 * error
+    clean = channel(model="gilbert-elliott", burst_enter=enter, burst_leave=leave)
+    got = set(numbers(arrivals(clean)))
+    lost = [i not in got for i in range(N)]
+    ends = sum(a and not b for a, b in zip(lost, lost[1:], strict=False))
+    bursts = ends + lost[-1]
+    # geometric bursts: mean 1 / leave, variance (1 - leave) / leave²
+    assert abs(sum(lost) / bursts - 1 / leave) < 4 * math.sqrt((1 - leave) / leave**2 / bursts)
+
+
+def test_delay_lies_in_its_range_evenly_and_packets_overtake() -> None:
+    got = arrivals(channel(delay_s=0.03, jitter_s=0.04))
+    assert [at_ns for at_ns, _ in got] == sorted(at_ns for at_ns, _ in got)
+    delays = np.array([at_ns - 10 * MS * i for (at_ns, _), i in zip(got, numbers(got), strict=True)]) / MS
+    assert delays.min() >= 30
+    assert delays.max() <= 70
+    assert abs(float(delays.mean()) - 50) < 4 * 40 / math.sqrt(12 * N)
+    assert abs(float(delays.std()) - 40 / math.sqrt(12)) < 0.2
+    order = numbers(got)
+    assert sorted(order) == list(range(N))
+    assert any(a > b for a, b in zip(order, order[1:], strict=False))
+
+
+def test_only_what_is_due_is_taken_the_limit_included() -> None:
+    ch = channel(delay_s=0.03)
+    ch.push(0, b"a")
+    ch.push(10 * MS, b"b")
+    assert ch.next_ns == 30 * MS
+    assert ch.pop_due(30 * MS - 1) == []
+    assert ch.pop_due(30 * MS) == [(30 * MS, b"a")]
+    assert ch.next_ns == 40 * MS
+    assert ch.pop_due(50 * MS) == [(40 * MS, b"b")]
+
+
+def test_duplicates_come_with_a_delay_of_their_own() -> None:
+    ch = channel(duplicate=0.25, jitter_s=0.04)
+    got = arrivals(ch)
+    assert len(got) == N + ch.counters.duplicated
+    assert abs(ch.counters.duplicated / N - 0.25) < 4 * math.sqrt(0.25 * 0.75 / N)
+    times: dict[int, list[int]] = {}
+    for (at_ns, _), i in zip(got, numbers(got), strict=True):
+        times.setdefault(i, []).append(at_ns)
+    assert all(a != b for a, b in (pair for pair in times.values() if len(pair) == 2))
+
+
+def test_corruption_flips_exactly_one_bit_anywhere() -> None:
+    ch = channel(corrupt=0.5)
+    wrong = np.zeros(8 * 32, dtype=int)
+    for i, (_, data) in enumerate(arrivals(ch, 20_000)):
+        difference = int.from_bytes(data, "little") ^ int.from_bytes(packet(i), "little")
+        if difference:
+            assert difference.bit_count() == 1
+            wrong[difference.bit_length() - 1] += 1
+    assert wrong.sum() == ch.counters.corrupted
+    assert abs(wrong.sum() / 20_000 - 0.5) < 4 * math.sqrt(0.25 / 20_000)
+    assert wrong.min() > 0
+
+
+def test_truncation_cuts_somewhere_before_the_end() -> None:
+    ch = channel(truncate=1.0)
+    got = arrivals(ch, 2000)
+    assert ch.counters.truncated == 2000
+    assert all(packet(i).startswith(data) for i, (_, data) in enumerate(got))
+    assert {len(data) for _, data in got} == set(range(32))
+
+
+def test_blackout_loses_everything_from_its_first_to_its_last_instant() -> None:
+    ch = channel(start_ns=5 * MS, blackout=((0.02, 0.05), (0.09, math.inf)))
+    for i in range(12):
+        ch.push(5 * MS + i * 10 * MS, packet(i))
+    assert numbers(ch.pop_due(10**18)) == [0, 1, 6, 7, 8]
+    assert ch.counters.lost == 7
+
+
+OTHERS = {
+    "loss": {"loss": 0.3},
+    "bursts": {"model": "gilbert-elliott", "burst_enter": 0.1, "burst_leave": 0.3},
+    "duplicate": {"duplicate": 0.2},
+    "corrupt": {"corrupt": 0.2},
+    "truncate": {"truncate": 0.2},
+    "blackout": {"blackout": ((1.0, 2.0),)},
+}
+
+
+@pytest.mark.parametrize("effect", OTHERS)
+def test_an_effect_switched_on_shifts_no_other_draw(effect: str) -> None:
+    plain = channel(delay_s=0.01, jitter_s=0.1)
+    loaded = channel(delay_s=0.01, jitter_s=0.1, **OTHERS[effect])
+    times: list[set[int]] = [set(), set()]
+    for seen, ch in zip(times, (plain, loaded), strict=True):
+        for i in range(500):
+            ch.push(i * 1000 * MS, packet(i))
+            seen.update(at_ns for at_ns, _ in ch.pop_due(10**18)[:1] if effect != "duplicate")
+            if effect == "duplicate":
+                seen.update(at_ns for at_ns, _ in ch.pop_due(10**18))
+    assert times[1] <= times[0]
+
+
+def test_loss_is_the_same_whatever_else_goes_wrong() -> None:
+    plain = set(numbers(arrivals(channel(loss=0.3), 2000)))
+    messy = set(numbers(arrivals(channel(loss=0.3, jitter_s=0.3, duplicate=0.3), 2000)))
+    assert plain == messy
+
+
+def test_one_seed_one_history() -> None:
+    link = {"loss": 0.2, "jitter_s": 0.1, "duplicate": 0.1, "corrupt": 0.1, "truncate": 0.1}
+    assert arrivals(channel(1, **link), 1000) == arrivals(channel(1, **link), 1000)
+    assert arrivals(channel(1, **link), 1000) != arrivals(channel(2, **link), 1000)

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+
+from logs.topics import TOPICS, definition, raw_link, raw_topic, record_type, topics_page
+from uavctl import data
+from uavctl.data import Datagram, Decision, Record
+
+
+def test_every_recorded_type_has_one_topic() -> None:
+    # Not on their own topic: parts of other records, and what never leaves the process.
+    inside = {"Record", "PositionSample", "Datagram", "Outgoing"}
+    types = {
+        name
+        for name, kind in vars(data).items()
+        if isinstance(kind, type) and issubclass(kind, Record) and name not in inside
+    }
+    assert {topic.record.__name__ for topic in TOPICS} == types | {"RecorderNote"}
+    assert len({topic.name for topic in TOPICS}) == len(TOPICS) == len(types) + 1
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_schema_is_an_object_with_the_record_s_fields(topic: object) -> None:
+    assert isinstance(topic, type(TOPICS[0]))
+    schema = json.loads(topic.definition.schema)
+    assert schema["type"] == "object"
+    assert list(schema["properties"]) == [field.name for field in msgspec.structs.fields(topic.record)]
+    references = {part.split('"')[0] for part in topic.definition.schema.decode().split('"$ref":"#/$defs/')[1:]}
+    assert references <= set(schema.get("$defs", {}))
+
+
+def test_raw_topics_name_link_and_direction() -> None:
+    assert raw_topic("vehicle", outgoing=False) == "/raw/vehicle/in"
+    assert raw_link("/raw/mocap/out") == ("mocap", True)
+    assert raw_link("/raw/a/b/in") is None
+    assert record_type("/raw/vehicle/in") is Datagram
+    assert definition("/raw/vehicle/in").encoding == "mavlink"
+    assert definition("/raw/vehicle/in").schema == b""
+
+
+def test_unknown_topic() -> None:
+    assert record_type("/uavctl/decision") is Decision
+    with pytest.raises(KeyError):
+        record_type("/uavctl/unknown")
+    with pytest.raises(KeyError):
+        definition("/raw/vehicle/sideways")
+
+
+def test_page_lists_every_topic_and_field() -> None:
+    page = topics_page()
+    for topic in TOPICS:
+        assert page.count(f"| `{topic.name}` |") == 1
+        section = page.split(f"## `{topic.name}`")[1].split("## ")[0]
+        for field in msgspec.structs.fields(topic.record):
+            assert f"| `{field.name}` |" in section
+    assert "| `position_m` | array of number |" in page
+    assert "| `solve` | `SolveStatus` or null |" in page

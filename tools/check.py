@@ -1,0 +1,121 @@
+"""All checks of the tree, one stage after the other; the first that fails ends the run.
+
+`make test` and continuous integration run this; `--write-docs` only writes the generated page.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from uavctl.config.reference import render
+
+ROOT = Path(__file__).resolve().parent.parent
+REFERENCE = ROOT / "docs" / "configuration.md"
+BIN = Path(sys.executable).parent
+_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
+
+
+class StageError(Exception):
+    """A stage failed; holds what its person needs to see."""
+
+
+def say(text: str) -> None:
+    """One line to the person who waits."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def run(command: Sequence[str | Path], *, cwd: Path = ROOT, extra: Mapping[str, str] | None = None) -> str:
+    """Run a program to its end; its output.
+
+    Raises:
+        StageError: If it exits with anything but 0, with all its output.
+    """
+    words = [str(word) for word in command]
+    done = subprocess.run(
+        words,
+        cwd=cwd,
+        env={**os.environ, **_THREADS, **(extra or {})},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise StageError(f"{done.stdout}\n{' '.join(words)}: exit code {done.returncode}")
+    return done.stdout
+
+
+def check_reference() -> str:
+    """The configuration page is what the types say."""
+    if not REFERENCE.exists() or REFERENCE.read_text(encoding="utf-8") != render():
+        raise StageError(f"{REFERENCE.relative_to(ROOT)} is not up to date; run `make docs`")
+    return ""
+
+
+def check_wheel() -> str:
+    """Build the wheel, install it outside the checkout, and fly from there."""
+    with tempfile.TemporaryDirectory(prefix="uavctl-wheel-") as name:
+        folder = Path(name)
+        shutil.rmtree(ROOT / "build", ignore_errors=True)  # else modules that are gone would be in the wheel
+        run([sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder / "dist", ROOT])
+        (wheel,) = (folder / "dist").glob("*.whl")
+        site = folder / "site"
+        run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel])
+        # -P and PYTHONPATH: the installed package, not the checkout beside the working directory.
+        flight = ("loopback", "--config", "paper", "--duration", "20", "--json", "--out", str(folder / "flights"))
+        outside = {"PYTHONPATH": str(site)}
+        where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
+        if not Path(where.strip()).is_relative_to(site):
+            raise StageError(f"the wheel was not what was imported, but {where.strip()}")
+        return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
+
+
+def check_tests() -> str:
+    """All tests; pytest's own closing line is the last one, and no test at all is a failure (exit code 5)."""
+    code = subprocess.run([BIN / "pytest", "-n", "2"], cwd=ROOT, env={**os.environ, **_THREADS}, check=False).returncode
+    if code != 0:
+        raise StageError(f"pytest: exit code {code}")
+    return ""
+
+
+STAGES: tuple[tuple[str, Callable[[], str]], ...] = (
+    ("ruff check", lambda: run([BIN / "ruff", "check"])),
+    ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
+    ("mypy", lambda: run([BIN / "mypy"])),
+    ("import contracts", lambda: run([BIN / "lint-imports"])),
+    ("docs/configuration.md", check_reference),
+    ("wheel, outside the checkout", check_wheel),
+    ("pytest", check_tests),
+)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the stages; 0 if all of them pass."""
+    if list(arguments) == ["--write-docs"]:
+        REFERENCE.write_text(render(), encoding="utf-8")
+        return 0
+    for name, stage in STAGES:
+        start = time.monotonic()
+        if stage is check_tests:
+            say(f"{name} ...")
+        try:
+            stage()
+        except StageError as error:
+            say(f"{error}\nFAILED  {name}")
+            return 1
+        if stage is not check_tests:
+            say(f"ok  {name} ({time.monotonic() - start:.1f} s)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,18 @@
+"""The command line: composes configuration, controller, simulator and recorder; one module a command."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def main() -> None:
+    """Entry point of `uavctl`; ends the process with the command's exit code."""
+    # The matrices are small: BLAS threads only disturb the control loop. Read once, when numpy is imported.
+    for variable in _THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+    from uavctl.cli.app import run
+
+    sys.exit(run(sys.argv[1:]))

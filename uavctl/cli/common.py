@@ -1,0 +1,65 @@
+"""What all commands share: --config, --set and --json, where output goes, and how a bad design is told."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.console import Console, RenderableType
+
+from uavctl.config import Loaded, explain, load
+from uavctl.errors import ConfigError, DesignError
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Common:
+    """Options of every command that takes a configuration."""
+
+    config: Annotated[str, Parameter(help="preset (paper, room) or TOML file")] = "room"
+    overrides: Annotated[
+        tuple[str, ...],
+        Parameter(name="--set", negative=(), help="override one key, as in link.loss=0.3; may be repeated"),
+    ] = ()
+    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False
+
+    def load(self) -> Loaded:
+        """The configuration that the options ask for.
+
+        Raises:
+            ConfigError: With all problems found.
+        """
+        return load(self.config, self.overrides)
+
+    def show(self, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]) -> None:
+        """Put the result on standard output: as JSON, or as a picture of it for people."""
+        if self.json:
+            sys.stdout.write(msgspec.json.encode(document).decode() + "\n")
+        else:
+            Console().print(picture())
+
+
+DEFAULTS = Common()
+
+
+def messages() -> Console:
+    """Where messages and progress go: standard error."""
+    return Console(stderr=True)
+
+
+@contextmanager
+def located(loaded: Loaded) -> Iterator[None]:
+    """Tell a refused design with the file and line of the key that is to blame.
+
+    Raises:
+        ConfigError: In place of the DesignError.
+    """
+    try:
+        yield
+    except DesignError as error:
+        raise ConfigError((explain(loaded.source, error),)) from error

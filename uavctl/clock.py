@@ -1,0 +1,54 @@
+"""Monotonic time and the grid of control ticks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+monotonic_ns: Callable[[], int] = time.monotonic_ns
+"""Nanoseconds of the clock that no adjustment of the wall clock moves; shared by all processes of a machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """One tick: its number, its absolute deadline on the grid, and the ticks skipped before it."""
+
+    tick: int
+    at_ns: int
+    missed: int
+
+
+class Ticker:
+    """Absolute deadlines on a grid.
+
+    The grid begins at the first multiple of `align_ns` after the first call of `next()`, so that
+    processes on one machine share it. Who oversleeps gets the newest tick that is due, once; the
+    ones before it are counted as missed and never made up.
+
+    Args:
+        period_ns: time between ticks.
+        align_ns: the grid's origin is a multiple of it; itself a multiple of `period_ns`.
+        now: the clock [ns].
+
+    Raises:
+        ValueError: a period below 1 ns, or one that does not divide `align_ns`.
+    """
+
+    def __init__(self, period_ns: int, align_ns: int, now: Callable[[], int] = monotonic_ns) -> None:
+        if period_ns < 1 or align_ns < 1 or align_ns % period_ns:
+            raise ValueError(f"a period of {period_ns} ns must be positive and divide the {align_ns} ns of the grid")
+        self._period_ns = period_ns
+        self._align_ns = align_ns
+        self._now = now
+        self._start_ns: int | None = None
+        self._tick = -1
+
+    def next(self) -> Due:
+        """The next tick; its deadline may be in the past by less than a period, never by more."""
+        now_ns = self._now()
+        if self._start_ns is None:
+            self._start_ns = (now_ns // self._align_ns + 1) * self._align_ns
+        expected = self._tick + 1
+        self._tick = max(expected, (now_ns - self._start_ns) // self._period_ns)
+        return Due(self._tick, self._start_ns + self._tick * self._period_ns, self._tick - expected)

@@ -1,0 +1,87 @@
+"""What is constant in a flight, and what one tick leaves to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from uavctl.data import ControlMode, Plan, Vec3
+from uavctl.flight.estimator import History
+from uavctl.flight.fallback import Fallback, FallbackParameters
+from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, make_kalman
+from uavctl.flight.limits import ZERO, LimitsParameters
+from uavctl.smpc.answer import Solver
+from uavctl.smpc.plant import Plant
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """Everything constant that `step` needs.
+
+    Attributes:
+        plant: The model.
+        design_id: Goes into every plan.
+        horizon: H [steps].
+        solver: Answers the decision problem.
+        target: Equilibrium to fly to (n_x,).
+        estimator: Parameters of the filter.
+        fallback: Parameters of the fallback.
+        limits: Parameters of the last gate.
+        dt_ns: Δt [ns].
+        tick_ns: Time between ticks [ns]; divides Δt.
+        kalman: The filter, made from the others.
+
+    Raises:
+        ValueError: If the ticks do not divide Δt, or the target has not one entry a state.
+    """
+
+    plant: Plant
+    design_id: str
+    horizon: int
+    solver: Solver
+    target: Array
+    estimator: EstimatorParameters
+    fallback: FallbackParameters
+    limits: LimitsParameters
+    dt_ns: int
+    tick_ns: int
+    kalman: Kalman = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
+            raise ValueError(f"tick_ns = {self.tick_ns} does not divide dt_ns = {self.dt_ns}")
+        if self.target.shape != (self.plant.n_x,):
+            raise ValueError(f"target has shape {self.target.shape}, wanted ({self.plant.n_x},)")
+        object.__setattr__(self, "kalman", make_kalman(self.plant, self.estimator, self.dt_ns))
+
+    @property
+    def ticks_per_step(self) -> int:
+        """Ticks in a Δt."""
+        return self.dt_ns // self.tick_ns
+
+
+@dataclass(frozen=True, eq=False)
+class ControlState:
+    """What one tick leaves to the next.
+
+    Attributes:
+        history: The estimator; None before the first tick.
+        decided_step: Step of the last boundary that was seen.
+        plan: The plan that is flown; None if none is.
+        fallback: The fallback that flies; None if it does not.
+        fresh: Fresh samples in a row.
+        accel_mps2: The last setpoint.
+    """
+
+    history: History | None = None
+    decided_step: int | None = None
+    plan: Plan | None = None
+    fallback: Fallback | None = None
+    fresh: int = 0
+    accel_mps2: Vec3 = ZERO
+
+    @property
+    def mode(self) -> ControlMode:
+        """What flies."""
+        if self.fallback is not None:
+            return self.fallback.mode
+        return ControlMode.WAIT if self.plan is None else ControlMode.TRACK

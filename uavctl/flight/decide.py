@@ -1,0 +1,137 @@
+"""Who flies in a tick: nobody yet, a plan (fresh, or played out), or the fallback."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.flight import fallback as fb
+from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.estimator import History, estimate
+from uavctl.flight.fallback import Fallback
+from uavctl.flight.limits import AXES, ZERO
+from uavctl.flight.planning import ask
+from uavctl.smpc.plant import Plant
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Place of a tick on the Δt grid, and what it sees."""
+
+    number: int  # step k
+    boundary_ns: int  # where step k began
+    boundary: bool  # the first tick of its step that runs
+    estimate: Estimate | None
+    age_steps: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What a tick decided."""
+
+    state: ControlState
+    reason: str
+    news: bool = False
+    solve: SolveStatus | None = None
+    plan: Plan | None = None
+    trouble: str = ""
+
+
+def place(state: ControlState, inp: StepInput, history: History, controller: Controller) -> Tick:
+    """The tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt)."""
+    number, into = divmod(inp.tick, controller.ticks_per_step)
+    boundary_ns = inp.at_ns - into * controller.tick_ns
+    captured_ns = history.captured_ns
+    return Tick(
+        number=number,
+        boundary_ns=boundary_ns,
+        boundary=state.decided_step is None or number > state.decided_step,
+        estimate=estimate(controller.kalman, history, inp.at_ns),
+        age_steps=None if captured_ns is None else max(0, (boundary_ns - captured_ns) // controller.dt_ns),
+    )
+
+
+def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
+    """Who flies: nobody yet, the plan, or the fallback."""
+    if state.fallback is not None and state.fallback.ended:
+        return _fall(state, state.fallback, tick, inp.at_ns, controller, "handed over")
+    why_not = unready(inp.vehicle)
+    stopping = inp.stop or (state.fallback is not None and state.fallback.stopping)
+    if why_not and stopping:
+        ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns, stopping=True)
+        return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
+    if why_not:
+        return Choice(replace(state, plan=None, fallback=None), why_not)
+    if stopping:
+        stopped = fb.request_stop(state.fallback, inp.at_ns)
+        return _fall(state, stopped, tick, inp.at_ns, controller, "the operator asked for the hand-over")
+    if tick.boundary:
+        return _decide(state, tick, inp.at_ns, controller)
+    if state.fallback is not None:
+        return _fall(state, state.fallback, tick, inp.at_ns, controller, "fallback goes on")
+    waiting = state.plan is None
+    return Choice(state, "waits for the next boundary" if waiting else "held until the next boundary")
+
+
+def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller) -> Choice:
+    """The decision of a Δt boundary, with a vehicle that takes setpoints."""
+    if tick.age_steps is None or state.history is None:
+        return Choice(state, "no position yet")
+    if tick.age_steps >= controller.horizon:
+        reason = f"age of information {tick.age_steps} has reached H = {controller.horizon}"
+        return _fall(state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, reason)
+    if state.fallback is not None and state.fresh < controller.fallback.recover_samples:
+        reason = f"{state.fresh} of {controller.fallback.recover_samples} fresh samples in a row"
+        return _fall(state, state.fallback, tick, at_ns, controller, reason)
+    choice = _replan(state, tick, controller)
+    plan = choice.state.plan
+    if plan is not None and tick.number - plan.seq < controller.horizon:
+        return choice
+    if plan is None and state.fallback is None and not choice.news:
+        return replace(choice, reason="no position from before this boundary yet")
+    fallen = _fall(choice.state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, "no plan is left to fly")
+    return replace(choice, state=fallen.state, reason=fallen.reason)
+
+
+def _replan(state: ControlState, tick: Tick, controller: Controller) -> Choice:
+    """Ask for a plan if there is news; else, or if that fails, the old one plays out."""
+    # A boundary that was missed is decided as it would have been then: from what had been captured by then.
+    base = None if state.history is None else estimate(controller.kalman, state.history, tick.boundary_ns)
+    if base is None or (state.plan is not None and base.captured_ns <= state.plan.captured_ns):
+        return Choice(state, "no news: the plan plays out")
+    asked = ask(controller.solver, tick.number, base, controller.target, controller.horizon, controller.design_id)
+    if asked.plan is None:
+        return Choice(state, "no new plan: the old one plays out", True, asked.status, None, asked.text)
+    return Choice(replace(state, plan=asked.plan, fallback=None), "news: a new plan", True, asked.status, asked.plan)
+
+
+def _fall(
+    state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller, reason: str
+) -> Choice:
+    """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
+    speed_mps = float(np.linalg.norm(velocity(tick.estimate, controller.plant)))
+    fallback = fb.advance(fallback, at_ns, speed_mps, controller.fallback)
+    fresh = 0 if state.fallback is None else state.fresh
+    return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
+
+
+def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
+    """Predicted velocity, zero in the axes that the plant has not."""
+    if estimated is None:
+        return ZERO
+    speeds = dict(zip(plant.axes, (estimated.mean[index] for index in plant.velocity_index), strict=True))
+    north, east, down = (speeds.get(axis, 0.0) for axis in AXES)
+    return north, east, down
+
+
+def unready(vehicle: VehicleStatus | None) -> str:
+    """Why the vehicle does not take setpoints; empty if it does."""
+    if vehicle is None:
+        return "no vehicle is heard"
+    if not vehicle.armed:
+        return "the vehicle is not armed"
+    if not vehicle.external:
+        return f"the vehicle is in mode {vehicle.mode}, which takes no setpoints"
+    return ""

@@ -1,0 +1,189 @@
+"""A source's stamps to our monotonic clock; pure, time is an argument.
+
+Two estimates of (our time − its time): from TIMESYNC round trips if the source answers them, else the
+sliding minimum of (received − stamp), which is the true offset plus the smallest delay; `latency`, the
+smallest delay as configured, is taken off again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+
+MAX_ROUND_TRIP_NS = 10_000_000
+MAX_DEVIATION_NS = 100_000_000
+RESYNC_AFTER = 5  # deviating values in a row that are believed
+LEAP_NS = 1_000_000_000
+SETTLED_AFTER = 20  # samples before the minimum is trusted to judge the next stamp
+AGREE_NS = 200_000_000  # spread of the delays of one new clock
+REMEMBERED_STAMPS = 64
+_GAIN = 4  # a new round trip counts one in so many
+
+
+class Refusal(StrEnum):
+    """Why a stamp gives no time of capture."""
+
+    FUTURE = "future-stamp"
+    LEAP = "stamp-leap"
+    DUPLICATE = "duplicate"
+
+
+class ClockSource(StrEnum):
+    """Where the offset comes from."""
+
+    TIMESYNC = "timesync"
+    MINIMUM = "minimum"
+    NONE = "none"
+
+
+class SlidingMinimum:
+    """Minimum over a window of time, amortised O(1): values that a later, smaller one outlives are dropped."""
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        self._queue: deque[tuple[int, int]] = deque()  # (at_ns, value), values ascending
+
+    def push(self, at_ns: int, value: int) -> int:
+        """Add a value and return the minimum of those younger than the window."""
+        while self._queue and self._queue[-1][1] >= value:
+            self._queue.pop()
+        self._queue.append((at_ns, value))
+        while self._queue[0][0] <= at_ns - self._window_ns:
+            self._queue.popleft()
+        return self._queue[0][1]
+
+    @property
+    def value(self) -> int | None:
+        """The minimum when the last value came, or None."""
+        return self._queue[0][1] if self._queue else None
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self._queue.clear()
+
+
+class RoundTrips:
+    """Offset of a peer's clock from its answers to TIMESYNC requests."""
+
+    def __init__(self, lifetime_ns: int) -> None:
+        self._lifetime_ns = lifetime_ns
+        self._offset_ns: int | None = None
+        self._at_ns = 0
+        self._deviating = 0
+
+    def offset_ns(self, at_ns: int) -> int | None:
+        """(our time − its time), or None without a good answer in the last `lifetime_ns`."""
+        return self._offset_ns if at_ns - self._at_ns <= self._lifetime_ns else None
+
+    def answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
+        """Take one answer.
+
+        Args:
+            sent_ns: our time when the request was sent.
+            remote_ns: the peer's time in the answer.
+            received_ns: our time when the answer came.
+
+        Returns:
+            Whether it was used; a slow or deviating one is not.
+        """
+        round_trip_ns = received_ns - sent_ns
+        if not 0 <= round_trip_ns <= MAX_ROUND_TRIP_NS:
+            return False
+        measured_ns = sent_ns + round_trip_ns // 2 - remote_ns
+        old_ns = self.offset_ns(received_ns)
+        if old_ns is None:
+            self._offset_ns = measured_ns
+        elif abs(measured_ns - old_ns) > MAX_DEVIATION_NS:
+            self._deviating += 1
+            if self._deviating < RESYNC_AFTER:
+                return False
+            self._offset_ns = measured_ns
+        else:
+            self._offset_ns = old_ns + (measured_ns - old_ns) // _GAIN
+        self._at_ns, self._deviating = received_ns, 0
+        return True
+
+
+class ClockSync:
+    """The clock of one source, identified by system, component and kind of stamp.
+
+    Args:
+        window_ns: window of the sliding minimum.
+        latency_ns: smallest delay from capture to arrival.
+        future_tolerance_ns: a stamp further ahead than this is refused.
+    """
+
+    def __init__(self, window_ns: int, latency_ns: int, future_tolerance_ns: int) -> None:
+        self._latency_ns = latency_ns
+        self._future_tolerance_ns = future_tolerance_ns
+        self._minimum = SlidingMinimum(window_ns)
+        self._newest_ns = 0
+        self._count = 0
+        self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
+        self._leaps: deque[int] = deque(maxlen=RESYNC_AFTER)
+        self.resyncs = 0
+        self.offset_ns: int | None = None
+        self.source = ClockSource.NONE
+
+    def captured_ns(self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None) -> int | Refusal:
+        """Time of capture in our clock.
+
+        Args:
+            stamp_ns: the source's stamp; None if it gives none.
+            received_ns: our time of arrival.
+            offset_ns: offset from round trips, if there is one. It is used if it makes the smallest
+                delay plausible: answers and stamps may come from different clocks.
+
+        Returns:
+            The time of capture, never after the arrival, or why the stamp is refused.
+        """
+        if stamp_ns is None:
+            return received_ns - self._latency_ns
+        refusal = self._judge(stamp_ns, received_ns)
+        if refusal is not None:
+            return refusal
+        self._count += 1
+        self._newest_ns = stamp_ns if self._count == 1 else max(self._newest_ns, stamp_ns)
+        self._stamps.append(stamp_ns)
+        minimum_ns = self._minimum.push(received_ns, received_ns - stamp_ns)
+        if offset_ns is None or not -self._future_tolerance_ns <= minimum_ns - offset_ns <= LEAP_NS:
+            self.offset_ns, self.source = minimum_ns - self._latency_ns, ClockSource.MINIMUM
+        else:
+            self.offset_ns, self.source = offset_ns, ClockSource.TIMESYNC
+        return min(stamp_ns + self.offset_ns, received_ns)
+
+    def unwrap(self, stamp: int, modulus: int, unit_ns: int) -> int:
+        """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
+        half = modulus // 2
+        newest = self._newest_ns // unit_ns if self._count else stamp
+        return (newest + (stamp - newest + half) % modulus - half) * unit_ns
+
+    def _judge(self, stamp_ns: int, received_ns: int) -> Refusal | None:
+        """Refuse stamps that the clock so far cannot have given, until several in a row agree on a new clock."""
+        minimum_ns = self._minimum.value
+        if minimum_ns is None:
+            return None
+        if stamp_ns in self._stamps:
+            return Refusal.DUPLICATE
+        delay_ns = received_ns - stamp_ns
+        ahead_ns = self._future_tolerance_ns if self._count >= SETTLED_AFTER else LEAP_NS
+        if minimum_ns - delay_ns > ahead_ns:
+            refusal = Refusal.FUTURE
+        elif self._newest_ns - stamp_ns > LEAP_NS:
+            refusal = Refusal.LEAP
+        else:
+            self._leaps.clear()
+            return None
+        self._leaps.append(delay_ns)
+        if len(self._leaps) < RESYNC_AFTER or max(self._leaps) - min(self._leaps) > AGREE_NS:
+            return refusal
+        self._restart()
+        return None
+
+    def _restart(self) -> None:
+        """Begin anew: the source has another clock now."""
+        self._minimum.clear()
+        self._stamps.clear()
+        self._leaps.clear()
+        self._count = 0
+        self.resyncs += 1

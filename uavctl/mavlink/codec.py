@@ -1,0 +1,307 @@
+"""MAVLink bytes to typed messages and back.
+
+Message definitions: https://mavlink.io/en/messages/common.html. Decoding never raises: what cannot
+be used is counted by reason. Encoding refuses what a vehicle must not get.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.data import Setpoint, Vec3
+from uavctl.frames import Convention, Quaternion, rotate
+from uavctl.mavlink.framing import BadBytes, RawFrame, scan
+from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text, TimeSync
+
+MAX_DATAGRAM_BYTES = 4096
+BOOT_MS_WRAP = 2**32  # time_boot_ms is unsigned, 32 bits: 49.7 days
+ACCEL_ONLY = 0x0C3F  # type_mask 3135: acceleration used; position, velocity, yaw and yaw rate ignored
+ACCEL_AND_YAW = 0x083F  # type_mask 2111: yaw is used too
+_ABSURD_ACCEL_MPS2 = 1e3
+_INT64 = 2**63
+
+BAD_FIELD = "non-finite"
+BAD_FRAME = "frame-id"
+BAD_PAYLOAD = "payload"
+BAD_QUALITY = "quality"
+
+
+class UnsendableError(ValueError):
+    """A message must not be sent as it is; a NaN, for one, aborts ArduPilot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """What some bytes held.
+
+    Attributes:
+        messages: those that are understood, in order.
+        total: number of messages, also of kinds that are passed over.
+        bad: what was skipped, by reason.
+    """
+
+    messages: tuple[Message, ...]
+    total: int
+    bad: Counter[str]
+
+
+class _RefusedError(Exception):
+    """A message's content cannot be used; the argument is the reason."""
+
+
+def decode(data: bytes) -> Decoded:
+    """Decode one datagram, with a parser of its own, so that a broken one spoils no other.
+
+    Args:
+        data: a datagram; longer ones than `MAX_DATAGRAM_BYTES` are dropped whole.
+    """
+    if len(data) > MAX_DATAGRAM_BYTES:
+        return Decoded((), 0, Counter({BadBytes.OVERSIZE: 1}))
+    found = scan(data, final=True)
+    return _decode_frames(found.frames, found.bad)
+
+
+class StreamDecoder:
+    """Reassembles messages from the chunks of a byte stream (TCP, serial)."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._in_step = True
+
+    def push(self, chunk: bytes) -> Decoded:
+        """Take the next bytes; what they begin and do not end waits for the next chunk."""
+        data = self._rest + chunk
+        found = scan(data, final=False, in_step=self._in_step)
+        self._rest, self._in_step = data[found.consumed :], found.in_step
+        return _decode_frames(found.frames, found.bad)
+
+
+def _decode_frames(frames: list[RawFrame], bad: Counter[str]) -> Decoded:
+    parser = mavlink.MAVLink(None)
+    messages = []
+    for frame in frames:
+        reader = _READERS.get(frame.message_id)
+        if reader is None:
+            continue
+        try:
+            message = reader(parser.decode(bytearray(frame.data)))
+        except _RefusedError as refused:
+            bad[str(refused)] += 1
+        except mavlink.MAVError:
+            bad[BAD_PAYLOAD] += 1
+        else:
+            if message is not None:
+                messages.append(message)
+    return Decoded(tuple(messages), len(frames), bad)
+
+
+def _finite(*values: float) -> bool:
+    return all(map(math.isfinite, values))
+
+
+def _xyz(raw: mavlink.MAVLink_message) -> Vec3:
+    position = (float(raw.x), float(raw.y), float(raw.z))
+    if not _finite(*position):
+        raise _RefusedError(BAD_FIELD)
+    return position
+
+
+def _from_usec(raw: mavlink.MAVLink_message, usec: int) -> Position:
+    return Position(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        name=raw.get_type(),
+        stamp_us=usec or None,
+        position_m=_xyz(raw),
+    )
+
+
+_ODOMETRY_AXES: dict[int, Convention] = {
+    mavlink.MAV_FRAME_LOCAL_NED: "ned",
+    mavlink.MAV_FRAME_LOCAL_FRD: "ned",
+    mavlink.MAV_FRAME_LOCAL_ENU: "enu",
+    mavlink.MAV_FRAME_LOCAL_FLU: "flu",
+}
+_BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
+
+
+def _odometry(raw: mavlink.MAVLink_message) -> Position:
+    axes = _ODOMETRY_AXES.get(raw.frame_id)
+    if axes is None:
+        raise _RefusedError(BAD_FRAME)
+    if raw.quality < 0:  # "odometry has failed"
+        raise _RefusedError(BAD_QUALITY)
+    return Position(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        name=raw.get_type(),
+        stamp_us=raw.time_usec or None,
+        position_m=_xyz(raw),
+        velocity_mps=_odometry_velocity(raw),
+        convention=axes,
+    )
+
+
+def _odometry_velocity(raw: mavlink.MAVLink_message) -> Vec3 | None:
+    """Velocity in the axes of the position; None if it is not given (NaN) or its axes are not known."""
+    velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
+    if not _finite(*velocity):
+        return None
+    if raw.child_frame_id in _BODY_AXES:
+        q: Quaternion = (raw.q[0], raw.q[1], raw.q[2], raw.q[3])
+        return rotate(q, velocity)
+    return velocity if raw.child_frame_id == raw.frame_id else None
+
+
+def _local_position(raw: mavlink.MAVLink_message) -> Position:
+    velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
+    return Position(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        name=raw.get_type(),
+        stamp_us=raw.time_boot_ms * 1000,
+        boot_ms=True,
+        position_m=_xyz(raw),
+        velocity_mps=velocity if _finite(*velocity) else None,
+        local_ned=True,
+    )
+
+
+def _heartbeat(raw: mavlink.MAVLink_message) -> Heartbeat:
+    return Heartbeat(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        vehicle_type=raw.type,
+        autopilot=raw.autopilot,
+        base_mode=raw.base_mode,
+        custom_mode=raw.custom_mode,
+    )
+
+
+def _timesync(raw: mavlink.MAVLink_message) -> TimeSync:
+    return TimeSync(system=raw.get_srcSystem(), component=raw.get_srcComponent(), tc1_ns=raw.tc1, ts1_ns=raw.ts1)
+
+
+def _landed(raw: mavlink.MAVLink_message) -> Landed:
+    state = raw.landed_state
+    undefined = state == mavlink.MAV_LANDED_STATE_UNDEFINED
+    return Landed(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        landed=None if undefined else state == mavlink.MAV_LANDED_STATE_ON_GROUND,
+    )
+
+
+_NO_VOLTAGE_MV = 0xFFFF
+
+
+def _sys_status(raw: mavlink.MAVLink_message) -> Battery | None:
+    return _battery(raw, [raw.voltage_battery])
+
+
+def _battery_status(raw: mavlink.MAVLink_message) -> Battery | None:
+    return _battery(raw, raw.voltages) if raw.id == 0 else None
+
+
+def _battery(raw: mavlink.MAVLink_message, voltages_mv: list[int]) -> Battery | None:
+    """Sum of the cells that are known (the first may stand for all of them)."""
+    known = [voltage for voltage in voltages_mv if voltage != _NO_VOLTAGE_MV]
+    if not known:
+        return None
+    return Battery(system=raw.get_srcSystem(), component=raw.get_srcComponent(), voltage_v=sum(known) / 1000)
+
+
+def _text(raw: mavlink.MAVLink_message) -> Text:
+    # Control characters would act on the terminal that shows them.
+    text = "".join(character if character.isprintable() else "?" for character in raw.text)
+    return Text(system=raw.get_srcSystem(), component=raw.get_srcComponent(), severity=raw.severity, text=text)
+
+
+def _ack(raw: mavlink.MAVLink_message) -> Ack:
+    return Ack(system=raw.get_srcSystem(), component=raw.get_srcComponent(), command=raw.command, result=raw.result)
+
+
+_READERS: dict[int, Callable[[mavlink.MAVLink_message], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: lambda raw: _from_usec(raw, raw.usec),
+    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: lambda raw: _from_usec(raw, raw.usec),
+    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: lambda raw: _from_usec(raw, raw.time_usec),
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: _odometry,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: _timesync,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _landed,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
+    mavlink.MAVLINK_MSG_ID_STATUSTEXT: _text,
+    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: _ack,
+}
+
+
+class Encoder:
+    """Messages to frames, numbered modulo 256 as one sequence.
+
+    `MAVLink.pack` leaves the number alone, so the encoder counts.
+    """
+
+    def __init__(self, system_id: int, component_id: int) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT of an onboard controller."""
+        return self._pack(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+            )
+        )
+
+    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+        """TIMESYNC: request with tc1 = 0, answer with our time in tc1 and the request's ts1.
+
+        Raises:
+            UnsendableError: a time is not a signed 64-bit number.
+        """
+        if not all(-_INT64 <= value < _INT64 for value in (tc1_ns, ts1_ns)):
+            raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
+        return self._pack(mavlink.MAVLink_timesync_message(tc1_ns, ts1_ns))
+
+    def setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
+        """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
+
+        Raises:
+            UnsendableError: a value is not finite, or absurd.
+        """
+        yaw = setpoint.yaw_rad
+        if not _finite(*setpoint.accel_mps2, yaw or 0.0) or max(map(abs, setpoint.accel_mps2)) > _ABSURD_ACCEL_MPS2:
+            raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
+        return self._pack(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                setpoint.at_ns // 1_000_000 % BOOT_MS_WRAP,
+                target_system,
+                target_component,
+                mavlink.MAV_FRAME_LOCAL_NED,
+                ACCEL_ONLY if yaw is None else ACCEL_AND_YAW,
+                *(0.0, 0.0, 0.0),
+                *(0.0, 0.0, 0.0),
+                *setpoint.accel_mps2,
+                yaw or 0.0,
+                0.0,
+            )
+        )
+
+    def land(self, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_NAV_LAND: land where it is."""
+        return self._pack(
+            mavlink.MAVLink_command_long_message(
+                target_system, target_component, mavlink.MAV_CMD_NAV_LAND, 0, *(0.0,) * 7
+            )
+        )
+
+    def _pack(self, message: mavlink.MAVLink_message) -> bytes:
+        data = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data

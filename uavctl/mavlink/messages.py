@@ -1,0 +1,87 @@
+"""The MAVLink messages that are understood, as typed records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uavctl.data import Vec3
+from uavctl.frames import Convention
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Message:
+    """Base of the messages that are understood; `system` and `component` sent it."""
+
+    system: int
+    component: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Position(Message):
+    """A position, and perhaps a velocity, in the axes that the message declares.
+
+    Attributes:
+        name: name of the MAVLink message.
+        stamp_us: the source's time of capture [µs]; None if it gives none.
+        boot_ms: the stamp is `time_boot_ms`, which wraps at 2**32 ms.
+        position_m: position [m].
+        velocity_mps: velocity in the same axes [m/s], or None.
+        convention: axes that the message declares; None if it leaves them to the configuration.
+        local_ned: the message is in the vehicle's local NED already.
+    """
+
+    name: str
+    stamp_us: int | None
+    boot_ms: bool = False
+    position_m: Vec3
+    velocity_mps: Vec3 | None = None
+    convention: Convention | None = None
+    local_ned: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heartbeat(Message):
+    """HEARTBEAT."""
+
+    vehicle_type: int
+    autopilot: int
+    base_mode: int
+    custom_mode: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeSync(Message):
+    """TIMESYNC: a request if `tc1_ns` is 0, else an answer to the request of `ts1_ns`."""
+
+    tc1_ns: int
+    ts1_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Landed(Message):
+    """EXTENDED_SYS_STATE; None while the vehicle does not know."""
+
+    landed: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Battery(Message):
+    """SYS_STATUS or BATTERY_STATUS with a voltage [V]."""
+
+    voltage_v: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Text(Message):
+    """STATUSTEXT; `severity` is MAV_SEVERITY, 0 the worst, 7 the least."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ack(Message):
+    """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted."""
+
+    command: int
+    result: int

@@ -1,0 +1,277 @@
+"""A complete design: what the decision problem is made from, checked against Assumption 4 and frozen."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import Vec3
+from uavctl.errors import DesignError
+from uavctl.smpc.age import age_distribution, at_most
+from uavctl.smpc.assumptions import AssumptionCheck, check_assumptions
+from uavctl.smpc.plant import Plant
+from uavctl.smpc.risk import Allocation, kappa
+from uavctl.smpc.schedule import Demand, Schedule, fixed, greedy, nested
+from uavctl.smpc.sets import Polytope
+from uavctl.smpc.terminal import Terminal, make_terminal
+
+Array = NDArray[np.float64]
+Rule = Literal["fixed", "search", "greedy"]
+
+
+@dataclass(frozen=True, eq=False)
+class DesignSpec:
+    """What a design is asked for; the fields are those of the configuration of the same name.
+
+    Attributes:
+        link_p: Link probabilities of the steps 1 … T (T,), T >= max(H, τ).
+        target_m: Where the terminal set has to fit the limits, local NED [m].
+    """
+
+    plant: Plant
+    state_set: Polytope
+    input_set: Polytope
+    q_x: Array
+    q_u: Array
+    horizon: int
+    tau: int
+    delta_x: float
+    delta_u: float
+    delta_tau: float
+    k_tau: Array
+    link_p: Array
+    target_m: Vec3
+    rule: Rule
+    delays: int | Sequence[int]
+    gamma_max: float
+    search_states: Array
+    allocation: Allocation
+    slack_linear: float
+    slack_quadratic: float
+    offset_weight: float
+    terminal_weight: float
+    max_iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Everything that a solver reads.
+
+    Attributes:
+        plant: The plant.
+        state_set: X, m_x rows.
+        input_set: U, m_u rows.
+        q_x: Q_x (n_x, n_x).
+        q_u: Q_u (n_u, n_u).
+        target: Equilibrium that the design was checked at (n_x,).
+        horizon: H.
+        schedule: Delays and likelihoods.
+        terminal: What follows after the horizon.
+        kappa_x: κ_t of the state rows (H+1,); entry 0 is not used.
+        kappa_u: κ_t of the input rows (H,).
+        kappa_x_terminal: The larger of δ_x's and the last stage's.
+        kappa_u_terminal: The larger of δ_u's and the terminal stages'.
+        slack_linear: Exact penalty of a slack.
+        slack_quadratic: Its quadratic part.
+        offset_weight: l1 weight of the reference's distance from the target.
+        terminal_weight: l1 weight of a missed terminal equality.
+        max_iterations: Bound of the interior-point method.
+        assumptions: Assumption 4, item by item.
+        design_id: Hash of all the above.
+    """
+
+    plant: Plant
+    state_set: Polytope
+    input_set: Polytope
+    q_x: Array
+    q_u: Array
+    target: Array
+    horizon: int
+    schedule: Schedule
+    terminal: Terminal
+    kappa_x: Array
+    kappa_u: Array
+    kappa_x_terminal: float
+    kappa_u_terminal: float
+    slack_linear: float
+    slack_quadratic: float
+    offset_weight: float
+    terminal_weight: float
+    max_iterations: int
+    assumptions: tuple[AssumptionCheck, ...]
+    design_id: str
+
+
+def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | None] | None = None) -> Design:
+    """Choose a schedule, make the terminal ingredients, check Assumption 4.
+
+    Args:
+        spec: What is asked for.
+        cost_of: Optimal cost of a design from a state (n_x,), None where it is infeasible; rule `search` needs it.
+
+    Raises:
+        DesignError: No such design, naming the key, the item of Assumption 4 if one fails, and the figures.
+    """
+    if spec.tau >= spec.horizon - 1:
+        raise DesignError(
+            "smpc.tau",
+            f"tau = {spec.tau} leaves {spec.horizon - spec.tau} free steps of the horizon H = {spec.horizon}",
+            f"take tau of at most {spec.horizon - 2}, or a longer smpc.horizon",
+        )
+    mu = age_distribution(spec.link_p)
+    demand = Demand(mu, spec.horizon, spec.tau, spec.delta_x, spec.delta_u)
+    terminal = make_terminal(spec.plant, spec.tau, spec.k_tau, spec.q_x, spec.q_u)
+    if spec.rule == "fixed":
+        return _assemble(spec, fixed(demand, spec.delays), terminal)
+    if spec.rule == "greedy":
+        return _assemble(spec, greedy(demand), terminal)
+    return _search(spec, demand, terminal, cost_of)
+
+
+def _search(
+    spec: DesignSpec, demand: Demand, terminal: Terminal, cost_of: Callable[[Design, Array], float | None] | None
+) -> Design:
+    """Least mean cost over the named states among the nested schedules that keep all of them feasible."""
+    if cost_of is None or not len(spec.search_states):
+        raise DesignError(
+            "schedule.search_states", "rule `search` has no states to minimise the cost over", "name some"
+        )
+    best: tuple[float, Design] | None = None
+    tried = 0
+    for schedule in nested(demand, spec.gamma_max):
+        tried += 1
+        try:
+            design = _assemble(spec, schedule, terminal)
+        except DesignError:
+            continue  # this schedule's likelihoods ask for more than the limits leave
+        costs = [cost_of(design, state) for state in spec.search_states]
+        known = [cost for cost in costs if cost is not None]
+        mean = float(np.mean(known)) if len(known) == len(costs) else np.inf
+        if np.isfinite(mean) and (best is None or mean < best[0]):
+            best = (mean, design)
+    if best is None:
+        raise DesignError(
+            "schedule.rule",
+            f"none of {tried} nested schedules keeps Assumption 4 with all {len(spec.search_states)} states feasible",
+            "name states that are easier, raise schedule.gamma_max, or use rule `fixed`",
+        )
+    return best[1]
+
+
+def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Design:
+    n_x, n_u = spec.plant.n_x, spec.plant.n_u
+    m_x, m_u = spec.state_set.b.size, spec.input_set.b.size
+
+    def factor(gamma: float, n: int, rows: int) -> float:
+        return kappa(gamma, n, rows, spec.allocation)
+
+    kappa_x = np.array([0.0, *(factor(g, n_x, m_x) for g in schedule.gamma_x[1:])])
+    kappa_u = np.array([factor(g, n_u, m_u) for g in schedule.gamma_u])
+    kappa_x_terminal = max(factor(spec.delta_x, n_x, m_x), float(kappa_x[-1]))
+    kappa_u_terminal = max(factor(spec.delta_u, n_u, m_u), float(kappa_u[-spec.tau :].max()))
+    target = spec.plant.equilibrium(spec.target_m)
+    mu = age_distribution(spec.link_p)
+    checks = check_assumptions(
+        plant=spec.plant,
+        terminal=terminal,
+        state_set=spec.state_set,
+        input_set=spec.input_set,
+        target=target,
+        kappa_x=kappa_x_terminal,
+        kappa_u=kappa_u_terminal,
+        age_within_tau=min(at_most(mu, t, spec.tau) for t in range(len(mu))),
+        delta_tau=spec.delta_tau,
+    )
+    design = Design(
+        plant=spec.plant,
+        state_set=spec.state_set,
+        input_set=spec.input_set,
+        q_x=spec.q_x,
+        q_u=spec.q_u,
+        target=target,
+        horizon=spec.horizon,
+        schedule=schedule,
+        terminal=terminal,
+        kappa_x=kappa_x,
+        kappa_u=kappa_u,
+        kappa_x_terminal=kappa_x_terminal,
+        kappa_u_terminal=kappa_u_terminal,
+        slack_linear=spec.slack_linear,
+        slack_quadratic=spec.slack_quadratic,
+        offset_weight=spec.offset_weight,
+        terminal_weight=spec.terminal_weight,
+        max_iterations=spec.max_iterations,
+        assumptions=checks,
+        design_id="",
+    )
+    return replace(design, design_id=_digest(design))
+
+
+def _digest(value: object) -> str:
+    """Hash of all numbers in a tree of dataclasses."""
+    hasher = hashlib.sha256()
+
+    def feed(part: object) -> None:
+        if isinstance(part, np.ndarray):
+            hasher.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
+        elif hasattr(part, "__dataclass_fields__") and not isinstance(part, type):
+            for one in fields(part):
+                hasher.update(one.name.encode())
+                feed(getattr(part, one.name))
+        elif isinstance(part, tuple):
+            for one in part:
+                feed(one)
+        else:
+            hasher.update(repr(part).encode())
+
+    feed(value)
+    return hasher.hexdigest()[:16]
+
+
+def design_record(design: Design) -> dict[str, object]:
+    """The design as plain numbers, for recordings and `uavctl design --json`."""
+    plant, schedule, terminal = design.plant, design.schedule, design.terminal
+    return {
+        "design_id": design.design_id,
+        "tau": terminal.tau,
+        "horizon": design.horizon,
+        "dt_s": plant.dt_s,
+        "axes": list(plant.axes),
+        "position_index": list(plant.position_index),
+        "velocity_index": list(plant.velocity_index),
+        "target": design.target.tolist(),
+        "delays": list(schedule.delays),
+        "alpha": schedule.alpha.tolist(),
+        "gamma_x": schedule.gamma_x.tolist(),
+        "gamma_u": schedule.gamma_u.tolist(),
+        "kappa_x": design.kappa_x.tolist(),
+        "kappa_u": design.kappa_u.tolist(),
+        "kappa_x_terminal": design.kappa_x_terminal,
+        "kappa_u_terminal": design.kappa_u_terminal,
+        "spectral_radius": terminal.spectral_radius,
+        "assumptions": [
+            {"item": check.item, "ok": check.ok, "value": check.value, "limit": check.limit, "text": check.text}
+            for check in design.assumptions
+        ],
+        "a": plant.a.tolist(),
+        "b": plant.b.tolist(),
+        "e": plant.e.tolist(),
+        "w": plant.w.tolist(),
+        "c_x": design.state_set.c.tolist(),
+        "b_x": design.state_set.b.tolist(),
+        "c_u": design.input_set.c.tolist(),
+        "b_u": design.input_set.b.tolist(),
+        "q_x": design.q_x.tolist(),
+        "q_u": design.q_u.tolist(),
+        "k_tau": terminal.k.tolist(),
+        "sigma_x": terminal.sigma_x.tolist(),
+        "slack_linear": design.slack_linear,
+        "slack_quadratic": design.slack_quadratic,
+        "offset_weight": design.offset_weight,
+        "terminal_weight": design.terminal_weight,
+    }

@@ -1,0 +1,25 @@
+"""Risk allocation: how a likelihood becomes the factor of a back-off."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+Allocation = Literal["ellipsoid", "halfspace"]
+
+
+def kappa(gamma: float, n: int, rows: int, allocation: Allocation) -> float:
+    """κ: how many standard deviations a row keeps away from its limit.
+
+    Args:
+        gamma: Likelihood that the whole vector has to be inside with.
+        n: Dimension of the vector.
+        rows: Number of limits.
+        allocation: `ellipsoid`: sqrt of the χ² quantile with n degrees of freedom, as printed; `halfspace`: Boole's
+            inequality, the same share of the risk for each row, with Gaussian quantiles.
+    """
+    if allocation == "ellipsoid":
+        return float(np.sqrt(chi2.ppf(gamma, n)))
+    return float(norm.isf((1.0 - gamma) / max(1, rows)))
