@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -30,8 +31,7 @@ _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of 
 _DATA_END = struct.Struct("<BQI")
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """A message whose chunk has the right checksum."""
 
     definition: Definition

@@ -96,8 +96,12 @@ class FlightData:
 
     @property
     def samples(self) -> tuple[PositionSample, ...]:
-        """Every position that reached a tick, also those that it refused."""
-        return tuple(sample for one in self.step_inputs for sample in one.samples)
+        """Positions that were accepted, as far as the recording tells.
+
+        A decision counts what it refused without naming it, so ticks that refused any are left out.
+        """
+        refusing = {decision.tick for decision in self.decisions if decision.rejected}
+        return tuple(sample for one in self.step_inputs if one.tick not in refusing for sample in one.samples)
 
     @cached_property
     def tick_ns(self) -> int:

@@ -95,6 +95,11 @@ class Journal:
         self._refusal = ""
         self.closed = False
 
+    @property
+    def queued(self) -> int:
+        """Records in the queue."""
+        return len(self._queue)
+
     def append(self, topic: str, at_ns: int, record: Record) -> None:
         """Queue a record, or count it as dropped."""
         if self.closed or len(self._queue) >= self._limit:

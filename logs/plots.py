@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from logs.design_view import AXIS_NUMBER, DesignView, Floats
 from logs.flight_data import FALLBACK, FlightData
 from logs.summary import position_error_m, state_outside
-from logs.svg import Drawing, canvas, colour
+from logs.svg import Drawing, canvas, colour, dots
 from uavctl.data import Plan
 
 POINTS = 1200
@@ -53,9 +53,9 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
     truth = seen(np.array([t.position_m for t in flight.truths]))
     target = seen(np.array([design.target_m]))
     _draw_room(ax, design, axes_shown)
-    ax.plot(*samples.T, ".", ms=3.5, color=colour("sample"), alpha=0.8, zorder=2)
-    ax.plot(*estimate.T, color=colour("estimate"), lw=1.2, zorder=3)
-    ax.plot(*truth.T, color=colour("truth"), lw=1.5, zorder=4)
+    ax.plot(*estimate.T, color=colour("estimate"), lw=2.8, alpha=0.5, zorder=2)
+    ax.plot(*truth.T, color=colour("truth"), lw=1.0, zorder=3)
+    dots(ax, samples[:, 0], samples[:, 1], "sample", 2.4, zorder=4)
     flown = truth if len(truth) else estimate
     ax.plot(*flown[:1].T, "o", ms=6, mfc=colour("card"), mec=colour("truth"), mew=1.5, zorder=5)
     ax.plot(*target.T, "*", ms=12, color=colour("target"), mec=colour("card"), mew=0.6, zorder=6)
@@ -105,11 +105,11 @@ def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, ti
             flight.seconds([e.at_ns for e in flight.estimates]),
             np.array([sign * e.mean[index] for e in flight.estimates]),
         )
-        ax.plot(estimate_s, estimate, color=colour("estimate"), lw=1.2)
+        ax.plot(estimate_s, estimate, color=colour("estimate"), lw=2.6, alpha=0.5)
         truth_s, truth = thin(
             flight.seconds([t.at_ns for t in flight.truths]), np.array([sign * t.state[index] for t in flight.truths])
         )
-        ax.plot(truth_s, truth, color=colour("truth"), lw=1.3)
+        ax.plot(truth_s, truth, color=colour("truth"), lw=1.0)
         ax.axhline(sign * flight.design.target[index], color=colour("target"), lw=1.1, ls=(0, (1, 1.6)))
         steps = flight.steps
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
@@ -133,7 +133,8 @@ def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
         reserve = np.array([max(stage[row] for stage in plan.backoff_x) for plan in plans]) / scale
         if len(plans):
             kept = sign * (side + inwards * reserve)
-            ax.fill_between(t_s, sign * side, kept, step="post", color=colour("limit"), alpha=0.13, lw=0)
+            shown_s, shown = thin(t_s, kept)
+            ax.fill_between(shown_s, sign * side, shown, step="post", color=colour("limit"), alpha=0.13, lw=0)
 
 
 def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
@@ -142,6 +143,8 @@ def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
     if not chosen:
         return
     end_s = max(_plan_times(flight, plan)[-1] for plan in chosen)
+    if {"north", "east"} <= set(flight.design.axes):
+        yield _plans_above(flight, chosen, end_s)
     for axis, index in zip(flight.design.axes, flight.design.position_index, strict=True):
         name, sign = SEEN[axis]
         key = f"plan-{index}"
@@ -158,6 +161,27 @@ def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
         yield Drawing(
             key, one.svg, f"{name.capitalize()}: {len(chosen)} plans with their back-off against what was flown"
         )
+
+
+def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawing:
+    """The same plans from above."""
+    design = flight.design
+    position = (
+        [t.position_m for t in flight.truths]
+        if flight.truths
+        else [design.position_of(e.mean) for e in flight.estimates]
+    )
+    t_s = flight.seconds([known.at_ns for known in flight.truths or flight.estimates])
+    flown = _thin(np.array(position).reshape(-1, 3)[t_s <= end_s])
+    with canvas("plan-above", 2.5) as one:
+        ax = one.axes("From above", "east [m]", "north [m]")
+        for plan in chosen:
+            north, east, _ = np.array([design.position_of(state) for state in plan.states]).T
+            ax.plot(east, north, "-", color=colour("plan"), lw=1.3, marker=".", ms=3, zorder=3)
+            ax.plot(east[0], north[0], "o", ms=4.5, color=colour("plan"), zorder=5)
+        ax.plot(flown[:, 1], flown[:, 0], color=colour("truth"), lw=1.5, zorder=4)
+        ax.set_aspect("equal", adjustable="datalim")
+    return Drawing("plan-above", one.svg, f"{len(chosen)} plans against what was flown, seen from above")
 
 
 def _component(flight: FlightData, index: int) -> list[float]:

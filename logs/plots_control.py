@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from numpy.typing import NDArray
 
 from logs.design_view import Floats
-from logs.flight_data import FlightData
+from logs.flight_data import FALLBACK, FlightData
 from logs.plots import DASHED, draw_path, shade_fallback, span, thin
 from logs.summary import decision_times_us, duration, input_outside
-from logs.svg import WIDTH_IN, Drawing, canvas, colour, ramp, standalone
+from logs.svg import WIDTH_IN, Drawing, canvas, colour, dots, ramp, standalone, strokes
 
 WIDE_IN = 8.6
 MARKS = 1500
+# Inputs as people see them: down is drawn upwards, like the height.
+INPUT = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("up", -1.0)}
 PICTURE_LABEL = "A flight from above within its limits, and the age of its position information"
 
 
@@ -28,7 +33,7 @@ def age(flight: FlightData) -> tuple[Drawing, Drawing]:
     drawings = []
     for key, width_in in (("age-wide", WIDE_IN), ("age-narrow", WIDTH_IN)):
         with canvas(key, 2.6, width_in) as one:
-            draw_age(one.axes("Age of information", "time [s]", "age [steps]"), flight)
+            draw_age(one.axes("", "time [s]", "age [steps]"), flight)
         drawings.append(Drawing(key, one.svg, label))
     return drawings[0], drawings[1]
 
@@ -45,7 +50,9 @@ def draw_age(ax: Axes, flight: FlightData) -> None:
     ax.fill_between(t_s, 0, ages, step="post", color=colour("estimate"), alpha=0.2, lw=0)
     ax.step(t_s, ages, where="post", color=colour("estimate"), lw=1.3)
     ax.axhline(horizon, color=colour("limit"), lw=1.2, ls=DASHED)
-    ax.vlines(lost_s[:: _stride(len(lost_s))], -1.25 * strip, -0.35 * strip, color=colour("lost"), lw=1.1)
+    marks_s = lost_s[:: _stride(len(lost_s))]
+    low, high = np.full(len(marks_s), -1.2 * strip), np.full(len(marks_s), -0.4 * strip)
+    strokes(ax, (marks_s, low), (marks_s, high), colour("lost"), 1.1)
     ax.axhline(0, color=colour("muted"), lw=0.6)
     ax.set_ylim(-1.6 * strip, highest * 1.1)
     ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -58,15 +65,16 @@ def inputs(flight: FlightData) -> Iterator[Drawing]:
     steps, design = flight.steps, flight.design
     outside = input_outside(flight)
     index = np.array([-1 if d.plan_index is None else d.plan_index for d in steps.decisions], dtype=np.int64)
-    for number, axis in enumerate(design.axes):
+    yield _indices(flight, index)
+    for number, (name, sign) in enumerate(INPUT[axis] for axis in design.axes):
         key = f"input-{number}"
         with canvas(key, 2.3) as one:
-            ax = one.axes(f"Input {axis}", "time [s]", f"input {axis} [{design.input_unit}]")
+            ax = one.axes(f"Input {name}", "time [s]", f"input {name} [{design.input_unit}]")
             shade_fallback(ax, flight)
             for side in (design.input_box.lower[number], design.input_box.upper[number]):
                 if np.isfinite(side):
-                    ax.axhline(side, color=colour("limit"), lw=1.2, ls=DASHED)
-            values = steps.input[:, number]
+                    ax.axhline(sign * side, color=colour("limit"), lw=1.2, ls=DASHED)
+            values = sign * steps.input[:, number]
             ax.step(*thin(steps.t_s, values), where="post", color=colour("muted"), lw=0.6)
             for at in np.unique(index):
                 chosen = index == at
@@ -74,13 +82,25 @@ def inputs(flight: FlightData) -> Iterator[Drawing]:
                 _draw_held(ax, steps.t_s[chosen], values[chosen], design.dt_s, shade)
             ax.plot(steps.t_s[outside], values[outside], "x", ms=6, mew=1.6, color=colour("limit"))
             span(ax, flight)
-        yield Drawing(key, one.svg, f"Input {axis} over time against its limits, coloured by the plan index flown")
+        yield Drawing(key, one.svg, f"Input {name} over time against its limits, coloured by the plan index flown")
+
+
+def _indices(flight: FlightData, index: NDArray[np.int64]) -> Drawing:
+    """How often each plan index was flown; the key to the colours, too."""
+    horizon = flight.design.horizon
+    share = np.array([np.count_nonzero(index == at) for at in range(horizon)]) / max(1, len(index)) * 100
+    with canvas("plan-index", 2.3) as one:
+        ax = one.axes("Plan index flown", "plan index [steps]", "steps flown [%]")
+        ax.bar(range(horizon), share, color=[ramp(at, horizon) for at in range(horizon)], width=0.8)
+        ax.xaxis.set_major_locator(MaxNLocator(12, integer=True))
+        ax.grid(visible=False, axis="x")
+    return Drawing("plan-index", one.svg, "Share of the steps in which each plan index was flown, in percent")
 
 
 def _draw_held(ax: Axes, t_s: Floats, values: Floats, dt_s: float, shade: str) -> None:
     """Values held for a step each."""
     kept = np.flatnonzero(np.isfinite(values))[:: _stride(len(values))]
-    ax.hlines(values[kept], t_s[kept], t_s[kept] + dt_s, color=shade, lw=2.4)
+    strokes(ax, (t_s[kept], values[kept]), (t_s[kept] + dt_s, values[kept]), shade, 2.2, zorder=3)
 
 
 def timing(flight: FlightData) -> Iterator[Drawing]:
@@ -101,13 +121,15 @@ def _times(flight: FlightData, key: str, title: str, t_s: Floats, values_us: Flo
         ax = one.axes(title, "time [s]", f"{title.lower()} (log scale)")
         ax.set_yscale("log")
         shown_s, shown_us = _largest(t_s, np.maximum(values_us, 1.0))
-        ax.plot(shown_s, shown_us, ".", ms=2.8, color=colour("estimate"), alpha=0.75)
+        dots(ax, shown_s, shown_us, "estimate", 2.0)
         p50, p99 = np.percentile(values_us, [50, 99])
-        for value, name in ((p50, "median"), (p99, "99 %")):
+        for value, name, side in ((p50, "median", "top"), (p99, "99 %", "bottom")):
             ax.axhline(max(value, 1.0), color=colour("muted"), lw=0.9, ls=DASHED)
-            ax.annotate(name, (1.0, max(value, 1.0)), (3, 0), ("axes fraction", "data"), "offset points", va="center")
+            ax.annotate(name, (1.0, max(value, 1.0)), (3, 0), ("axes fraction", "data"), "offset points", va=side)
         low, high = float(shown_us.min()), float(shown_us.max())
         ax.set_ylim(low / 2, high * 2)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
+        ax.yaxis.set_minor_locator(NullLocator())
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value)))
         span(ax, flight)
     return Drawing(key, one.svg, f"{title} over time; median {duration(p50)}, 99 percent below {duration(p99)}")
@@ -134,9 +156,12 @@ def picture(flight: FlightData) -> str:
         draw_path(left, flight, ("east", "north"))
         right.set(title="Age of its position information", xlabel="time [s]", ylabel="age [steps]")
         draw_age(right, flight)
-        names = (("truth", "o", "flown"), ("sample", ".", "positions received"), ("target", "*", "target"))
+        names = (("truth", "-", "flown"), ("sample", ".", "position used"), ("target", "*", "target"))
         marks = [right.plot([], [], mark, color=colour(role), label=name)[0] for role, mark, name in names]
         limit = right.plot([], [], color=colour("limit"), ls=DASHED, label="limits, horizon H")[0]
         lost = right.plot([], [], "|", ms=7, color=colour("lost"), label="position lost")[0]
-        one.figure.legend(handles=[*marks, limit, lost], loc="outside lower center", ncols=5)
+        handles: list[Artist] = [*marks, limit, lost]
+        if flight.spans(FALLBACK):
+            handles.append(Patch(color=colour("fallback"), alpha=0.22, lw=0, label="fallback"))
+        one.figure.legend(handles=handles, loc="outside lower center", ncols=6)
     return standalone(one.svg, PICTURE_LABEL)

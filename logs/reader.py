@@ -6,7 +6,6 @@ A file that was not finished is read to its last whole chunk; a damaged one is r
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,7 +43,7 @@ def walk(path: Path) -> Iterator[Message | Damage | End]:
     for file in segment_files(path):
         for item in scan(file):
             if isinstance(item, Message) and item.definition.topic == HEADER:
-                yield replace(item, repeated=item.data == first)
+                yield item._replace(repeated=item.data == first)
                 first = first or item.data
             else:
                 yield item

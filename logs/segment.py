@@ -15,8 +15,8 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from dataclasses import dataclass
 from importlib.metadata import version
+from typing import NamedTuple
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -33,8 +33,7 @@ _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A message on its way to the disk."""
 
     definition: Definition

@@ -163,14 +163,14 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     s = summary
     lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
     seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
-    speed = "" if s.real_time_factor is None else f" ({s.real_time_factor:.3g} × real time)"
+    speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
     found = [
-        ("Flown", f"{s.steps} steps; {s.duration_s:.4g} s in {s.wall_s:.4g} s{speed}"),
+        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s in {number(s.wall_s)} s{speed}"),
         ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
-        ("Largest age", f"{s.max_age} steps ({s.max_age_s:.3g} s)"),
+        ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),
-        ("State outside limits", f"{s.state_violations} steps{_share(s.state_violations, s.steps)}{seen}"),
-        ("Input outside limits", f"{s.input_violations} steps{_share(s.input_violations, s.steps)}"),
+        ("State outside limits", f"{count(s.state_violations, 'step')}{_share(s.state_violations, s.steps)}{seen}"),
+        ("Input outside limits", f"{count(s.input_violations, 'step')}{_share(s.input_violations, s.steps)}"),
         ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
         ("Cost", f"{s.cost:.6g}{seen}"),
         ("Distance from target", _distance(s)),
@@ -186,7 +186,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
 def _distance(s: FlightSummary) -> str:
     if s.final_error_m is None or s.settled_error_m is None:
         return "not flown"
-    return f"{s.final_error_m:.3g} m at the end; {s.settled_error_m:.3g} m over the last quarter (rms)"
+    return f"{number(s.final_error_m)} m at the end; {number(s.settled_error_m)} m over the last quarter (rms)"
 
 
 def _share(part: int, whole: int) -> str:
@@ -202,6 +202,16 @@ def _times(times: Spread) -> str:
 def duration(value_us: float) -> str:
     """A duration [µs] with a unit that suits it."""
     return f"{value_us:.3g} µs" if value_us < 1000 else f"{value_us / 1000:.3g} ms"
+
+
+def number(value: float, decimals: int = 3) -> str:
+    """A number for people: no more decimals than they need, no exponent below a million."""
+    return f"{round(value, decimals):g}"
+
+
+def count(amount: int, noun: str) -> str:
+    """An amount with its noun, e.g. "1 step"."""
+    return f"{amount} {noun}{'' if amount == 1 else 's'}"
 
 
 def _fallback_entries(modes: list[ControlMode]) -> int:

@@ -8,9 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+
+from logs.design_view import Floats
 
 # role -> (light, dark). Okabe and Ito's colours, which colour-blind people can tell apart; lifted for dark pages.
 PALETTE = {
@@ -47,6 +52,8 @@ _STYLE: dict[str, object] = {
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.4,
     "lines.solid_capstyle": "round",
+    "figure.constrained_layout.w_pad": 0.08,
+    "figure.constrained_layout.h_pad": 0.06,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "figure.facecolor": "none",
@@ -118,6 +125,24 @@ def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[C
         out = io.StringIO()
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
         one.svg = _inline(out.getvalue(), key)
+
+
+def dots(ax: Axes, x: Floats, y: Floats, role: str, size_pt: float, zorder: float = 2) -> None:
+    """Round dots: strokes without length."""
+    points = (x, y)
+    strokes(ax, points, points, colour(role), size_pt, zorder)
+
+
+def strokes(
+    ax: Axes, begin: tuple[Floats, Floats], end: tuple[Floats, Floats], paint: str, width_pt: float, zorder: float = 2
+) -> None:
+    """Separate strokes between points (x, y), as one path: a tenth of the bytes of as many lines or markers."""
+    if not len(begin[0]):
+        return
+    points = np.stack([np.column_stack(begin), np.column_stack(end)], axis=1).reshape(-1, 2)
+    path = Path(points, np.tile([Path.MOVETO, Path.LINETO], len(begin[0])))
+    path.should_simplify = False
+    ax.add_patch(PathPatch(path, fill=False, ec=paint, lw=width_pt, capstyle="round", zorder=zorder))
 
 
 def standalone(svg: str, label: str) -> str:

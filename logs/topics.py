@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import cast
 
 import msgspec
@@ -95,11 +95,13 @@ _RAW = re.compile(r"/raw/([^/]+)/(in|out)")
 _RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
 
 
+@lru_cache(maxsize=256)
 def raw_topic(link: str, *, outgoing: bool) -> str:
     """Topic of a connection's raw bytes in one direction."""
     return f"/raw/{link}/{'out' if outgoing else 'in'}"
 
 
+@lru_cache(maxsize=256)
 def raw_link(topic: str) -> tuple[str, bool] | None:
     """Connection name and whether outgoing, of a raw topic; None for any other topic."""
     match = _RAW.fullmatch(topic)
@@ -115,6 +117,7 @@ def record_type(topic: str) -> type[Record]:
     return Datagram if raw_link(topic) is not None else _BY_NAME[topic].record
 
 
+@lru_cache(maxsize=256)
 def definition(topic: str) -> Definition:
     """How a topic is written.
 

@@ -44,11 +44,11 @@ class Channel:
         self._order = 0
         self.counters = Counters()
 
-    def push(self, at_ns: int, data: bytes) -> None:
-        """Send a packet at `at_ns`."""
+    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
+        """Send a packet at `at_ns`; a `certain` one is not lost."""
         link, counters = self._link, self.counters
         counters.sent += 1
-        lost = self._loses(at_ns)
+        lost = self._loses(at_ns) and not certain
         delays = self._delay.random(2)
         doubled = self._duplicate.random() < link.duplicate
         data, corrupted = self._flip(data)

@@ -20,14 +20,13 @@ SYSTEM_ID, COMPONENT_ID = 17, 197  # 197: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 # The cameras' clock at the start, so that a stamp is never 0 ("unknown") and never our time.
 UPTIME_S = 4000.0
 UNKNOWN = [math.nan, *([0.0] * 20)]  # a covariance whose first element is NaN is unknown (message definitions)
-IDENTITY = [1.0, 0.0, 0.0, 0.0]
 
 
 class Cameras:
     """Cameras that sample at phase_s + i / rate_hz after the start.
 
-    Positions are sent in the camera frame of `[frame]`; message `odometry` carries the velocity too, in a child frame
-    (the body) that keeps the camera frame's axes.
+    Positions are sent in the camera frame of `[frame]`. The vehicle is taken as level with its nose north; message
+    `odometry` carries that attitude and the velocity in body axes, as its definition wants.
 
     Raises:
         ConfigError: the clock offset makes a stamp that is not positive.
@@ -39,6 +38,8 @@ class Cameras:
                 (f"sim.camera.clock_offset_s: {camera.clock_offset_s} is outside {1.0 - UPTIME_S} to 1e9 s",)
             )
         self._camera = camera
+        self._odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD if frame.convention == "ned" else mavlink.MAV_FRAME_LOCAL_ENU
+        self._attitude = north_level(frame)
         self._frame = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
         self._rng = np.random.default_rng(seed)
         self._start_ns = start_ns
@@ -68,12 +69,12 @@ class Cameras:
         north, east, down = (float(p + n) for p, n in zip(position_m, noise, strict=True))
         where = self._frame.from_ned((north, east, down))
         usec = self._clock_us + (at_ns - self._start_ns) // 1000
-        msg = self._message(usec, where, self._frame.velocity_from_ned(velocity_mps))
+        msg = self._message(usec, where, velocity_mps)
         data = bytes(msg.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
         return at_ns + self._latency_ns, data
 
-    def _message(self, usec: int, where: Vec3, speed: Vec3) -> mavlink.MAVLink_message:
+    def _message(self, usec: int, where: Vec3, body_mps: Vec3) -> mavlink.MAVLink_message:
         msg: mavlink.MAVLink_message
         match self._camera.message:
             case "vision":
@@ -81,9 +82,18 @@ class Cameras:
             case "vicon":
                 msg = mavlink.MAVLink_vicon_position_estimate_message(usec, *where, 0.0, 0.0, 0.0, UNKNOWN)
             case "mocap":
-                msg = mavlink.MAVLink_att_pos_mocap_message(usec, IDENTITY, *where, UNKNOWN)
-            case "odometry":  # frames that both PX4 and ArduPilot take
-                frames = mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD
-                motion = *speed, 0.0, 0.0, 0.0, UNKNOWN, UNKNOWN
-                msg = mavlink.MAVLink_odometry_message(usec, *frames, *where, IDENTITY, *motion)
+                msg = mavlink.MAVLink_att_pos_mocap_message(usec, self._attitude, *where, UNKNOWN)
+            case "odometry":  # LOCAL_FRD and BODY_FRD are what both PX4 and ArduPilot take
+                frames = self._odometry_frame, mavlink.MAV_FRAME_BODY_FRD
+                motion = *body_mps, 0.0, 0.0, 0.0, UNKNOWN, UNKNOWN
+                msg = mavlink.MAVLink_odometry_message(usec, *frames, *where, self._attitude, *motion)
         return msg
+
+
+def north_level(frame: FrameConfig) -> list[float]:
+    """Attitude (w, x, y, z) of a level vehicle with its nose north: from body FRD to the camera frame."""
+    cos, sin = math.cos(math.radians(frame.yaw_deg) / 2), math.sin(math.radians(frame.yaw_deg) / 2)
+    if frame.convention == "ned":
+        return [cos, 0.0, 0.0, -sin]
+    half = math.sqrt(0.5)  # the same, then half a turn about (1, 1, 0): NED to ENU
+    return [0.0, half * (cos - sin), half * (cos + sin), 0.0]

@@ -44,6 +44,7 @@ class Peers:
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
         self.channel = Channel(config.link, for_channel, start_ns)
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+        self._airborne = airborne
         self._mocap_link = VEHICLE if shared_link else MOCAP
         self._on_truth = on_truth
         self._truth_ns = start_ns  # boundary of the next truth
@@ -107,7 +108,9 @@ class Peers:
                 self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
                 busy = True
             if self._cameras.next_ns <= at_ns:
-                self.channel.push(*self._cameras.capture(self.vehicle.position_m, self.vehicle.velocity_mps))
+                sample = self._cameras.capture(self.vehicle.position_m, self.vehicle.velocity_mps)
+                # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
+                self.channel.push(*sample, certain=self._airborne and not self.channel.counters.sent)
                 busy = True
             if not busy:
                 break

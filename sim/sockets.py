@@ -53,9 +53,11 @@ class UdpPort:
         self._scheme = scheme
         if scheme == "udpout":
             self._peer = address
-            self._socket.bind(("", 0))
-        else:
-            self._socket.bind(address)
+        try:
+            self._socket.bind(("", 0) if scheme == "udpout" else address)
+        except OSError:
+            self._socket.close()
+            raise
         self._address = self._peer or self._socket.getsockname()
 
     @property

@@ -56,6 +56,7 @@ class Bench:
         self.client = Client()
         self.seen: list[tuple[int, Any]] = []
         self.positions: list[tuple[int, Any]] = []
+        self.wait(0.0)
 
     @property
     def now_ns(self) -> int:

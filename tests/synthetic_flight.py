@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import expm, logm, solve_discrete_are
+from scipy.linalg import expm, logm
+from synthetic_scene import Array, Scene, box
 
 from uavctl.data import (
     ControlMode,
@@ -26,115 +26,8 @@ from uavctl.data import (
     VehicleStatus,
 )
 
-Array = NDArray[np.float64]
 Item = tuple[str, int, Record]
 CAPTURE_DELAY_S = 0.05
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A plant in its box, with a start and a target."""
-
-    a: Array
-    b: Array
-    e: Array
-    noise_std: Array
-    q_x: Array
-    q_u: Array
-    lower: Array
-    upper: Array
-    input_limit: Array
-    start: Array
-    target: Array
-    dt_s: float
-    tick_s: float
-    axes: tuple[str, ...]
-    name: str
-    gain: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        p = solve_discrete_are(self.a, self.b, self.q_x, self.q_u * 20)
-        gain = np.linalg.solve(self.q_u * 20 + self.b.T @ p @ self.b, self.b.T @ p @ self.a)
-        object.__setattr__(self, "gain", -gain)
-
-    @property
-    def per_axis(self) -> int:
-        return len(self.start) // len(self.axes)
-
-    def design(self) -> dict[str, object]:
-        """As the header carries it."""
-        n, m = len(self.start), len(self.input_limit)
-        c_x, b_x = _box(self.lower, self.upper)
-        c_u, b_u = _box(-self.input_limit, self.input_limit)
-        return {
-            "c_x": c_x.tolist(),
-            "b_x": b_x.tolist(),
-            "c_u": c_u.tolist(),
-            "b_u": b_u.tolist(),
-            "q_x": self.q_x.tolist(),
-            "q_u": self.q_u.tolist(),
-            "target": self.target.tolist(),
-            "dt_s": self.dt_s,
-            "horizon": 12,
-            "axes": list(self.axes),
-            "position_index": list(range(0, n, self.per_axis)),
-            "velocity_index": list(range(1, n, self.per_axis)),
-            "input_unit": "m/s²" if m == 3 else "input units",
-            "gamma_x": [1.0] * 13,
-        }
-
-
-def _box(lower: Array, upper: Array) -> tuple[Array, Array]:
-    eye = np.eye(len(lower))
-    rows = [(s * eye[i], s * v) for i in range(len(lower)) for s, v in ((1.0, upper[i]), (-1.0, lower[i]))]
-    rows = [(c, b) for c, b in rows if np.isfinite(b)]
-    return np.array([c for c, _ in rows]), np.array([b for _, b in rows])
-
-
-def room() -> Scene:
-    """Three axes with drag and acceleration lag, 9 states."""
-    ac = np.array([[0.0, 1.0, 0.0], [0.0, -0.3, 1.0], [0.0, 0.0, -4.0]])
-    m = expm(np.block([[ac, np.array([[0.0, 0.0], [0.0, 1.0], [4.0, 0.0]])], [np.zeros((2, 5))]]) * 0.2)
-    eye, inf = np.eye(3), np.inf
-    return Scene(
-        a=np.kron(eye, m[:3, :3]),
-        b=np.kron(eye, m[:3, 3:4]),
-        e=np.kron(eye, m[:3, 4:5]),
-        noise_std=np.array([0.15, 0.15, 0.10]),
-        q_x=np.kron(eye, np.diag([10.0, 1.0, 0.1])),
-        q_u=eye,
-        lower=np.array([-3.0, -1.5, -inf, -2.5, -1.5, -inf, -2.5, -1.0, -inf]),
-        upper=np.array([3.0, 1.5, inf, 2.5, 1.5, inf, 0.0, 1.0, inf]),
-        input_limit=np.array([2.0, 2.0, 1.5]),
-        start=np.array([-2.4, 0.0, 0.0, -1.9, 0.0, 0.0, -0.7, 0.0, 0.0]),
-        target=np.array([1.5, 0.0, 0.0, 1.0, 0.0, 0.0, -1.2, 0.0, 0.0]),
-        dt_s=0.2,
-        tick_s=0.05,
-        axes=("north", "east", "down"),
-        name="room",
-    )
-
-
-def paper() -> Scene:
-    """Section 5: two axes, 4 states."""
-    eye = np.eye(2)
-    return Scene(
-        a=np.kron(eye, np.array([[1.0, 0.79], [0.0, 0.61]])),
-        b=np.kron(eye, np.array([[0.21], [0.39]])),
-        e=np.kron(eye, np.array([[0.5], [1.0]])),
-        noise_std=np.sqrt([0.6, 0.6]),
-        q_x=np.kron(eye, np.diag([10.0, 0.1])),
-        q_u=0.1 * eye,
-        lower=np.array([-30.0, -8.0, -25.0, -8.0]),
-        upper=np.array([50.0, 7.0, 20.0, 8.0]),
-        input_limit=np.array([7.5, 7.5]),
-        start=np.array([35.0, -2.0, -20.0, -4.0]),
-        target=np.zeros(4),
-        dt_s=1.0,
-        tick_s=0.1,
-        axes=("north", "east"),
-        name="paper",
-    )
 
 
 @dataclass
@@ -163,8 +56,10 @@ def fly(
     per_step, ticks = round(scene.dt_s / scene.tick_s), round(duration_s / scene.tick_s)
     config = config_toml or f'name = "{scene.name}"\nduration_s = {duration_s}\n\n[link]\nloss = 0.3\n'
     yield "/uavctl/header", start_ns, header(scene, config, start_ns)
-    yield "/uavctl/vehicle", start_ns, VehicleStatus(
-        at_ns=start_ns, autopilot="px4", armed=True, mode="OFFBOARD", external=True, battery_v=15.2
+    yield (
+        "/uavctl/vehicle",
+        start_ns,
+        VehicleStatus(at_ns=start_ns, autopilot="px4", armed=True, mode="OFFBOARD", external=True, battery_v=15.2),
     )
     pilot, x, lost = _Pilot(scene.start.copy()), scene.start.copy(), 0
     u, w = np.zeros(len(scene.input_limit)), np.zeros(len(scene.axes))
@@ -187,12 +82,16 @@ def fly(
             yield "/uavctl/plan", at_ns, pilot.plan
         yield "/sim/truth", at_ns, _truth(scene, x, u, at_ns, step + 1, lost)
         yield from _spoken(scene, pilot, u, tick, step, at_ns, boundary, heard, solved)
-        yield "/uavctl/timing", at_ns, Timing(
-            tick=tick,
-            at_ns=at_ns,
-            lateness_ns=int(rng.gamma(3.0, 3e4)),
-            step_ns=int(rng.lognormal(15.3, 0.15)) if solved else int(rng.lognormal(11.0, 0.2)),
-            send_ns=300_000,
+        yield (
+            "/uavctl/timing",
+            at_ns,
+            Timing(
+                tick=tick,
+                at_ns=at_ns,
+                lateness_ns=int(rng.gamma(3.0, 3e4)),
+                step_ns=int(rng.lognormal(15.3, 0.15)) if solved else int(rng.lognormal(11.0, 0.2)),
+                send_ns=300_000,
+            ),
         )
         x = fine[0] @ x + fine[1] @ u + fine[2] @ w
         pilot.mean = fine[0] @ pilot.mean + fine[1] @ u
@@ -243,8 +142,8 @@ def _input(pilot: _Pilot, scene: Scene) -> Array:
 
 def _plan(scene: Scene, mean: Array, at_ns: int, step: int) -> Plan:
     states, inputs, cov = [mean], [], np.zeros((len(mean), len(mean)))
-    c_x, _ = _box(scene.lower, scene.upper)
-    c_u, _ = _box(-scene.input_limit, scene.input_limit)
+    c_x, _ = box(scene.lower, scene.upper)
+    c_u, _ = box(-scene.input_limit, scene.input_limit)
     backoff = [np.zeros(len(c_x))]
     noise = scene.e @ np.diag(scene.noise_std**2) @ scene.e.T
     for t in range(12):
@@ -287,9 +186,7 @@ def _position(scene: Scene, x: Array) -> tuple[float, float, float]:
     return (p[0], p[1], p[2])
 
 
-def _sample(
-    scene: Scene, x: Array, captured_ns: int, at_ns: int, seq: int, rng: np.random.Generator
-) -> PositionSample:
+def _sample(scene: Scene, x: Array, captured_ns: int, at_ns: int, seq: int, rng: np.random.Generator) -> PositionSample:
     n, e, d = _position(scene, x + rng.normal(0, 0.003, len(x)))
     return PositionSample(
         captured_ns=captured_ns,
@@ -331,33 +228,43 @@ def _spoken(
     since_ns = round(((tick % round(scene.dt_s / scene.tick_s)) * scene.tick_s + CAPTURE_DELAY_S) * 1e9)
     captured_ns = at_ns - since_ns - round(pilot.age * scene.dt_s * 1e9)
     zero = tuple((0.0,) * n for _ in range(n))
-    yield "/uavctl/estimate", at_ns, Estimate(
-        at_ns=at_ns, captured_ns=captured_ns, mean=tuple(pilot.mean.tolist()), cov=zero
+    yield (
+        "/uavctl/estimate",
+        at_ns,
+        Estimate(at_ns=at_ns, captured_ns=captured_ns, mean=tuple(pilot.mean.tolist()), cov=zero),
     )
     tracking = not pilot.falling and pilot.plan is not None
-    yield "/uavctl/decision", at_ns, Decision(
-        tick=tick,
-        at_ns=at_ns,
-        step=step,
-        boundary=boundary,
-        mode=mode,
-        age_steps=pilot.age,
-        news=solved,
-        plan_seq=pilot.plan.seq if tracking and pilot.plan is not None else None,
-        plan_index=pilot.index if tracking else None,
-        solve=SolveStatus.OPTIMAL if solved else None,
-        input=tuple(u.tolist()),
-        fresh=pilot.fresh,
-        missed_ticks=0,
-        accepted=int(heard),
-        rejected=0,
-        reason="age reached the horizon" if pilot.falling else "plan",
+    yield (
+        "/uavctl/decision",
+        at_ns,
+        Decision(
+            tick=tick,
+            at_ns=at_ns,
+            step=step,
+            boundary=boundary,
+            mode=mode,
+            age_steps=pilot.age,
+            news=solved,
+            plan_seq=pilot.plan.seq if tracking and pilot.plan is not None else None,
+            plan_index=pilot.index if tracking else None,
+            solve=SolveStatus.OPTIMAL if solved else None,
+            input=tuple(u.tolist()),
+            fresh=pilot.fresh,
+            missed_ticks=0,
+            accepted=int(heard),
+            rejected=0,
+            reason="age reached the horizon" if pilot.falling else "plan",
+        ),
     )
     if boundary and pilot.falling and pilot.age == 12:
-        yield "/uavctl/event", at_ns, Event(
-            at_ns=at_ns, severity=Severity.WARNING, code="fallback", text="no position for 12 steps: braking"
+        yield (
+            "/uavctl/event",
+            at_ns,
+            Event(at_ns=at_ns, severity=Severity.WARNING, code="fallback", text="no position for 12 steps: braking"),
         )
     if tick % 100 == 50:
-        yield "/uavctl/event", at_ns, Event(
-            at_ns=at_ns, severity=Severity.INFO, code="late", text="a sample came out of order", count=3
+        yield (
+            "/uavctl/event",
+            at_ns,
+            Event(at_ns=at_ns, severity=Severity.INFO, code="late", text="a sample came out of order", count=3),
         )

@@ -9,6 +9,7 @@ from typing import Any
 
 import grimp
 import pytest
+from importlinter.configuration import configure
 from importlinter.contracts.forbidden import ForbiddenContract
 from importlinter.contracts.layers import LayersContract
 from importlinter.domain.contract import Contract
@@ -20,6 +21,7 @@ TYPES: dict[str, type[Contract]] = {"layers": LayersContract, "forbidden": Forbi
 
 @pytest.fixture(scope="module")
 def graph() -> grimp.ImportGraph:
+    configure()
     return grimp.build_graph(*SETTINGS["root_packages"], include_external_packages=True, cache_dir=None)
 
 

@@ -75,9 +75,11 @@ def test_every_setpoint_of_100000_random_steps_with_faults_is_finite_bounded_and
         # The memory of the last setpoint may be wrong as well: then only the bounds can be promised.
         before: Vec3 = (float(rng.choice(ODD)), sent[1], sent[2]) if faulty else sent
         out, limited = gate((want[0], want[1], want[2]), before, TICK_S, LIMITS)
-        assert all(math.isfinite(value) and abs(value) <= bound for value, bound in zip(out, LIMITS.accel_mps2))
+        assert all(
+            math.isfinite(value) and abs(value) <= bound for value, bound in zip(out, LIMITS.accel_mps2, strict=True)
+        )
         if not faulty:
-            assert max(abs(new - old) for new, old in zip(out, sent)) <= 1.0 + 1e-12
+            assert max(abs(new - old) for new, old in zip(out, sent, strict=True)) <= 1.0 + 1e-12
         assert bool(limited) == (out != (want[0], want[1], want[2]))
         limited_steps += bool(limited)
         sent = out

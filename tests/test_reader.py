@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_fakes import HEADER, Clock, Disk, flight, own, record_flight, write_two_segments
+from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, write_two_segments
 
 from logs.reader import header, read, records, segment_files
 from logs.recorder import SyncRecorder
@@ -93,7 +93,7 @@ def test_damaged_chunk_is_named_and_refused(tmp_path: Path) -> None:
     at = data.index(b"number 29")
     data[at] ^= 1
     path.write_bytes(data)
-    got = []
+    got: list[Item] = []
     with pytest.raises(RecordingError, match=r"flight\.mcap, offset \d+: .*checksum.*uavctl log recover") as caught:
         got.extend(read(path))
         pytest.fail("not refused")

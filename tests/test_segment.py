@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Channel, Chunk, Message
+from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from recording_fakes import record_flight
 

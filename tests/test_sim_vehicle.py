@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from sim.vehicle import MAX_ACCEL_MPS2, Vehicle, linear_model
@@ -13,6 +14,7 @@ from uavctl.data import Vec3
 from uavctl.errors import DesignError
 
 S = 1_000_000_000
+Array = NDArray[np.float64]
 
 
 def vehicle(config: Config, seed: int = 1, start_ns: int = 0) -> Vehicle:
@@ -73,7 +75,7 @@ def test_drag_lag_matches_an_integrator_with_the_input_changed_within_a_step() -
     flown = vehicle(config)
     w = np.array([0.15, 0.15, 0.10]) * np.random.default_rng(np.random.SeedSequence(1)).standard_normal(3)
 
-    def slope(_t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]  # of the integrator
+    def slope(_t: float, y: Array, u: Array) -> Array:
         p_v_a = y.reshape(3, 3)
         velocity, accel = p_v_a[:, 1], p_v_a[:, 2]
         return np.column_stack([velocity, accel - 0.3 * velocity + w, (u - accel) / 0.25]).ravel()

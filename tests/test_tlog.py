@@ -4,7 +4,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from pymavlink.dialects.v20 import common
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.tlog import read_tlog
 from uavctl.errors import RecordingError
@@ -14,9 +14,9 @@ EPOCH_US = 1_780_000_000_000_000
 
 def packet(system: int, count: int, version: int = 2) -> bytes:
     """A heartbeat made by pymavlink."""
-    mav = common.MAVLink(None, srcSystem=system, srcComponent=1)
+    mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     mav.seq = count % 256
-    return bytes(common.MAVLink_heartbeat_message(2, 3, 81, count, 4, 3).pack(mav, force_mavlink1=version == 1))
+    return bytes(mavlink.MAVLink_heartbeat_message(2, 3, 81, count, 4, 3).pack(mav, force_mavlink1=version == 1))
 
 
 def stamped(packets: list[bytes]) -> bytes:
@@ -35,10 +35,10 @@ def test_packets_times_and_directions(tmp_path: Path) -> None:
 
 
 def test_signed_packet_is_longer(tmp_path: Path) -> None:
-    mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     mav.signing.secret_key = b"k" * 32
     mav.signing.sign_outgoing = True
-    signed = bytes(common.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mav))
+    signed = bytes(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mav))
     assert signed[2] & 1
     path = tmp_path / "a.tlog"
     path.write_bytes(stamped([signed, packet(1, 1)]))

@@ -29,7 +29,7 @@ def fly(
         ticker: the grid of ticks.
         stop_requested: asked once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
-        stop_limit_s: the hand-over is cut off after this time [s].
+        stop_limit_s: the hand-over is cut off after this time [s]; 0 ends without one.
     """
     first_ns: int | None = None
     stop_ns: int | None = None
@@ -41,7 +41,7 @@ def fly(
         over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
         if stop_ns is None and (over or stop_requested()):
             stop_ns = due.at_ns
-        if stop_ns is not None and due.at_ns - stop_ns > stop_limit_s * 1e9:
+        if stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9:
             return
         for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):
             connections[message.link].send(message.data)

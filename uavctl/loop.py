@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
+import msgspec
+
 from uavctl.config import Config
 from uavctl.data import (
     ControlMode,
@@ -27,7 +29,7 @@ from uavctl.data import (
 )
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
 from uavctl.mavlink.link import Link
-from uavctl.mavlink.mode import HandOver, Sending
+from uavctl.mavlink.mode import HandOver, Seen, Sending, State, look
 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
@@ -72,6 +74,7 @@ class ControlLoop:
         self._state = initial_state(controller)
         self._inbox: deque[tuple[int, PositionSample | VehicleStatus]] = deque()
         self._next_stats_ns: int | None = None
+        self._last_step_ns = 0
         self.vehicle: VehicleStatus | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
@@ -94,17 +97,20 @@ class ControlLoop:
     def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> tuple[Outgoing, ...]:
         """Run the control tick of grid time `at_ns`; returns the bytes to send."""
         begun = self._stopwatch()
+        samples, heard = self._take_due(at_ns)
         inp = StepInput(
             tick=tick,
             at_ns=at_ns,
-            samples=self._take_due(at_ns),
-            vehicle=self.vehicle,
+            samples=samples,
+            vehicle=self._flyable(at_ns),
             missed_ticks=missed_ticks,
             stop=stop,
         )
         self._put("/uavctl/step_input", at_ns, inp)
+        for status in heard:
+            self._put("/uavctl/vehicle", status.at_ns, status)
         self._state, out = step(self._state, inp, self._controller)
-        step_ns = self._stopwatch() - begun
+        self._last_step_ns = self._stopwatch() - begun
         self._remember(out)
         self._record(out, at_ns)
         outgoing = self._outgoing(out, at_ns)
@@ -112,7 +118,6 @@ class ControlLoop:
             sent = Datagram(at_ns=at_ns, link=one.link, outgoing=True, data=one.data)
             self._put(raw_topic(one.link, outgoing=True), at_ns, sent)
         self._record_stats(at_ns)
-        self._last_step_ns = step_ns
         return outgoing
 
     def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
@@ -131,17 +136,27 @@ class ControlLoop:
             ),
         )
 
-    def _take_due(self, at_ns: int) -> tuple[PositionSample, ...]:
-        """Samples that arrived up to `at_ns`; vehicle states among them are taken over."""
-        samples = []
+    def _take_due(self, at_ns: int) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...]]:
+        """Samples and vehicle states that arrived up to `at_ns`; the newest state is taken over."""
+        samples: list[PositionSample] = []
+        heard: list[VehicleStatus] = []
         while self._inbox and self._inbox[0][0] <= at_ns:
             item = self._inbox.popleft()[1]
             if isinstance(item, VehicleStatus):
                 self.vehicle = item
-                self._put("/uavctl/vehicle", item.at_ns, item)
+                heard.append(item)
             else:
                 samples.append(item)
-        return tuple(samples)
+        return tuple(samples), tuple(heard)
+
+    def _flyable(self, at_ns: int) -> VehicleStatus | None:
+        """The vehicle as far as it is ours: none when its heartbeats stopped, not external once the pilot took over."""
+        vehicle = self.vehicle
+        if vehicle is None or look(at_ns, vehicle, land=False) is Seen.SILENCE:
+            return None
+        if self._hand_over.state is State.RELEASED:
+            return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} (released to the pilot)")
+        return vehicle
 
     def _remember(self, out: StepOutput) -> None:
         self.decision = out.decision
@@ -164,7 +179,7 @@ class ControlLoop:
         for event in events:
             self._put("/uavctl/event", at_ns, event)
         messages = [Outgoing(link=name, data=data) for name, link in self._links.items() for data in link.due(at_ns)]
-        if sending is Sending.SETPOINTS and out.setpoint is not None:
+        if sending in (Sending.SETPOINTS, Sending.NEUTRAL) and out.setpoint is not None:
             messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].setpoint(out.setpoint)))
         if sending is Sending.LAND:
             messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].land(at_ns)))

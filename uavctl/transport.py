@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import selectors
 import socket
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Protocol, cast
@@ -20,7 +21,6 @@ from urllib.parse import urlsplit
 
 import serial
 
-from uavctl.clock import monotonic_ns
 from uavctl.errors import ConnectionSpecError
 
 FORMS = "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///dev/NAME:BAUD"
@@ -57,7 +57,7 @@ class Connection(Protocol):
         ...
 
 
-def open_connection(url: str, now: Callable[[], int] = monotonic_ns) -> Connection:
+def open_connection(url: str, now: Callable[[], int] = time.monotonic_ns) -> Connection:
     """Open a connection.
 
     Args:
@@ -81,7 +81,9 @@ def open_connection(url: str, now: Callable[[], int] = monotonic_ns) -> Connecti
     return _Tcp(url, family, address, now)
 
 
-def wait(connections: Mapping[str, Connection], deadline_ns: int, now: Callable[[], int] = monotonic_ns) -> list[str]:
+def wait(
+    connections: Mapping[str, Connection], deadline_ns: int, now: Callable[[], int] = time.monotonic_ns
+) -> list[str]:
     """Sleep until something can be read or the deadline has come.
 
     Args:
@@ -202,12 +204,6 @@ class _UdpIn(_Socket):
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
         )
         self._socket.setblocking(False)
-
-    @property
-    def address(self) -> Address:
-        """Where it is bound (with port 0 the system chooses)."""
-        address: Address = self._socket.getsockname()
-        return address
 
     def _read(self) -> bytes | None:
         data, peer = self._socket.recvfrom(_LARGEST)

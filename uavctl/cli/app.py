@@ -11,7 +11,7 @@ from uavctl import __version__
 from uavctl.cli.common import messages
 from uavctl.errors import UavctlError, UsageError
 
-_EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration.
+_EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss.
 
 With --json, standard output holds one JSON document and nothing else; messages go to standard error.
 Every configuration key is described in docs/configuration.md."""
@@ -24,10 +24,18 @@ app = App(
     version=__version__,
 )
 
-# A command's module is imported when the command runs: completion and usage errors stay quick.
-app.command("uavctl.cli.design_cmd:design", name="design")
-app.command("uavctl.cli.solve_cmd:solve", name="solve")
-app.command("uavctl.cli.bench_cmd:bench", name="bench")
+# A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
+_COMMANDS = {
+    "loopback": ("loopback_cmd:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
+    "fly": ("fly_cmd:fly", "Fly a real vehicle: the flight daemon on a real link."),
+    "sim": ("sim_cmd:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
+    "design": ("design_cmd:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
+    "solve": ("solve_cmd:solve", "Solve one decision problem, towards the configured target."),
+    "bench": ("bench_cmd:bench", "Measure the speed of a decision, beside the problem as printed."),
+    "log": ("log_cmd:log_app", "Look into recordings: info, recover, replay, report."),
+}
+for _name, (_path, _help) in _COMMANDS.items():
+    app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
 app.register_install_completion_command(add_to_startup=False)
 
 

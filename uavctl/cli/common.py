@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import msgspec
@@ -14,6 +14,8 @@ from rich.console import Console, RenderableType
 
 from uavctl.config import Loaded, explain, load
 from uavctl.errors import ConfigError, DesignError
+
+_FILE_WIDTH = 120
 
 
 @Parameter(name="*")
@@ -24,9 +26,17 @@ class Common:
     config: Annotated[str, Parameter(help="preset (paper, room) or TOML file")] = "room"
     overrides: Annotated[
         tuple[str, ...],
-        Parameter(name="--set", negative=(), help="override one key, as in link.loss=0.3; may be repeated"),
+        Parameter(
+            name="--set",
+            negative=(),
+            show_default=False,
+            metavar="KEY=VALUE",
+            help="override one key, as in link.loss=0.3; may be repeated",
+        ),
     ] = ()
-    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False
+    json: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
+    ] = False
 
     def load(self) -> Loaded:
         """The configuration that the options ask for.
@@ -36,12 +46,17 @@ class Common:
         """
         return load(self.config, self.overrides)
 
+    def with_overrides(self, more: Sequence[str]) -> Common:
+        """The same with further overrides, from a command's own options; they win."""
+        return replace(self, overrides=(*self.overrides, *more))
+
     def show(self, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]) -> None:
         """Put the result on standard output: as JSON, or as a picture of it for people."""
         if self.json:
             sys.stdout.write(msgspec.json.encode(document).decode() + "\n")
         else:
-            Console().print(picture())
+            # Files and pipes have no width of their own; the usual 80 columns would fold the tables.
+            Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(picture())
 
 
 DEFAULTS = Common()

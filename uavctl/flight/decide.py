@@ -23,6 +23,7 @@ class Tick:
     number: int  # step k
     boundary_ns: int  # where step k began
     boundary: bool  # the first tick of its step that runs
+    history: History
     estimate: Estimate | None
     age_steps: int | None
 
@@ -48,6 +49,7 @@ def place(state: ControlState, inp: StepInput, history: History, controller: Con
         number=number,
         boundary_ns=boundary_ns,
         boundary=state.decided_step is None or number > state.decided_step,
+        history=history,
         estimate=estimate(controller.kalman, history, inp.at_ns),
         age_steps=None if captured_ns is None else max(0, (boundary_ns - captured_ns) // controller.dt_ns),
     )
@@ -77,7 +79,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
 
 def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller) -> Choice:
     """The decision of a Δt boundary, with a vehicle that takes setpoints."""
-    if tick.age_steps is None or state.history is None:
+    if tick.age_steps is None:
         return Choice(state, "no position yet")
     if tick.age_steps >= controller.horizon:
         reason = f"age of information {tick.age_steps} has reached H = {controller.horizon}"
@@ -98,7 +100,7 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
 def _replan(state: ControlState, tick: Tick, controller: Controller) -> Choice:
     """Ask for a plan if there is news; else, or if that fails, the old one plays out."""
     # A boundary that was missed is decided as it would have been then: from what had been captured by then.
-    base = None if state.history is None else estimate(controller.kalman, state.history, tick.boundary_ns)
+    base = estimate(controller.kalman, tick.history, tick.boundary_ns)
     if base is None or (state.plan is not None and base.captured_ns <= state.plan.captured_ns):
         return Choice(state, "no news: the plan plays out")
     asked = ask(controller.solver, tick.number, base, controller.target, controller.horizon, controller.design_id)

@@ -29,6 +29,7 @@ BAD_FIELD = "non-finite"
 BAD_FRAME = "frame-id"
 BAD_PAYLOAD = "payload"
 BAD_QUALITY = "quality"
+OWN_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no external position
 
 
 class UnsendableError(ValueError):
@@ -131,6 +132,8 @@ _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
 
 
 def _odometry(raw: mavlink.MAVLink_message) -> Position:
+    if raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT:
+        raise _RefusedError(OWN_ESTIMATE)
     axes = _ODOMETRY_AXES.get(raw.frame_id)
     if axes is None:
         raise _RefusedError(BAD_FRAME)
@@ -217,8 +220,8 @@ def _battery(raw: mavlink.MAVLink_message, voltages_mv: list[int]) -> Battery | 
 
 
 def _text(raw: mavlink.MAVLink_message) -> Text:
-    # Control characters would act on the terminal that shows them.
-    text = "".join(character if character.isprintable() else "?" for character in raw.text)
+    # Control characters would act on the terminal that shows them; PX4 ends its texts with a tab.
+    text = "".join(character if character.isprintable() else "?" for character in raw.text.rstrip())
     return Text(system=raw.get_srcSystem(), component=raw.get_srcComponent(), severity=raw.severity, text=text)
 
 

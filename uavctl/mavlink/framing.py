@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 _HEADER_V1, _HEADER_V2, _CHECKSUM = 6, 10, 2
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
+MAX_FAILED = 64  # tries in one datagram; a hostile one must not cost the loop its tick
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
@@ -95,9 +96,11 @@ def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
         in_step: whether the first byte should begin a frame (see `Scan`).
 
     Returns:
-        What was found. One broken frame, or one run of garbage, counts once.
+        What was found. One broken frame, or one run of garbage, counts once. A datagram in which
+        nothing fits any more after `MAX_FAILED` tries is dropped from there on.
     """
     result = Scan(in_step=in_step)
+    failed = 0
     while result.consumed < len(data):
         end, reason = _try_frame(data, result, final=final)
         if reason is _WAIT:
@@ -105,7 +108,9 @@ def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
         if end is None:
             if result.in_step:
                 result.bad[reason] += 1
-            end = _next_magic(data, result.consumed + 1)
+            failed += 1
+            gives_up = final and failed > MAX_FAILED
+            end = len(data) if gives_up else _next_magic(data, result.consumed + 1)
         result.in_step = reason is _TAKEN
         result.consumed = end
     return result

@@ -6,7 +6,7 @@ from collections import Counter, deque
 
 from uavctl.config.types import ClockConfig, DaemonConfig, EstimatorConfig, FrameConfig, SourceConfig
 from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, VehicleStatus
-from uavctl.mavlink.codec import Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.intake import PositionIntake
 from uavctl.mavlink.messages import Message, Position, TimeSync
@@ -22,6 +22,7 @@ FIRST_REQUESTS = 10  # sent faster, until the first answer
 OPEN_REQUESTS = 8  # requests whose answers are still taken
 MAX_ANSWERS = 8  # answers to others' requests that wait for the next tick
 STREAM_SCHEMES = ("tcp:", "serial:")
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
 Item = PositionSample | VehicleStatus | Event
 
@@ -124,9 +125,9 @@ class Link:
             datagrams=self._datagrams,
             messages=self._messages,
             samples=self._intake.samples,
-            bad=dict(self._bad),
+            bad={str(reason): count for reason, count in self._bad.items()},
             clock_offset_ns=self._intake.clock_offset_ns,
-            clock_source=self._intake.clock_source,
+            clock_source=str(self._intake.clock_source),
         )
 
     def _target(self) -> tuple[int, int]:
@@ -155,7 +156,7 @@ class Link:
 
     def _count(self, reason: str, count: int = 1) -> None:
         self._bad[reason] += count
-        if reason != BadBytes.UNKNOWN:  # other dialects' messages are nobody's fault
+        if reason not in _USUAL:
             self._untold[reason] += count
 
     def _tell(self, at_ns: int) -> tuple[Event, ...]:

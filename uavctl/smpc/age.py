@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.errors import DesignError
+
 Array = NDArray[np.float64]
 
 
@@ -16,7 +18,12 @@ def age_distribution(p: Array) -> Array:
 
     Returns:
         mu (T+1, T+1): mu[t, j] = P(a(k+t) = j).
+
+    Raises:
+        DesignError: An entry is no probability.
     """
+    if not np.all((p >= 0.0) & (p <= 1.0)):
+        raise DesignError("link.loss", f"the link's probabilities {p.tolist()} are not all in [0, 1]", "correct them")
     steps = len(p)
     mu = np.zeros((steps + 1, steps + 1))
     mu[0, 0] = 1.0

@@ -18,7 +18,16 @@ _ROUNDING = 1e-8
 
 @dataclass(frozen=True)
 class AssumptionCheck:
-    """One item: `value` stays at or below `limit` (4.1: at or above)."""
+    """One item of Assumption 4.
+
+    Attributes:
+        item: Its number, "4.1" … "4.5".
+        ok: Whether it holds.
+        value: 4.1: P(a <= τ); 4.2: spectral radius; 4.3, 4.4: half-width of the terminal set along the row that it
+            fills most, in the row's unit; 4.5: largest eigenvalue of AᵀPA - P + Q_ξ, relative to P_ξ.
+        limit: What `value` stays at or below (4.1: at or above); 4.3, 4.4: the room from the equilibrium to the row.
+        text: What is compared, for people.
+    """
 
     item: str
     ok: bool
@@ -56,17 +65,21 @@ def check_assumptions(
         DesignError: An item fails; it is named with its figures.
     """
     k_sigma = terminal.k @ terminal.sigma_x @ terminal.k.T
-    rest = np.linalg.lstsq(plant.b, target - plant.a @ target, rcond=None)[0]
-    share_x, row_x = _fill(state_set, target, terminal.sigma_x, kappa_x)
-    share_u, row_u = _fill(input_set, rest, k_sigma, kappa_u)
-    invariance = max(terminal.spectral_radius, invariance_residual(terminal, plant.w) / _ROUNDING)
+    rest = np.asarray(np.linalg.lstsq(plant.b, target - plant.a @ target, rcond=None)[0], dtype=np.float64)
+    radius, residual = terminal.spectral_radius, invariance_residual(terminal, plant.w)
     drop = lyapunov_residual(terminal)
     checks = (
         AssumptionCheck("4.1", age_within_tau >= delta_tau, age_within_tau, delta_tau, "P(a <= tau) >= delta_tau"),
-        AssumptionCheck("4.2", invariance < 1.0, terminal.spectral_radius, 1.0, "stable, with an invariant covariance"),
-        AssumptionCheck("4.3", share_x <= 1.0, share_x, 1.0, f"terminal set / room to the limits, row {row_x}"),
-        AssumptionCheck("4.4", share_u <= 1.0, share_u, 1.0, f"terminal input / room to the limits, row {row_u}"),
-        AssumptionCheck("4.5", drop <= _ROUNDING, drop, _ROUNDING, "P_xi falls by the stage cost"),
+        AssumptionCheck(
+            "4.2",
+            radius < 1.0 and residual <= _ROUNDING,
+            radius,
+            1.0,
+            f"spectral radius of the delayed loop (residual of the invariant covariance {residual:.1g})",
+        ),
+        _fits("4.3", state_set, target, terminal.sigma_x, kappa_x, "state"),
+        _fits("4.4", input_set, rest, k_sigma, kappa_u, "input"),
+        AssumptionCheck("4.5", drop <= _ROUNDING, drop, _ROUNDING, "largest eigenvalue of A'PA - P + Q, relative to P"),
     )
     for check in checks:
         if not check.ok:
@@ -85,10 +98,20 @@ _BLAME = {
 }
 
 
-def _fill(polytope: Polytope, center: Array, covariance: Array, kappa: float) -> tuple[float, int]:
-    """Largest share of a row's room that the ellipsoid around `center` takes, and that row."""
+def _fits(item: str, polytope: Polytope, center: Array, covariance: Array, kappa: float, what: str) -> AssumptionCheck:
+    """Compare the ellipsoid around `center` with the room to the limits, at the row that it fills most."""
+    if not len(polytope.b):
+        return AssumptionCheck(item, True, 0.0, np.inf, f"no {what} has a limit")
     room = polytope.margin(center)
     half = kappa * np.sqrt(np.einsum("ij,jk,ik->i", polytope.c, covariance, polytope.c))
-    share = np.where(room > 0, half / np.where(room > 0, room, 1.0), np.inf)
-    row = int(np.argmax(share)) if len(share) else -1
-    return (float(share[row]) if len(share) else 0.0), row
+    share = np.divide(half, room, out=np.full_like(half, np.inf), where=room > 0)
+    row = int(np.argmax(share))
+    text = f"half-width of the terminal set at {_name(polytope.c[row], row, what)}, against the room from the target"
+    return AssumptionCheck(item, bool(half[row] <= room[row]), float(half[row]), float(room[row]), text)
+
+
+def _name(normal: Array, row: int, what: str) -> str:
+    index = np.flatnonzero(normal)
+    if len(index) != 1:
+        return f"row {row} of the {what} set"
+    return f"the {'upper' if normal[index[0]] > 0 else 'lower'} limit of {what} {index[0]}"

@@ -117,7 +117,8 @@ def whole(design: Design) -> Component:
 def _shared_row(c: Array) -> Array:
     """Non-zero where two variables appear in one row of a constraint."""
     used = (c != 0).astype(np.float64)
-    return used.T @ used
+    shared: Array = used.T @ used
+    return shared
 
 
 def _component(design: Design, states: Index, inputs: Index, disturbances: Index) -> Component:

@@ -14,8 +14,9 @@ from scipy import sparse
 
 Array = NDArray[np.float64]
 
-# Relative gap and residuals: the optimum is right to 1e-7 with room to spare, within what doubles can do.
-TOLERANCE = 1e-9
+# The optimum is to be right to 1e-7: a hundredth of that for the gap; residuals go no lower than this in doubles.
+GAP_TOLERANCE = 1e-9
+RESIDUAL_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +127,22 @@ class ProgramBuilder:
         return ConicProgram(p, self._q, self._c, squares, rows, [cone for _, cone in groups], max_iterations)
 
 
+BREAKDOWN = "Breakdown"  # the numbers overflow, or the solver panics
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the solver gave back; `cost` and `cost_lower` include the constant."""
+    """What the solver gave back.
 
-    status: clarabel.SolverStatus
+    Attributes:
+        status: Name of Clarabel's status, or BREAKDOWN.
+        variables: (n,), not necessarily finite.
+        cost: Primal objective with the constant.
+        cost_lower: Dual objective with the constant.
+        iterations: Interior-point iterations.
+    """
+
+    status: str
     variables: Array
     cost: float
     cost_lower: float
@@ -150,37 +162,56 @@ class ConicProgram:
         cones: list[clarabel.Cone],
         max_iterations: int,
     ) -> None:
-        self._q, self._c = q, c
+        self._c = c
         self._q_par = 2.0 * squares.var.T @ squares.par
         self._q_const = q + 2.0 * squares.var.T @ squares.const
         self._square_par, self._square_const = squares.par, squares.const
         self._b_par, self._b_const = rows.par, rows.const
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_iter = max_iterations
-        settings.max_threads = 1
-        settings.direct_solve_method = "qdldl"
-        # Both would change the shape of the data that update() replaces.
-        settings.presolve_enable = False
-        settings.chordal_decomposition_enable = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
-        self._solver = clarabel.DefaultSolver(
-            sparse.csc_array(np.triu(p)), self._q_const, sparse.csc_array(-rows.var), self._b_const, cones, settings
-        )
+        self._p = sparse.csc_array(np.triu(p))
+        self._a = sparse.csc_array(-rows.var)
+        self._cones = cones
+        self._max_iterations = max_iterations
+        self._solver = self._set_up()
 
     def solve(self, parameters: Array) -> Solution:
         """Solve for `parameters` (n_p,); the same parameters give the same bits, whatever was solved before."""
-        residual = self._square_par @ parameters + self._square_const
-        self._solver.update(
-            q=self._q_const + self._q_par @ parameters,
-            b=self._b_const + self._b_par @ parameters,
-        )
-        result = self._solver.solve()
-        constant = self._c + float(residual @ residual)
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual = self._square_par @ parameters + self._square_const
+            constant = self._c + float(residual @ residual)
+            q = self._q_const + self._q_par @ parameters
+            b = self._b_const + self._b_par @ parameters
+        if not (np.isfinite(constant) and np.all(np.isfinite(q)) and np.all(np.isfinite(b))):
+            return self._breakdown()
+        try:
+            self._solver.update(q=q, b=b)
+            result = self._solver.solve()
+        except BaseException as error:
+            # A panic of the solver's own code is no Exception, and its class cannot be imported.
+            if type(error).__name__ != "PanicException":
+                raise
+            self._solver = self._set_up()
+            return self._breakdown()
         return Solution(
-            status=result.status,
+            status=str(result.status),
             variables=np.array(result.x),
             cost=result.obj_val + constant,
             cost_lower=result.obj_val_dual + constant,
             iterations=result.iterations,
         )
+
+    def _breakdown(self) -> Solution:
+        return Solution(BREAKDOWN, np.full(self._q_const.size, np.nan), np.nan, np.nan, 0)
+
+    def _set_up(self) -> clarabel.DefaultSolver:
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.max_iter = self._max_iterations
+        settings.max_threads = 1
+        settings.direct_solve_method = "qdldl"
+        # Both would change the shape of the data that update() replaces.
+        settings.presolve_enable = False
+        settings.chordal_decomposition_enable = False
+        settings.tol_gap_abs = settings.tol_gap_rel = GAP_TOLERANCE
+        settings.tol_feas = RESIDUAL_TOLERANCE
+        # The first numbers fix the scaling, so they are the program's, not a question's.
+        return clarabel.DefaultSolver(self._p, self._q_const, self._a, self._b_const, self._cones, settings)

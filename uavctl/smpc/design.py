@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,8 @@ from uavctl.data import Vec3
 from uavctl.errors import DesignError
 from uavctl.smpc.age import age_distribution, at_most
 from uavctl.smpc.assumptions import AssumptionCheck, check_assumptions
-from uavctl.smpc.plant import Plant
+from uavctl.smpc.digest import digest
+from uavctl.smpc.plant import Plant, steps_to_reach
 from uavctl.smpc.risk import Allocation, kappa
 from uavctl.smpc.schedule import Demand, Schedule, fixed, greedy, nested
 from uavctl.smpc.sets import Polytope
@@ -22,6 +23,8 @@ from uavctl.smpc.terminal import Terminal, make_terminal
 
 Array = NDArray[np.float64]
 Rule = Literal["fixed", "search", "greedy"]
+# A candidate costs one program built and solved for each search state: this many are minutes.
+MOST_CANDIDATES = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,20 +120,27 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
     Raises:
         DesignError: No such design, naming the key, the item of Assumption 4 if one fails, and the figures.
     """
-    if spec.tau >= spec.horizon - 1:
-        raise DesignError(
-            "smpc.tau",
-            f"tau = {spec.tau} leaves {spec.horizon - spec.tau} free steps of the horizon H = {spec.horizon}",
-            f"take tau of at most {spec.horizon - 2}, or a longer smpc.horizon",
-        )
+    _check_horizon(spec)
     mu = age_distribution(spec.link_p)
     demand = Demand(mu, spec.horizon, spec.tau, spec.delta_x, spec.delta_u)
     terminal = make_terminal(spec.plant, spec.tau, spec.k_tau, spec.q_x, spec.q_u)
     if spec.rule == "fixed":
         return _assemble(spec, fixed(demand, spec.delays), terminal)
     if spec.rule == "greedy":
-        return _assemble(spec, greedy(demand), terminal)
+        return _assemble(spec, greedy(demand, spec.gamma_max), terminal)
     return _search(spec, demand, terminal, cost_of)
+
+
+def _check_horizon(spec: DesignSpec) -> None:
+    """The mean is at the target from stage N = H - τ on: N steps have to suffice from any state."""
+    free, least = spec.horizon - spec.tau, steps_to_reach(spec.plant)
+    if free < least:
+        raise DesignError(
+            "smpc.tau",
+            f"tau = {spec.tau} leaves N = {free} free steps of the horizon H = {spec.horizon}, and from any state "
+            f"to the target it takes {least}",
+            f"take smpc.tau of at most {spec.horizon - least}, or smpc.horizon of at least {spec.tau + least}",
+        )
 
 
 def _search(
@@ -141,14 +151,21 @@ def _search(
         raise DesignError(
             "schedule.search_states", "rule `search` has no states to minimise the cost over", "name some"
         )
+    candidates = list(islice(nested(demand, spec.gamma_max), MOST_CANDIDATES + 1))
+    if len(candidates) > MOST_CANDIDATES:
+        raise DesignError(
+            "schedule.rule",
+            f"`search` has more than {MOST_CANDIDATES} nested schedules to try at H = {spec.horizon}",
+            "take a shorter smpc.horizon, a lower schedule.gamma_max, or rule `greedy`",
+        )
     best: tuple[float, Design] | None = None
-    tried = 0
-    for schedule in nested(demand, spec.gamma_max):
-        tried += 1
+    refused, why = 0, ""
+    for schedule in candidates:
         try:
             design = _assemble(spec, schedule, terminal)
-        except DesignError:
-            continue  # this schedule's likelihoods ask for more than the limits leave
+        except DesignError as error:  # this schedule's likelihoods ask for more than the limits leave
+            refused, why = refused + 1, f": {error.reason}"
+            continue
         costs = [cost_of(design, state) for state in spec.search_states]
         known = [cost for cost in costs if cost is not None]
         mean = float(np.mean(known)) if len(known) == len(costs) else np.inf
@@ -157,7 +174,8 @@ def _search(
     if best is None:
         raise DesignError(
             "schedule.rule",
-            f"none of {tried} nested schedules keeps Assumption 4 with all {len(spec.search_states)} states feasible",
+            f"none of {len(candidates)} nested schedules will do: {refused} fail Assumption 4, "
+            f"{len(candidates) - refused} leave one of the {len(spec.search_states)} states infeasible{why}",
             "name states that are easier, raise schedule.gamma_max, or use rule `fixed`",
         )
     return best[1]
@@ -209,28 +227,7 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
         assumptions=checks,
         design_id="",
     )
-    return replace(design, design_id=_digest(design))
-
-
-def _digest(value: object) -> str:
-    """Hash of all numbers in a tree of dataclasses."""
-    hasher = hashlib.sha256()
-
-    def feed(part: object) -> None:
-        if isinstance(part, np.ndarray):
-            hasher.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
-        elif hasattr(part, "__dataclass_fields__") and not isinstance(part, type):
-            for one in fields(part):
-                hasher.update(one.name.encode())
-                feed(getattr(part, one.name))
-        elif isinstance(part, tuple):
-            for one in part:
-                feed(one)
-        else:
-            hasher.update(repr(part).encode())
-
-    feed(value)
-    return hasher.hexdigest()[:16]
+    return replace(design, design_id=digest(design))
 
 
 def design_record(design: Design) -> dict[str, object]:
@@ -244,6 +241,7 @@ def design_record(design: Design) -> dict[str, object]:
         "axes": list(plant.axes),
         "position_index": list(plant.position_index),
         "velocity_index": list(plant.velocity_index),
+        "accel_per_input": plant.accel_per_input.tolist(),
         "target": design.target.tolist(),
         "delays": list(schedule.delays),
         "alpha": schedule.alpha.tolist(),
@@ -255,7 +253,13 @@ def design_record(design: Design) -> dict[str, object]:
         "kappa_u_terminal": design.kappa_u_terminal,
         "spectral_radius": terminal.spectral_radius,
         "assumptions": [
-            {"item": check.item, "ok": check.ok, "value": check.value, "limit": check.limit, "text": check.text}
+            {
+                "item": check.item,
+                "ok": check.ok,
+                "value": check.value,
+                "limit": check.limit if np.isfinite(check.limit) else None,  # JSON has no infinity
+                "text": check.text,
+            }
             for check in design.assumptions
         ],
         "a": plant.a.tolist(),
@@ -274,4 +278,5 @@ def design_record(design: Design) -> dict[str, object]:
         "slack_quadratic": design.slack_quadratic,
         "offset_weight": design.offset_weight,
         "terminal_weight": design.terminal_weight,
+        "max_iterations": design.max_iterations,
     }

@@ -67,7 +67,7 @@ class Horizon:
             for t in range(steps)
             for r in _fed_back(t, int(schedule.delays[t]), self.free)
             for i in range(n_u)
-            for j in range(self._n_w)
+            for j in np.flatnonzero(np.diagonal(component.w)).tolist()  # nothing to feed back otherwise
         )
         powers = [np.eye(component.a.shape[0])]
         for _ in range(steps):
@@ -80,6 +80,11 @@ class Horizon:
         self._root_w = _root(component.w)
         self.gamma, self.gamma_eq = self._means()
         self.p, self.q, self.c_0 = self._covariance_cost()
+
+    @property
+    def width(self) -> int:
+        """H n_w, the number of disturbance entries over the horizon."""
+        return self.steps * int(self._n_w)
 
     @property
     def n_theta(self) -> int:
@@ -105,13 +110,13 @@ class Horizon:
         parts = [self.state_noise(self.free, np.eye(n_x))]
         parts += [self.input_noise(t, np.eye(n_u)) for t in range(self.free, self.steps)]
         stacked = _stack(parts)
-        columns = np.arange(stacked.offset.size) % (self.steps * self._n_w)
+        columns = np.arange(stacked.offset.size) % self.width
         old = np.flatnonzero(columns < self.free * self._n_w)  # no gain acts on the others, nor do they reach z
         return Affine(stacked.offset[old], stacked.matrix[old])
 
     def _affine(self, offset: Array, effect: dict[int, Array]) -> Affine:
         """Add the gains: `effect[s]` (m, n_u) is what u_s does to the rows."""
-        m, width = offset.shape[0], self.steps * self._n_w
+        m, width = offset.shape[0], self.width
         rows: list[int] = []
         columns: list[int] = []
         values: list[float] = []
@@ -119,10 +124,10 @@ class Horizon:
             if s not in effect:
                 continue
             for row in range(m):
-                for l in np.flatnonzero(self._root_w[j]):
-                    rows.append(row * width + r * self._n_w + int(l))
+                for k_w in np.flatnonzero(self._root_w[j]):
+                    rows.append(row * width + r * self._n_w + int(k_w))
                     columns.append(k)
-                    values.append(float(effect[s][row, i] * self._root_w[j, l]))
+                    values.append(float(effect[s][row, i] * self._root_w[j, k_w]))
         matrix = sparse.csr_array((values, (rows, columns)), shape=(m * width, self.n_theta))
         matrix.eliminate_zeros()
         return Affine(offset.ravel(), matrix)
@@ -148,10 +153,9 @@ class Horizon:
         terms += [self.input_noise(t, control) for t in range(self.steps)]
         n_x = part.a.shape[0]
         stacked = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
-        width = self.steps * self._n_w
-        weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(width), format="csr")
+        weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(self.width), format="csr")
         xi = _stack(stacked)
-        terms.append(Affine(weight @ xi.offset, sparse.csr_array(weight @ xi.matrix)))
+        terms.append(Affine(np.asarray(weight @ xi.offset), sparse.csr_array(weight @ xi.matrix)))
         everything = _stack(terms)
         gram = (everything.matrix.T @ everything.matrix).toarray()
         linear = everything.matrix.T @ everything.offset
@@ -163,7 +167,7 @@ def _fed_back(t: int, delay: int, free: int) -> range:
     if t >= free and t - delay >= free:
         raise DesignError(
             "schedule.delays",
-            f"delay {delay} in stage {t} feeds back a disturbance of the last {t - free + 1} stages of the terminal law",
+            f"delay {delay} in stage {t} feeds back a disturbance that the terminal law does not know yet",
             f"use at least {t - free + 1} there",
         )
     return range(max(0, min(t - delay + 1, free)))

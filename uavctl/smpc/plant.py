@@ -14,11 +14,12 @@ from uavctl.errors import DesignError
 
 Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A linear plant with the meaning of its states.
+    """A linear plant with the meaning of its states; the arrays are copied and read-only.
 
     Attributes:
         a: A (n_x, n_x).
@@ -32,7 +33,7 @@ class Plant:
         accel_per_input: Acceleration setpoint per unit of input, each axis [m/s² per unit].
 
     Raises:
-        DesignError: shapes do not fit, W is no covariance, or A has no real logarithm.
+        DesignError: Shapes do not fit, W is no covariance, or A has no real logarithm.
     """
 
     a: Array
@@ -47,19 +48,10 @@ class Plant:
     _generator: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        for name in ("a", "b", "e", "w", "accel_per_input"):
+            object.__setattr__(self, name, _frozen(getattr(self, name)))
         _check(self)
-        lifted = np.eye(self.n_x + self.n_u + self.n_w)
-        lifted[: self.n_x] = np.hstack([self.a, self.b, self.e])
-        generator = logm(lifted)
-        if np.iscomplexobj(generator) and np.abs(generator.imag).max() > 1e-9:
-            raise DesignError(
-                "plant.a",
-                f"A has no real logarithm (eigenvalues {np.linalg.eigvals(self.a).round(4).tolist()})",
-                "a sampled continuous plant has no eigenvalue on the negative real axis",
-            )
-        object.__setattr__(self, "_generator", np.real(generator) / self.dt_s)
-        for array in (self.a, self.b, self.e, self.w, self.accel_per_input, self._generator):
-            array.setflags(write=False)
+        object.__setattr__(self, "_generator", _frozen(_logarithm(self) / self.dt_s))
 
     @property
     def n_x(self) -> int:
@@ -77,9 +69,18 @@ class Plant:
         return int(self.e.shape[1])
 
     def transition(self, dt_s: float) -> tuple[Array, Array, Array]:
-        """A, B, E of a part 0 <= dt <= Δt of a step in which u and w are held."""
+        """A, B, E of a part of a step, with u and w held: exact, by the matrix logarithm of [[A, B, E], [0, I]].
+
+        Args:
+            dt_s: Length of the part, 0 <= dt <= Δt [s]; Δt gives back the plant's own matrices.
+
+        Raises:
+            ValueError: The part is no part of a step.
+        """
         if dt_s == self.dt_s:
             return self.a, self.b, self.e
+        if not 0.0 <= dt_s < self.dt_s:
+            raise ValueError(f"{dt_s} s is not within a step of {self.dt_s} s")
         lifted = expm(self._generator * dt_s)[: self.n_x]
         a, b, e = np.split(lifted, [self.n_x, self.n_x + self.n_u], axis=1)
         return a, b, e
@@ -131,11 +132,22 @@ def drag_lag(
         wind_std_mps2: Standard deviation of w of each axis [m/s²].
         dt_s: Δt [s].
         axes: Axes of local NED.
+
+    Raises:
+        DesignError: Not one number for each axis, or a lag that is not positive.
     """
+    given = {"drag_1ps": drag_1ps, "lag_s": lag_s, "gain": gain, "wind_std_mps2": wind_std_mps2}
+    for key, values in given.items():
+        if len(values) != len(axes):
+            raise DesignError(f"plant.{key}", f"{len(values)} numbers for {len(axes)} axes", "give one an axis")
+    if min(lag_s, default=1.0) <= 0.0:
+        raise DesignError("plant.lag_s", f"{list(lag_s)} has a lag that is not positive", "give times above 0")
     parts = []
     for drag, lag, reach in zip(drag_1ps, lag_s, gain, strict=True):
         lifted = np.zeros((5, 5))
-        lifted[:3] = [[0, 1, 0, 0, 0], [0, -drag, 1, 0, 1], [0, 0, -1 / lag, reach / lag, 0]]
+        lifted[0, 1] = 1.0
+        lifted[1, 1:] = [-drag, 1.0, 0.0, 1.0]
+        lifted[2, 2:4] = [-1.0 / lag, reach / lag]
         parts.append(expm(lifted * dt_s)[:3])
     return Plant(
         a=block_diag(*(part[:, :3] for part in parts)),
@@ -150,26 +162,95 @@ def drag_lag(
     )
 
 
+def steps_to_reach(plant: Plant) -> int:
+    """Fewest steps in which inputs without limits take the mean from any state to any other.
+
+    Raises:
+        DesignError: No number of steps does.
+    """
+    reach = np.zeros((plant.n_x, 0))
+    for steps in range(1, plant.n_x + 1):
+        reach = np.hstack([plant.b, plant.a @ reach])
+        if np.linalg.matrix_rank(reach) == plant.n_x:
+            return steps
+    raise DesignError(
+        "plant.b",
+        f"the inputs reach {int(np.linalg.matrix_rank(reach))} of {plant.n_x} states only",
+        "leave out the states that no input moves, or add an input",
+    )
+
+
+def _frozen(array: Array) -> Array:
+    copy = np.array(array, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
+
+
 def _check(plant: Plant) -> None:
-    n_x, n_axes = plant.a.shape[0], len(plant.axes)
-    shapes = {
-        "plant.a": plant.a.shape == (n_x, n_x),
-        "plant.b": plant.b.shape == (n_x, n_axes),
-        "plant.e": plant.e.ndim == 2 and plant.e.shape[0] == n_x,
-        "plant.w": plant.e.ndim == 2 and plant.w.shape == (plant.e.shape[1],) * 2,
-        "plant.accel_per_input": plant.accel_per_input.shape == (n_axes,) and bool(np.all(plant.accel_per_input != 0)),
-        "plant.position_index": len(plant.position_index) == n_axes and all(0 <= i < n_x for i in plant.position_index),
-        "plant.velocity_index": len(plant.velocity_index) == n_axes and all(0 <= i < n_x for i in plant.velocity_index),
-        "plant.dt_s": plant.dt_s > 0,
-    }
-    for key, fits in shapes.items():
-        if not fits:
-            raise DesignError(key, "the shape does not fit the other matrices", f"A has {n_x} states, {n_axes} axes")
-    arrays = (plant.a, plant.b, plant.e, plant.w)
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise DesignError("plant", "a matrix has an entry that is not finite", "give finite numbers")
-    least = float(np.linalg.eigvalsh((plant.w + plant.w.T) / 2).min(initial=0.0))
-    if not np.allclose(plant.w, plant.w.T) or least < -1e-12:
+    _check_shapes(plant)
+    for name in ("a", "b", "e", "w", "accel_per_input"):
+        bad = np.argwhere(~np.isfinite(getattr(plant, name)))
+        if len(bad):
+            raise DesignError(f"plant.{name}", f"entry {bad[0].tolist()} is not finite", "give finite numbers")
+    if not 0.0 < plant.dt_s < np.inf:
+        raise DesignError("plant.dt_s", f"{plant.dt_s:g} s is no step", "give a time above 0")
+    if np.any(plant.accel_per_input == 0.0):
         raise DesignError(
-            "plant.w", f"W is not symmetric positive semidefinite (eigenvalue {least:.3g})", "give a covariance"
+            "plant.accel_per_input", "is 0 for an axis, which nothing could steer", "give a number other than 0"
         )
+    size = float(np.abs(plant.w).max(initial=0.0))
+    skew = float(np.abs(plant.w - plant.w.T).max(initial=0.0))
+    if skew > _ROUNDING * size:
+        raise DesignError(
+            "plant.w", f"W is not symmetric (W and its transpose differ by {skew:.3g})", "give W[i][j] = W[j][i]"
+        )
+    least = float(np.linalg.eigvalsh(plant.w).min(initial=0.0))
+    if least < -_ROUNDING * size:
+        raise DesignError(
+            "plant.w", f"W is not positive semidefinite (smallest eigenvalue {least:.3g})", "give a covariance"
+        )
+
+
+def _check_shapes(plant: Plant) -> None:
+    n_x, n_axes = len(plant.a), len(plant.axes)
+    n_w = plant.e.shape[-1] if plant.e.ndim else 0
+    wanted = {"a": (n_x, n_x), "b": (n_x, n_axes), "e": (n_x, n_w), "w": (n_w, n_w), "accel_per_input": (n_axes,)}
+    for name, shape in wanted.items():
+        given = getattr(plant, name).shape
+        if given != shape:
+            raise DesignError(
+                f"plant.{name}",
+                f"shape {given} is not {shape}",
+                f"A has {n_x} rows, there are {n_axes} axes and {n_w} disturbances",
+            )
+    if not n_axes or list(plant.axes) != [axis for axis in AXES if axis in plant.axes]:
+        raise DesignError("plant.axes", f"{list(plant.axes)} are no axes", f"give some of {list(AXES)}, in this order")
+    for name in ("position_index", "velocity_index"):
+        index = getattr(plant, name)
+        if len(index) != n_axes or len(set(index)) != n_axes or not all(0 <= i < n_x for i in index):
+            raise DesignError(
+                f"plant.{name}",
+                f"{list(index)} does not name one state of {n_x} for each of {n_axes} axes",
+                f"give {n_axes} different numbers from 0 to {n_x - 1}",
+            )
+
+
+def _logarithm(plant: Plant) -> Array:
+    """Real logarithm of [[A, B, E], [0, I]]."""
+    eigenvalues = np.linalg.eigvals(plant.a)
+    size = float(np.abs(eigenvalues).max())
+    # The principal logarithm is real where no eigenvalue is 0 or negative.
+    barred = (np.abs(eigenvalues.imag) <= _ROUNDING * size) & (eigenvalues.real <= _ROUNDING * size)
+    refused = DesignError(
+        "plant.a",
+        f"A has no real logarithm (eigenvalues {', '.join(f'{value:.4g}' for value in eigenvalues)})",
+        "a sampled continuous plant has no eigenvalue that is 0 or negative: check A, or model the plant at another Δt",
+    )
+    if barred.any():
+        raise refused
+    lifted = np.eye(plant.n_x + plant.n_u + plant.n_w)
+    lifted[: plant.n_x] = np.hstack([plant.a, plant.b, plant.e])
+    generator = np.real(logm(lifted))
+    if np.abs(expm(generator) - lifted).max() > 1e-9 * max(1.0, float(np.abs(lifted).max())):
+        raise refused
+    return _frozen(generator)

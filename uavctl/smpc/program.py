@@ -8,6 +8,7 @@ vehicle far from the origin is computed as well as one at the origin.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +49,17 @@ class Layout:
     slack: slice
     miss: slice
     backoff: slice
-    size: int
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return int(self.backoff.stop)
 
     @classmethod
     def of(cls, v: int, theta: int, y: int, slack: int, miss: int, backoff: int) -> Layout:
         """Lay the given numbers of variables out one after another."""
         ends = np.cumsum([0, v, theta, y, y, slack, miss, backoff]).tolist()
-        return cls(*(slice(i, j) for i, j in zip(ends[:-1], ends[1:], strict=True)), size=ends[-1])
+        return cls(*(slice(i, j) for i, j in pairwise(ends)))
 
 
 class Program:
@@ -105,7 +110,8 @@ class Program:
     def _mean(self, t: int) -> Expression:
         """x̄_t relative to the present equilibrium."""
         horizon = self.horizon
-        return horizon.phi[t] @ self._x + horizon.gamma[t] @ self._v + horizon.gamma_eq[t] @ self._y
+        mean: Expression = horizon.phi[t] @ self._x + horizon.gamma[t] @ self._v + horizon.gamma_eq[t] @ self._y
+        return mean
 
     def _noise_x(self, t: int, pair: Pair) -> Affine:
         return self.horizon.state_noise(t, np.array([pair.c]))

@@ -84,4 +84,4 @@ def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> Terminal
 def _times(matrix: Array, z: Affine, columns: int) -> Affine:
     """matrix · Z for Z stored row by row."""
     wide = sparse.kron(sparse.csr_array(matrix), sparse.eye_array(columns), format="csr")
-    return Affine(wide @ z.offset, sparse.csr_array(wide @ z.matrix))
+    return Affine(np.asarray(wide @ z.offset), sparse.csr_array(wide @ z.matrix))

@@ -6,6 +6,7 @@ The delay d_t says that stage t feeds back w(k+r) for r <= t - d_t only. It is u
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from uavctl.smpc.age import at_most
 Array = NDArray[np.float64]
 # The product's and the likelihoods' bounds are strict: equality makes γ = 1 and the back-off infinite.
 _STRICT = 1e-9
-LONGEST_DELAY = 11
+LONGEST_DELAY = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class Schedule:
     """Delays and the likelihoods that they leave.
 
     Attributes:
-        delays: d_0 … d_{H-1} [steps].
+        delays: d_0 … d_{H-1} (H,) [steps].
         alpha: α_t (H,), probability that stage t's feedback is usable.
         gamma_x: γ^x_t (H+1,) by (6); gamma_x[0] = 1 is not used.
         gamma_u: γ^u_t (H,) by (6).
@@ -43,7 +44,7 @@ class Demand:
     """What a schedule has to meet.
 
     Attributes:
-        mu: Age distribution (T+1, T+1) with T >= H - 1.
+        mu: Age distribution (T+1, T+1), from an age of 0, with T >= H - 1.
         horizon: H.
         tau: τ.
         delta_x: δ_x.
@@ -61,9 +62,26 @@ class Demand:
         """N = H - τ, the first stage of the terminal stack."""
         return self.horizon - self.tau
 
+    @property
+    def last(self) -> tuple[int, ...]:
+        """Delays of the last τ stages: those of the terminal law."""
+        return (self.tau + 1,) * self.tau
+
     def alpha(self, t: int, delay: int) -> float:
         """α_t of a delay."""
         return 1.0 if t < delay else at_most(self.mu, t, delay - 1)
+
+    def admits(self, t: int, newest: int, product: float, gamma_max: float) -> bool:
+        """Whether stage t may feed back the disturbances up to r̂ = `newest` (-1: none), after a ∏ α of `product`.
+
+        Its α is above the likelihoods, and if the stages after it used nothing newer (the largest α they can have
+        in a nested schedule), the product of all would be at least δ_x / `gamma_max`.
+        """
+        if newest > max(-1, self.free - self.tau - 1) or self.alpha(t, t - newest) <= max(self.delta_x, self.delta_u):
+            return False
+        free = (self.alpha(s, s - newest) for s in range(t, self.free))
+        last = (self.alpha(s, self.tau + 1) for s in range(self.free, self.horizon))
+        return product * math.prod((*free, *last)) >= self.delta_x / gamma_max
 
 
 def fixed(demand: Demand, delays: int | Sequence[int]) -> Schedule:
@@ -91,31 +109,31 @@ def fixed(demand: Demand, delays: int | Sequence[int]) -> Schedule:
     return _likelihoods(demand, listed)
 
 
-def greedy(demand: Demand) -> Schedule:
-    """Stage by stage the shortest delay that (7) admits: α_t > max(δ), ∏ α > δ_x with what is left to the others.
+def greedy(demand: Demand, gamma_max: float) -> Schedule:
+    """Stage by stage, earliest first, the newest information that (7) admits.
 
-    The last τ stages have d_t = τ + 1, so that the terminal law can be followed.
+    The later stages must still be able to do with what this one has: r̂_t never falls, the last τ stages have
+    d_t = τ + 1, and the product of all α stays at or above δ_x / `gamma_max` (δ_x itself would make γ = 1).
 
     Raises:
         DesignError: (7) admits none.
     """
-    last = [demand.tau + 1] * demand.tau
-    reserve = float(np.prod([demand.alpha(t, demand.tau + 1) for t in range(demand.free, demand.horizon)]))
+    newest, product = -1, 1.0
     chosen: list[int] = []
-    product = 1.0
     for t in range(demand.free):
-        for delay in range(chosen[-1] if chosen else 1, demand.horizon + 1):
-            alpha = demand.alpha(t, delay)
-            if alpha > max(demand.delta_x, demand.delta_u) and product * alpha * reserve > demand.delta_x + _STRICT:
-                break
-        chosen.append(delay)
-        product *= alpha
-    return fixed(demand, chosen + last)
+        newest = next((r for r in range(t - 1, newest, -1) if demand.admits(t, r, product, gamma_max)), newest)
+        product *= demand.alpha(t, t - newest)
+        chosen.append(t - newest)
+    return fixed(demand, (*chosen, *demand.last))
 
 
 def nested(demand: Demand, gamma_max: float) -> Iterator[Schedule]:
-    """All nested schedules: r̂_t = t - d_t never falls, d_t = τ + 1 for the last τ stages, every γ <= `gamma_max`."""
-    for delays in _nested_delays(demand):
+    """All nested schedules: r̂_t = t - d_t never falls, d_t = τ + 1 for the last τ stages, every γ <= `gamma_max`.
+
+    Schedules that feed back the same disturbances come once; delays beyond LONGEST_DELAY gain next to nothing in
+    likelihood and are left out.
+    """
+    for delays in _nested_delays(demand, gamma_max, (), -1, 1.0):
         try:
             schedule = fixed(demand, delays)
         except DesignError:
@@ -124,24 +142,19 @@ def nested(demand: Demand, gamma_max: float) -> Iterator[Schedule]:
             yield schedule
 
 
-def _nested_delays(demand: Demand) -> Iterator[tuple[int, ...]]:
-    """Delays with feedback sets that only grow, each distinct set once (a stage without feedback has d_t = t + 1)."""
-    last = (demand.tau + 1,) * demand.tau
-
-    def extend(chosen: tuple[int, ...], newest: int, product: float) -> Iterator[tuple[int, ...]]:
-        t = len(chosen)
-        if t == demand.free:
-            if newest <= t - demand.tau - 1 and product > demand.delta_x:
-                yield chosen + last
-            return
-        for newest_t in range(newest, t):  # -1: nothing is fed back
-            delay = t - newest_t
-            alpha = demand.alpha(t, delay) if newest_t >= 0 else 1.0
-            long = newest_t >= 0 and delay > LONGEST_DELAY
-            if not long and alpha > max(demand.delta_x, demand.delta_u) and product * alpha > demand.delta_x:
-                yield from extend((*chosen, delay), newest_t, product * alpha)
-
-    yield from extend((), -1, 1.0)
+def _nested_delays(
+    demand: Demand, gamma_max: float, chosen: tuple[int, ...], newest: int, product: float
+) -> Iterator[tuple[int, ...]]:
+    """Continuations of the delays `chosen`, whose last stage has r̂ = `newest` (-1: nothing) and whose ∏ α is known."""
+    t = len(chosen)
+    if t == demand.free:
+        yield (*chosen, *demand.last)
+        return
+    for r in range(newest, t):
+        delay = t - r
+        if (r < 0 or delay <= LONGEST_DELAY) and demand.admits(t, r, product, gamma_max):
+            alpha = demand.alpha(t, delay)
+            yield from _nested_delays(demand, gamma_max, (*chosen, delay), r, product * alpha)
 
 
 def _likelihoods(demand: Demand, delays: tuple[int, ...]) -> Schedule:

@@ -47,11 +47,15 @@ def make_terminal(plant: Plant, tau: int, k: Array, q_x: Array, q_u: Array) -> T
     """Solve the two Lyapunov equations of the lifted system.
 
     Raises:
-        DesignError: K_τ has the wrong shape, or the delayed closed loop is unstable (Assumption 4.2).
+        DesignError: τ is below 1, K_τ has the wrong shape, or the delayed closed loop is unstable (Assumption 4.2).
     """
+    if tau < 1:
+        raise DesignError("smpc.tau", f"{tau} is no delay", "give at least 1 step")
     n_x, n_u = plant.n_x, plant.n_u
-    if k.shape != (n_u, n_x):
-        raise DesignError("smpc.k_tau", f"shape {k.shape} is not ({n_u}, {n_x})", "one row an input")
+    if k.shape != (n_u, n_x) or not np.isfinite(k).all():
+        raise DesignError(
+            "smpc.k_tau", f"is not ({n_u}, {n_x}) finite numbers, its shape is {k.shape}", "one row an input"
+        )
     size = (tau + 1) * n_x
     a_cl = np.zeros((size, size))
     a_cl[:-n_x, n_x:] = np.eye(tau * n_x)
@@ -115,6 +119,5 @@ def invariance_residual(terminal: Terminal, w: Array) -> float:
     return float(np.abs(terminal.a_cl @ sigma @ terminal.a_cl.T + noise - sigma).max() / np.abs(sigma).max())
 
 
-def _symmetric(matrix: Array) -> Array:
-    symmetric: Array = (matrix + matrix.T) / 2
-    return symmetric
+def _symmetric(matrix: NDArray[np.floating]) -> Array:
+    return np.asarray((matrix + matrix.T) / 2, dtype=np.float64)

@@ -1,0 +1,122 @@
+"""What happened in a flight, in sentences made from its figures."""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+import numpy as np
+
+from logs.flight_data import FALLBACK, FLOWN, FlightData
+from logs.summary import FlightSummary, count, input_outside, number, position_error_m, state_outside
+from uavctl.data import ControlMode
+
+_ENDINGS = {
+    ControlMode.WAIT: "At the end the controller was waiting for positions or for a vehicle to fly.",
+    ControlMode.TRACK: "At the end a plan was being flown.",
+    ControlMode.BRAKE: "The recording ends while the fallback was braking.",
+    ControlMode.HOLD: "The recording ends while the fallback held zero acceleration.",
+    ControlMode.LAND: "The flight ended in the vehicle's own landing, which the fallback asked for.",
+    ControlMode.STOPPED: "At the end the vehicle had been handed over.",
+}
+
+
+def story(flight: FlightData, summary: FlightSummary) -> list[str]:
+    """Sentences that say what happened; each is true of this flight's data."""
+    if summary.final_error_m is None or summary.settled_error_m is None:
+        last = flight.decisions[-1]
+        return [f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}.", _ENDINGS[last.mode]]
+    return [
+        _engaged(flight, summary, summary.final_error_m, summary.settled_error_m),
+        _silence(flight, summary),
+        *_fallback(flight, summary),
+        _state_limits(flight, summary),
+        _input_limits(flight, summary),
+        _plans(summary),
+        _ENDINGS[flight.decisions[-1].mode],
+    ]
+
+
+def _engaged(flight: FlightData, s: FlightSummary, final_m: float, settled_m: float) -> str:
+    begun_s = flight.spans(FLOWN)[0][0]
+    start_m = position_error_m(flight)[0]
+    seen = "" if s.state_source == "truth" else ", by the estimate"
+    return (
+        f"The controller took over {_after(begun_s)} and flew {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
+        f"It began {number(start_m)} m from the target and ended {number(final_m)} m from it{seen}; "
+        f"over the last quarter the distance was {number(settled_m)} m (root mean square)."
+    )
+
+
+def _after(begun_s: float) -> str:
+    return "at the first tick" if begun_s == 0 else f"{number(begun_s)} s after the first tick"
+
+
+def _silence(flight: FlightData, s: FlightSummary) -> str:
+    if s.lost is None:
+        positions = f"{count(s.accepted, 'position')} {_were(s.accepted)} used and {s.rejected} refused"
+    elif s.lost:
+        sent = s.lost + s.received
+        positions = f"Of {sent} positions sent, {s.lost} {_were(s.lost)} lost ({100 * s.lost / sent:.3g} %)"
+    else:
+        positions = f"None of {s.received} positions sent was lost"
+    if s.max_age == 0:
+        return f"{positions}; there was fresh information at every step."
+    return (
+        f"{positions}; the longest silence was {count(s.max_age, 'step')} "
+        f"({number(s.max_age_s)} s since the last position was captured), "
+        f"where plans reach {flight.design.horizon} steps."
+    )
+
+
+def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
+    spans = flight.spans(FALLBACK)
+    if not spans:
+        return ["The fallback was never needed."]
+    first = next(d for d in flight.decisions if d.mode in FALLBACK)
+    total_s = sum(end - begin for begin, end in spans)
+    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.decisions if d.mode in FALLBACK)]
+    course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
+    times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
+    return [
+        f"The fallback {course}took over {times}, for {number(total_s)} s in all; "
+        f"{'' if s.fallbacks == 1 else 'first '}at {number(spans[0][0])} s: {first.reason}."
+    ]
+
+
+def _state_limits(flight: FlightData, s: FlightSummary) -> str:
+    whose = "true" if s.state_source == "truth" else "estimated"
+    if not s.state_violations:
+        return f"The {whose} state stayed inside its limits at every step."
+    share = 100 * s.state_violations / s.steps
+    return (
+        f"The {whose} state was outside its limits at {s.state_violations} of {count(s.steps, 'step')} ({share:.2g} %)"
+        f"{_worst(flight)}."
+    )
+
+
+def _worst(flight: FlightData) -> str:
+    """The largest excess over an axis-parallel limit, named."""
+    box, states = flight.design.state_box, flight.steps.state[state_outside(flight)]
+    excess = np.nan_to_num(np.maximum(box.lower - states, states - box.upper), nan=0.0, neginf=0.0)
+    _, index = np.unravel_index(int(excess.argmax()), excess.shape)
+    most = float(excess.max())
+    return f", at worst {most:.2g} beyond a limit of {flight.design.state_name(int(index))}" if most > 0 else ""
+
+
+def _input_limits(flight: FlightData, s: FlightSummary) -> str:
+    if not s.input_violations:
+        return "No input was beyond its limits."
+    at_s = float(flight.steps.t_s[input_outside(flight)][0])
+    return f"An input was beyond its limits at {count(s.input_violations, 'step')}, first at {number(at_s)} s."
+
+
+def _plans(s: FlightSummary) -> str:
+    if not s.solves:
+        return "No plan was asked for."
+    ended = "every one of them optimal" if not s.failed_solves else f"{s.failed_solves} without an optimum"
+    slack = "no constraint had to give way" if not s.slack_used else f"in {s.slack_used} flown a constraint gave way"
+    return f"{count(s.solves, 'plan')} {_were(s.solves)} computed, {ended}; {slack}."
+
+
+def _were(number: int) -> str:
+    return "was" if number == 1 else "were"

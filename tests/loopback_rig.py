@@ -1,0 +1,62 @@
+"""A lockstep flight in memory: the real loop, the real simulator, no disk."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from logs.flight_data import FlightData
+from sim.world import World
+from uavctl.build import build_controller, build_design
+from uavctl.config import Config, load_config
+from uavctl.config.load import dump_config
+from uavctl.data import Header, Record, Sink
+from uavctl.loop import ControlLoop
+from uavctl.smpc.design import Design, design_record
+
+R = TypeVar("R", bound=Record)
+
+
+class Memory:
+    """Sink that keeps everything, in order."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[str, int, Record]] = []
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        self.entries.append((topic, at_ns, record))
+
+    def of(self, kind: type[R]) -> list[R]:
+        return [record for _, _, record in self.entries if isinstance(record, kind)]
+
+
+def make_loop(config: Config, sink: Sink, design: Design | None = None) -> ControlLoop:
+    return ControlLoop(config, build_controller(config, design), sink, lambda: 0)
+
+
+def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:
+    """Fly a preset in virtual time."""
+    config = load_config(name, [f"duration_s={duration_s}", *overrides])
+    design = build_design(config)
+    memory = Memory()
+    memory.put("/uavctl/header", 0, header(config, design))
+    loop = make_loop(config, memory, design)
+    World(config, loop, on_truth=lambda truth: memory.put("/sim/truth", truth.at_ns, truth)).run(duration_s)
+    return memory
+
+
+def header(config: Config, design: Design) -> Header:
+    return Header(
+        started_ns=0,
+        started_utc="2026-01-01T00:00:00",
+        seed=config.sim.seed,
+        command="test",
+        config_toml=dump_config(config),
+        design_id=design.design_id,
+        design=design_record(design),
+        versions={},
+        cpu="",
+    )
+
+
+def flight(memory: Memory) -> FlightData:
+    return FlightData.from_records(memory.entries)

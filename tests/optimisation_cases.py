@@ -1,0 +1,108 @@
+"""Designs that the tests of the decision problem share: the paper's, a room's, and one with coupled axes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.plant import Plant, drag_lag
+from uavctl.smpc.sets import Polytope
+
+Array = NDArray[np.float64]
+
+START = np.array([35.0, -2.0, -20.0, -4.0])
+ORIGIN = np.zeros(4)
+PAPER_COST, PAPER_COST_X, PAPER_COST_Y = 61669.93, 42499.44, 19170.49
+
+ROOM_CORNER = np.array([-2.4, 0, 0, -1.9, 0, 0, -0.7, 0, 0])
+ROOM_TARGET = np.array([1.5, 0, 0, 1.0, 0, 0, -1.2, 0, 0])
+
+PAPER_LOWER = np.array([-30.0, -8.0, -25.0, -8.0])
+PAPER_UPPER = np.array([50.0, 7.0, 20.0, 8.0])
+
+TWO = np.eye(2)
+
+
+def paper_plant(w: Array | None = None, coupling: float = 0.0) -> Plant:
+    a = np.kron(TWO, [[1.0, 0.79], [0.0, 0.61]])
+    a[1, 3] = a[3, 1] = coupling
+    return Plant(
+        a=a,
+        b=np.kron(TWO, [[0.21], [0.39]]),
+        e=np.kron(TWO, [[0.5], [1.0]]),
+        w=0.6 * np.eye(2) if w is None else w,
+        dt_s=1.0,
+        axes=("north", "east"),
+        position_index=(0, 2),
+        velocity_index=(1, 3),
+        accel_per_input=np.full(2, 0.494),
+    )
+
+
+def paper_spec(**changes: Any) -> DesignSpec:
+    spec = DesignSpec(
+        plant=paper_plant(),
+        state_set=Polytope.from_box(PAPER_LOWER.tolist(), PAPER_UPPER.tolist()),
+        input_set=Polytope.from_box([-7.5, -7.5], [7.5, 7.5]),
+        q_x=np.diag([10.0, 0.1, 10.0, 0.1]),
+        q_u=0.1 * np.eye(2),
+        horizon=12,
+        tau=4,
+        delta_x=0.95,
+        delta_u=0.9,
+        delta_tau=0.99,
+        k_tau=np.kron(TWO, [[-0.058, -1.172]]),
+        link_p=np.full(12, 0.7),
+        target_m=(0.0, 0.0, 0.0),
+        rule="fixed",
+        delays=5,
+        gamma_max=0.985,
+        search_states=np.zeros((0, 4)),
+        allocation="ellipsoid",
+        slack_linear=1e5,
+        slack_quadratic=1e3,
+        offset_weight=5000.0,
+        terminal_weight=1e5,
+        max_iterations=100,
+    )
+    return replace(spec, **changes)
+
+
+def paper(**changes: Any) -> Design:
+    return make_design(paper_spec(**changes))
+
+
+def coupled() -> Design:
+    """Two axes that drag at one another, with a short horizon and a good link."""
+    return paper(
+        plant=paper_plant(coupling=0.05),
+        horizon=5,
+        tau=1,
+        delays=2,
+        link_p=np.full(12, 0.95),
+    )
+
+
+def room(**changes: Any) -> Design:
+    inf = np.inf
+    spec = paper_spec(
+        plant=drag_lag([0.3] * 3, [0.25] * 3, [1.0] * 3, [0.15, 0.15, 0.10], 0.2, ("north", "east", "down")),
+        state_set=Polytope.from_box(
+            [-3.0, -1.5, -inf, -2.5, -1.5, -inf, -2.5, -1.0, -inf], [3.0, 1.5, inf, 2.5, 1.5, inf, 0.0, 1.0, inf]
+        ),
+        input_set=Polytope.from_box([-2.0, -2.0, -1.5], [2.0, 2.0, 1.5]),
+        q_x=np.diag([10.0, 1.0, 0.1] * 3),
+        q_u=np.eye(3),
+        tau=3,
+        k_tau=np.kron(np.eye(3), [[-1.060, -1.444, -0.696]]),
+        target_m=(1.5, 1.0, -1.2),
+        # Stages 4 and 5 feed nothing back: enough likelihood is left for a feasible schedule.
+        delays=[6] * 7 + [4] * 5,
+        search_states=np.zeros((0, 9)),
+        offset_weight=1000.0,
+    )
+    return make_design(replace(spec, **changes))

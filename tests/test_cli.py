@@ -1,0 +1,166 @@
+"""The command line as it is typed: exit codes, what goes where, refusals."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from uavctl import __version__
+from uavctl.cli.app import app, run
+
+PRESET = Path(__file__).resolve().parent.parent / "uavctl" / "presets" / "paper.toml"
+STATE = "35,-2,-20,-4"
+
+
+def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = run(arguments)
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    code, out, _ = typed(capsys, *arguments, "--json")
+    assert code == 0
+    assert out.count("\n") == 1  # one document, on a line of its own
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+def test_solve_gives_the_paper_s_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    answer = document(capsys, "solve", "--config", "paper", "--state", STATE)
+    assert {
+        "status", "cost", "cost_lower", "gap", "inputs", "states", "backoff_x", "backoff_u", "slack", "method",
+        "solve_us",
+    } <= answer.keys()  # fmt: skip
+    assert (answer["status"], answer["method"]) == ("optimal", "exact")
+    assert answer["cost"] == pytest.approx(61669.93, abs=0.01)
+    assert answer["cost_lower"] <= answer["cost"] + 1e-3
+    assert answer["inputs"][0] == pytest.approx([-7.5, 7.5], abs=1e-6)
+    assert (len(answer["states"]), len(answer["inputs"])) == (13, 12)
+    assert answer["states"][0] == [35.0, -2.0, -20.0, -4.0]
+
+
+def test_solve_shows_people_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = typed(capsys, "solve", "--config", "paper", "--state", STATE)
+    assert code == 0
+    assert "optimal" in out and "61669.93" in out and "v_e" in out
+
+
+@pytest.mark.parametrize("state", ["1,2", "1,2,3,x", "1,2,3,nan", ""])
+def test_a_state_that_is_none_is_refused(capsys: pytest.CaptureFixture[str], state: str) -> None:
+    code, out, err = typed(capsys, "solve", "--config", "paper", f"--state={state}")
+    assert (code, out) == (2, "")
+    assert "give 4 numbers" in err
+
+
+def test_design_shows_assumption_4_with_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "design", "--config", "paper")
+    assert {
+        "tau", "delays", "alpha", "gamma_x", "gamma_u", "spectral_radius", "assumptions", "library_size", "gap_max",
+        "design_id", "wall_s",
+    } <= found.keys()  # fmt: skip
+    assert (found["tau"], found["delays"], found["library_size"]) == (4, [5] * 12, 0)
+    assert found["spectral_radius"] == pytest.approx(0.9714, abs=5e-5)
+    assert [check["item"] for check in found["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
+    assert all(check["ok"] and {"value", "limit"} <= check.keys() for check in found["assumptions"])
+    assert found["assumptions"][0]["value"] == pytest.approx(1 - 0.3**5)
+    code, out, _ = typed(capsys, "design", "--config", "paper")
+    assert code == 0
+    assert "Assumption 4" in out and "0.9976" in out
+
+
+def test_bench_times_all_methods_on_the_same_states(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "bench", "--config", "paper", "--states", "2")
+    assert {
+        "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "exact_ms", "ratio_cvxpy_exact",
+    } <= found.keys()  # fmt: skip
+    assert (found["states"], found["components"], found["printed_states"]) == (2, 2, 2)
+    assert found["cost_difference"] < 1e-5
+    assert found["ratio_cvxpy_exact"] == pytest.approx(found["cvxpy_axis_ms"] / found["exact_axis_ms"])
+    assert 0 <= found["printed_optimal"] <= 2
+
+
+WRONG = {
+    "unknown key": (("horizon = 12", "horizn = 12"), "smpc.horizn", "unknown key", 'nearest valid name "horizon"'),
+    "wrong shape": (("[0.0, 0.61, 0.0, 0.0], ", ""), "plant.a", "is 3 x 4", "give 3 rows of 3 numbers"),
+    "target too near the limits": (
+        ("position_m = [0.0,", "position_m = [45.0,"), "target.position_m", "Assumption 4.3 fails", "move the target",
+    ),
+    "tau as long as the horizon": (("tau = 4", "tau = 12"), "smpc.tau", "do not fit into", "longer horizon"),
+    "tau too long for the horizon": (("tau = 4", "tau = 11"), "smpc.tau", "free steps", "smpc.horizon of at least"),
+    "unstable gain": (("[-0.058, -1.172, 0.0", "[-0.6, -1.2, 0.0"), "smpc.k_tau", "unstable", "smaller gain"),
+    "W is no covariance": (
+        ("w = [[0.6, 0.0], [0.0, 0.6]]", "w = [[0.6, 0.7], [0.7, 0.6]]"), "plant.w", "not positive semidefinite",
+        "give a covariance",
+    ),
+    "delta out of reach": (("delta_x = 0.95", "delta_x = 0.995"), "smpc.delta_x", "out of reach", "lower it"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, what: str) -> None:
+    (old, new), key, reason, todo = WRONG[what]
+    text = PRESET.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace(old, new), encoding="utf-8")
+    code, out, err = typed(capsys, "design", "--config", str(file), "--json")
+    assert (code, out) == (2, "")
+    name = key.partition(".")[2]
+    lines = enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+    line = next(number for number, content in lines if content.startswith(f"{name} ="))
+    (told,) = [each for each in err.splitlines() if f"{file}:{line}: {key}: " in each]
+    assert reason in told
+    assert todo in told.partition(reason)[2] or todo in told
+    assert "Traceback" not in err
+
+
+def test_overrides_repeat_and_their_errors_name_them(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(
+        capsys, "design", "--config", "paper", "--set", "smpc.tau=3", "--set", "schedule.delays=4",
+        "--set", "smpc.delta_x=0.9", "--set", "sets.state_lower=[-90, -20, -90, -20]",
+        "--set", "sets.state_upper=[90, 20, 90, 20]",
+    )  # fmt: skip
+    assert (found["tau"], found["delays"]) == (3, [4] * 12)
+    code, out, err = typed(capsys, "design", "--set", "link.los=0.3", "--set", "smpc.tau=0")
+    assert (code, out) == (2, "")
+    assert "--set link.los=0.3: link.los: unknown key" in err
+    assert "--set smpc.tau=0: smpc.tau: expected a whole number >= 1, got 0" in err
+
+
+@pytest.mark.parametrize(
+    "arguments", [("desgn",), ("solve",), ("design", "--confg", "paper"), ("solve", "--method", "x")]
+)
+def test_usage_errors_exit_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
+    code, out, err = typed(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err
+
+
+def test_help_tells_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = typed(capsys, "--help")
+    assert code == 0
+    assert "Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration" in " ".join(out.split())
+    for name in ("loopback", "fly", "sim", "design", "solve", "bench", "log"):
+        assert name in out
+        assert app[name].help  # the module is there, and has the function that is named
+
+
+def test_a_fresh_process_writes_one_document_and_keeps_to_one_thread() -> None:
+    # The variables only count if they are set before numpy is imported.
+    script = "import sys; from uavctl.cli import main; assert 'numpy' not in sys.modules; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", script, "design", "--config", "paper", "--json"],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["tau"] == 4
+    done = subprocess.run(
+        [sys.executable, "-m", "uavctl", "--version"], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.strip() == __version__

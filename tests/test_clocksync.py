@@ -1,0 +1,290 @@
+"""Clock: sliding minimum, round trips, jumps, wrap."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mavlink_rig import MS, SECOND, packets, read
+
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, Refusal, RoundTrips, SlidingMinimum
+
+OFFSET = 1_000_000 * SECOND  # our clock is that far ahead of the source's
+PERIOD = 40 * MS
+WRAP = 2**32
+
+
+def make(latency_ns: int = 0, window_ns: int = 10 * SECOND, tolerance_ns: int = 20 * MS) -> ClockSync:
+    return ClockSync(window_ns, latency_ns, tolerance_ns)
+
+
+class Source:
+    """A source with a clock of its own, a delay for each sample, and the truth."""
+
+    def __init__(self, clock: ClockSync, offset_ns: int = OFFSET) -> None:
+        self.clock, self.offset_ns = clock, offset_ns
+        self.true_ns = 2_000_000 * SECOND  # in our clock
+
+    def sample(self, delay_ns: int, error_ns: int = 0, **more: int) -> int | Refusal:
+        """One sample; its time of capture as mapped, relative to the truth, or the refusal."""
+        self.true_ns += PERIOD
+        stamp_ns = self.true_ns - self.offset_ns + error_ns
+        captured = self.clock.captured_ns(stamp_ns, self.true_ns + delay_ns, **more)
+        return captured if isinstance(captured, str) else captured - self.true_ns
+
+    def settle(self, delay_ns: int = 30 * MS, count: int = 30) -> None:
+        for _ in range(count):
+            assert not isinstance(self.sample(delay_ns), str)
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(-100, 100)), min_size=1, max_size=60), st.integers(1, 100))
+def test_sliding_minimum_is_that_of_the_window(steps: list[tuple[int, int]], window: int) -> None:
+    minimum = SlidingMinimum(window)
+    at, seen = 0, []
+    for step, value in steps:
+        at += step
+        seen.append((at, value))
+        assert minimum.push(at, value) == min(v for t, v in seen if t > at - window)
+        assert minimum.value is not None
+
+
+def test_minimum_mode_knows_all_but_the_smallest_delay() -> None:
+    source = Source(make())
+    source.settle(25 * MS)
+    assert source.sample(25 * MS) == 25 * MS  # as if it had no delay
+    assert source.sample(100 * MS) == 25 * MS
+    assert source.clock.offset_ns == OFFSET + 25 * MS
+    assert source.clock.source is ClockSource.MINIMUM
+
+
+def test_latency_is_the_smallest_delay_and_is_taken_off() -> None:
+    source = Source(make(latency_ns=25 * MS))
+    source.settle(25 * MS)
+    assert source.sample(100 * MS) == 0
+    assert source.clock.offset_ns == OFFSET
+
+
+def test_reordered_samples_keep_their_times() -> None:
+    clock = make()
+    base = 5_000 * SECOND
+    for n in range(30):
+        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET + 20 * MS)
+    newer, older = base + 31 * PERIOD, base + 30 * PERIOD
+    received = newer + OFFSET + 50 * MS
+    assert clock.captured_ns(newer, received) == newer + OFFSET + 20 * MS
+    assert clock.captured_ns(older, received) == older + OFFSET + 20 * MS
+
+
+def test_without_stamps_the_latency_is_all_that_is_known() -> None:
+    clock = make(latency_ns=7 * MS)
+    assert clock.captured_ns(None, 100 * SECOND) == 100 * SECOND - 7 * MS
+    assert clock.source is ClockSource.NONE
+
+
+def test_old_minima_leave_the_window() -> None:
+    source = Source(make(window_ns=2 * SECOND))
+    source.settle(20 * MS)
+    source.settle(60 * MS, count=60)  # 2.4 s
+    assert source.sample(60 * MS) == 60 * MS
+
+
+def test_a_drifting_clock_is_followed() -> None:
+    clock = make(window_ns=2 * SECOND)
+    worst = 0
+    for n in range(2000):  # 1.3 % slow, as recorded from a simulator on a busy computer
+        true_ns = 1_000 * SECOND + n * PERIOD
+        captured = clock.captured_ns(round(true_ns * 0.987), true_ns + 10 * MS)
+        assert not isinstance(captured, str)
+        worst = max(worst, abs(captured - true_ns))
+    assert worst <= 10 * MS + 2 * SECOND * 0.0131
+
+
+def test_a_stamp_from_the_future_is_refused() -> None:
+    source = Source(make())
+    source.settle(30 * MS)
+    assert source.sample(30 * MS, error_ns=21 * MS) is Refusal.FUTURE
+    assert source.sample(30 * MS, error_ns=3600 * SECOND) is Refusal.FUTURE
+    assert source.sample(30 * MS) == 30 * MS  # and changes nothing
+
+
+def test_first_samples_may_lower_the_minimum_by_more_than_the_tolerance() -> None:
+    source = Source(make())
+    assert source.sample(142 * MS) == 142 * MS
+    assert source.sample(25 * MS) == 25 * MS
+    assert source.sample(142 * MS) == 25 * MS
+
+
+def test_a_duplicate_is_refused() -> None:
+    clock = make()
+    assert clock.captured_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
+    assert clock.captured_ns(5 * SECOND, 6 * SECOND + MS) is Refusal.DUPLICATE
+
+
+@pytest.mark.parametrize("leap_ns", [-2 * SECOND, -1_500_000 * SECOND, 2 * SECOND, 4_000_000 * SECOND, 500 * MS])
+def test_a_leaping_clock_is_believed_after_five_in_a_row(leap_ns: int) -> None:
+    source = Source(make())
+    source.settle(30 * MS)
+    source.offset_ns -= leap_ns
+    got = [source.sample(30 * MS) for _ in range(8)]
+    assert all(isinstance(one, Refusal) for one in got[:4])
+    assert got[4:] == [30 * MS] * 4
+    assert source.clock.resyncs == 1
+
+
+def test_single_leaps_are_never_believed() -> None:
+    source = Source(make())
+    source.settle(30 * MS)
+    for n in range(100):
+        assert isinstance(source.sample(30 * MS, error_ns=(n + 2) * SECOND), Refusal)
+        assert source.sample(30 * MS) == 30 * MS
+    assert source.clock.resyncs == 0
+
+
+def test_garbage_stamps_that_agree_on_nothing_are_never_believed() -> None:
+    source = Source(make())
+    source.settle(30 * MS)
+    numbers = random.Random(1)
+    for _ in range(200):
+        got = source.sample(30 * MS, error_ns=numbers.choice((-1, 1)) * numbers.randrange(2, 10**6) * SECOND)
+        assert isinstance(got, Refusal)
+    assert source.sample(30 * MS) == 30 * MS
+
+
+def test_a_backlog_keeps_its_ages() -> None:
+    clock = make()
+    base = 5_000 * SECOND
+    for n in range(30):
+        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET)
+    received = base + 100 * PERIOD + OFFSET  # 2.8 s of silence, then all of it at once
+    for n in range(30, 101):
+        assert clock.captured_ns(base + n * PERIOD, received) == base + n * PERIOD + OFFSET
+    assert clock.resyncs == 0
+
+
+@pytest.mark.parametrize("start_ms", [0, 123, WRAP - 50, WRAP - 1])
+def test_the_boot_clock_wraps(start_ms: int) -> None:
+    clock = make(latency_ns=0)
+    for n in range(100):
+        received = 77 * SECOND + n * PERIOD
+        stamp = clock.unwrap((start_ms + 40 * n) % WRAP, WRAP, MS)
+        assert clock.captured_ns(stamp, received) == received
+    assert clock.resyncs == 0
+    late = clock.unwrap((start_ms + 40 * 98 + 1) % WRAP, WRAP, MS)
+    assert clock.captured_ns(late, received) == received - 39 * MS
+
+
+# --- round trips -------------------------------------------------------------------------------------
+
+
+def trip(trips: RoundTrips, at_ns: int, offset_ns: int = OFFSET, there_ns: int = 2 * MS, back_ns: int = 2 * MS) -> bool:
+    return trips.answer(at_ns, at_ns + there_ns - offset_ns, at_ns + there_ns + back_ns)
+
+
+def test_a_round_trip_gives_the_offset() -> None:
+    trips = RoundTrips(10 * SECOND)
+    assert trips.offset_ns(0) is None
+    assert trip(trips, 5 * SECOND)
+    assert trips.offset_ns(6 * SECOND) == OFFSET
+
+
+@pytest.mark.parametrize(("there_ms", "back_ms"), [(9, 0), (0, 9), (5, 5)])
+def test_asymmetry_costs_at_most_half_the_round_trip(there_ms: int, back_ms: int) -> None:
+    trips = RoundTrips(10 * SECOND)
+    assert trip(trips, 5 * SECOND, there_ns=there_ms * MS, back_ns=back_ms * MS)
+    offset = trips.offset_ns(5 * SECOND)
+    assert offset is not None
+    assert abs(offset - OFFSET) <= 4.5 * MS
+
+
+@pytest.mark.parametrize(("there_ms", "back_ms"), [(8, 3), (0, 500), (-3, 2)])
+def test_slow_or_impossible_round_trips_are_dropped(there_ms: int, back_ms: int) -> None:
+    trips = RoundTrips(10 * SECOND)
+    assert not trip(trips, 5 * SECOND, there_ns=there_ms * MS, back_ns=back_ms * MS)
+    assert trips.offset_ns(5 * SECOND) is None
+
+
+def test_a_deviating_clock_is_believed_after_five_in_a_row() -> None:
+    trips = RoundTrips(100 * SECOND)
+    trip(trips, SECOND)
+    new = OFFSET + 101 * MS
+    assert [trip(trips, n * SECOND, new) for n in range(2, 6)] == [False] * 4
+    assert trips.offset_ns(6 * SECOND) == OFFSET
+    assert trip(trips, 6 * SECOND, new)
+    assert trips.offset_ns(6 * SECOND) == new
+
+
+def test_deviations_that_are_not_in_a_row_are_never_believed() -> None:
+    trips = RoundTrips(100 * SECOND)
+    trip(trips, SECOND)
+    for n in range(2, 200):
+        in_order = n % 5 == 0
+        assert trip(trips, n * SECOND, OFFSET if in_order else OFFSET + 200 * MS) == in_order
+    assert trips.offset_ns(200 * SECOND) == OFFSET
+
+
+def test_small_changes_are_followed_slowly() -> None:
+    trips = RoundTrips(100 * SECOND)
+    trip(trips, SECOND)
+    trip(trips, 2 * SECOND, OFFSET + 8 * MS)
+    assert trips.offset_ns(2 * SECOND) == OFFSET + 2 * MS
+    for n in range(3, 60):
+        trip(trips, n * SECOND, OFFSET + 8 * MS)
+    assert trips.offset_ns(60 * SECOND) == pytest.approx(OFFSET + 8 * MS, abs=MS / 100)
+
+
+def test_an_old_answer_counts_no_more() -> None:
+    trips = RoundTrips(10 * SECOND)
+    trip(trips, SECOND)
+    assert trips.offset_ns(11 * SECOND) == OFFSET
+    assert trips.offset_ns(12 * SECOND) is None
+    trip(trips, 13 * SECOND, OFFSET + SECOND)  # and nothing deviates from it
+    assert trips.offset_ns(13 * SECOND) == OFFSET + SECOND
+
+
+def test_round_trips_show_the_whole_delay() -> None:
+    source = Source(make(latency_ns=99 * MS))  # which counts only without round trips
+    for delay_ms in (30, 80, 25, 124):
+        assert source.sample(delay_ms * MS, offset_ns=OFFSET) == 0
+    assert source.clock.source is ClockSource.TIMESYNC
+    assert source.clock.offset_ns == OFFSET
+
+
+def test_a_capture_is_never_after_its_arrival() -> None:
+    source = Source(make())
+    assert source.sample(5 * MS, offset_ns=OFFSET + 15 * MS) == 5 * MS
+
+
+@pytest.mark.parametrize("wrong_ns", [-2 * SECOND, 40 * MS, 3600 * SECOND])
+def test_round_trips_of_another_clock_are_not_used(wrong_ns: int) -> None:
+    source = Source(make())
+    assert source.sample(5 * MS, offset_ns=OFFSET + wrong_ns) == 5 * MS
+    assert source.clock.source is ClockSource.MINIMUM
+
+
+# --- recorded ------------------------------------------------------------------------------------------
+
+
+def test_recorded_camera_delays() -> None:
+    """The offset of recorded poses against the simulator's own clock, which its TIMESYNC answers tell."""
+    clock = make()
+    trips: list[tuple[int, int]] = []  # (round trip, offset)
+    delays: list[int] = []
+    received_of: list[tuple[int, int]] = []
+    for at_ns, data in packets("arducopter-vicon.tlog"):
+        (raw,) = read(data)
+        if raw.get_type() == "TIMESYNC" and raw.tc1:
+            trips.append((at_ns - raw.ts1, (at_ns + raw.ts1) // 2 - raw.tc1))
+        if raw.get_type() == "VISION_POSITION_ESTIMATE":
+            captured = clock.captured_ns(raw.usec * 1000, at_ns)
+            assert isinstance(captured, int) and not isinstance(captured, bool)
+            delays.append(at_ns - captured)
+            received_of.append((at_ns, raw.usec * 1000))
+    truth_ns = min(trips)[1] - 4467 * SECOND
+    true_delays = sorted(at_ns - stamp_ns - truth_ns for at_ns, stamp_ns in received_of)
+    assert len(delays) > 300
+    assert clock.offset_ns is not None
+    assert clock.offset_ns - truth_ns == pytest.approx(25 * MS, abs=6 * MS)  # the smallest delay
+    assert true_delays[len(delays) // 2] == pytest.approx(80 * MS, abs=8 * MS)
+    assert sorted(delays)[len(delays) // 2] == pytest.approx((80 - 25) * MS, abs=8 * MS)

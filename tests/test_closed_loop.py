@@ -1,0 +1,118 @@
+"""Closed loop over the real MAVLink bytes, in virtual time."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from loopback_rig import flight, lockstep, make_loop
+
+from logs.replay import replay
+from logs.summary import summarise
+from uavctl.config import load_config
+from uavctl.data import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SolveStatus, Truth
+
+
+@pytest.mark.parametrize("first", range(0, 20, 4))
+def test_paper_flies_200_steps_without_slack_and_replays_identically(first: int) -> None:
+    outside = 0
+    for seed in range(first, first + 4):
+        memory = lockstep("paper", 200.0, f"sim.seed={seed}")
+        summary = summarise(flight(memory), wall_s=1.0)
+        assert summary.steps == 200
+        assert summary.slack_used == 0
+        assert summary.input_violations == 0
+        assert summary.failed_solves == 0
+        assert summary.fallbacks == 0
+        outside += summary.state_violations
+        config = load_config("paper", [f"sim.seed={seed}"])
+        result = replay(memory.entries, lambda sink, config=config: make_loop(config, sink))  # type: ignore[misc]
+        assert result.identical, result.first_difference
+        assert result.decisions == 2000
+    assert outside < 0.01 * 4 * 200
+
+
+def test_paper_costs_what_the_paper_s_example_costs() -> None:
+    # 60 runs of 50 steps: 56.2e3 on average (theory, section 7). Six runs scatter by a few percent.
+    costs = [
+        summarise(flight(lockstep("paper", 50.0, f"sim.seed={seed}")), wall_s=1.0).cost for seed in range(100, 106)
+    ]
+    assert np.mean(costs) == pytest.approx(56.2e3, rel=0.08)
+
+
+def test_the_true_state_follows_the_plant_and_the_applied_inputs() -> None:
+    memory = lockstep("paper", 30.0, "plant.w=[[1e-12,0.0],[0.0,1e-12]]")
+    config = load_config("paper")
+    a, b = np.array(config.plant.a), np.array(config.plant.b)
+    truths = memory.of(Truth)
+    for now, then in itertools.pairwise(truths):
+        assert then.state == pytest.approx(a @ now.state + b @ now.input, abs=1e-4)
+    decided = {d.step: d.input for d in memory.of(Decision) if d.boundary}
+    for step, truth in enumerate(truths):
+        # float32 on the wire
+        assert decided[step] == pytest.approx(truth.input, rel=1e-6, abs=1e-6)
+
+
+def test_blackout_from_step_20_falls_back_in_the_tick_in_which_age_reaches_the_horizon() -> None:
+    memory = lockstep("paper", 40.0, "link.blackout=[[20.0, 100.0]]")
+    decisions = memory.of(Decision)
+    horizon = load_config("paper").smpc.horizon
+    fallen = next(d for d in decisions if d.mode is ControlMode.BRAKE)
+    assert fallen.boundary
+    assert fallen.age_steps == horizon
+    before = [d for d in decisions if d.tick < fallen.tick and d.age_steps is not None]
+    assert all(d.age_steps < horizon and d.mode is ControlMode.TRACK for d in before if d.age_steps is not None)
+    newest = max(e.captured_ns for e in memory.of(Estimate))
+    assert fallen.at_ns == newest + horizon * 1_000_000_000
+
+
+def test_playout_flies_the_old_plan_s_next_input_in_every_step_of_silence() -> None:
+    memory = lockstep("paper", 60.0)
+    plans = {plan.seq: plan for plan in memory.of(Plan)}
+    silent = 0
+    for decision in memory.of(Decision):
+        if not decision.boundary or decision.mode is not ControlMode.TRACK:
+            continue
+        assert decision.plan_seq is not None and decision.plan_index is not None and decision.input is not None
+        assert decision.plan_index == decision.age_steps
+        planned = plans[decision.plan_seq].inputs[decision.plan_index]
+        assert decision.input == pytest.approx(planned, abs=1e-12)
+        silent += decision.plan_index > 0
+    assert silent > 5
+
+
+def test_room_settles_at_the_target_from_the_far_corner() -> None:
+    for seed in range(3):
+        memory = lockstep("room", 40.0, f"sim.seed={seed}")
+        summary = summarise(flight(memory), wall_s=1.0)
+        assert summary.state_violations == 0
+        assert summary.input_violations == 0
+        assert summary.failed_solves == 0
+        assert summary.lost is not None and summary.lost > 30
+        assert summary.settled_error_m is not None and summary.settled_error_m < 0.25
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
+    def sent(seed: int) -> list[bytes]:
+        memory = lockstep("room", 4.0, f"sim.seed={seed}")
+        return [d.data for d in memory.of(Datagram) if d.outgoing]
+
+    assert sent(5) == sent(5)
+    assert sent(5) != sent(6)
+
+
+def test_plans_are_optimal_and_certified() -> None:
+    for plan in lockstep("room", 10.0).of(Plan):
+        assert plan.status is SolveStatus.OPTIMAL
+        assert abs(plan.gap) < 1e-6
+        assert plan.cost_lower <= plan.cost * (1 + 1e-7)
+
+
+def test_every_setpoint_is_within_the_last_gate_s_limits() -> None:
+    config = load_config("room")
+    limit = np.array(config.limits.accel_mps2)
+    setpoints = lockstep("room", 20.0, "link.loss=0.6").of(Setpoint)
+    assert len(setpoints) > 300
+    for setpoint in setpoints:
+        assert np.all(np.abs(setpoint.accel_mps2) <= limit)

@@ -1,0 +1,428 @@
+"""Faults of the link, the messages, the clock and the solver, one test a row of the table of faults.
+
+Each fault is injected, and the reaction asserted from the records of the ticks alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from flight_rig import (
+    DT_NS,
+    HORIZON,
+    MS,
+    START_NS,
+    TICK_NS,
+    TICKS,
+    StubSolver,
+    boundary_ns,
+    inputs_of,
+    make_controller,
+    one_a_step,
+    run,
+    sample,
+    small_plant,
+    stub_inputs,
+    vehicle,
+)
+
+from uavctl.data import ControlMode, PositionSample, Severity, SolveStatus, StepInput
+from uavctl.flight.step import Controller, StepOutput
+from uavctl.smpc.answer import Answer
+
+TRACK = ControlMode.TRACK
+FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
+Fault = Callable[[Answer], Answer]
+
+
+def boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
+    return [output for output in outputs if output.decision.boundary]
+
+
+def flown(outputs: list[StepOutput]) -> list[tuple[int | None, int | None]]:
+    """(plan, index) at each boundary."""
+    return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
+
+
+def codes(output: StepOutput) -> dict[str, int]:
+    return {event.code: event.count for event in output.events}
+
+
+def with_faults(faults: dict[int, Fault], axes: tuple[str, ...] = ("north",)) -> tuple[Controller, StubSolver]:
+    solver = StubSolver(small_plant(axes), faults=faults)
+    return make_controller(solver), solver
+
+
+def assert_sound(outputs: list[StepOutput], limits: tuple[float, ...] = (2.0, 2.0, 1.5), slew: float = 5.0) -> None:
+    """Every setpoint finite, bounded, slew-limited; every plan used within its horizon."""
+    before = (0.0, 0.0, 0.0)
+    for output in outputs:
+        assert output.decision.plan_index is None or 0 <= output.decision.plan_index < HORIZON
+        if output.setpoint is not None:
+            accel = output.setpoint.accel_mps2
+            assert all(math.isfinite(a) and abs(a) <= limit for a, limit in zip(accel, limits, strict=True))
+            assert max(abs(a - b) for a, b in zip(accel, before, strict=True)) <= slew + 1e-12
+            before = accel
+
+
+def test_row_1_one_loss_is_played_out_in_the_same_tick() -> None:
+    outputs = run(make_controller(), inputs_of(range(5 * TICKS), one_a_step(lost=[3])))
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
+    lost = boundaries(outputs)[3]
+    assert (lost.decision.age_steps, lost.decision.news, lost.decision.solve, lost.plan) == (1, False, None, None)
+    assert lost.decision.input == tuple(stub_inputs(2, HORIZON, 1)[1])
+    assert lost.setpoint is not None
+
+
+def test_row_2_a_burst_shorter_than_the_horizon_is_played_out() -> None:
+    burst = range(3, 3 + HORIZON - 1)
+    outputs = run(make_controller(), inputs_of(range(8 * TICKS), one_a_step(lost=burst)))
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (2, 3), (6, 0), (7, 0)]
+    assert [output.decision.age_steps for output in boundaries(outputs)] == [0, 0, 0, 1, 2, 3, 0, 0]
+    assert {output.decision.mode for output in outputs} == {TRACK}
+    for output in boundaries(outputs)[3:6]:
+        assert output.decision.input == tuple(stub_inputs(2, HORIZON, 1)[output.decision.age_steps or 0])
+
+
+def test_row_3_fallback_in_the_very_tick_in_which_the_age_reaches_the_horizon() -> None:
+    outputs = run(make_controller(), inputs_of(range(8 * TICKS), one_a_step(lost=range(3, 99))))
+    entered = (2 + HORIZON) * TICKS
+    assert all(output.decision.mode is TRACK for output in outputs[:entered])
+    assert all(output.decision.mode in FALLBACK for output in outputs[entered:])
+    assert outputs[entered].decision.age_steps == HORIZON
+    assert outputs[entered].decision.reason == "age of information 4 has reached H = 4"
+
+
+def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
+    rng = np.random.default_rng(30)
+    steps = 5000
+    arrives = rng.random(steps) < 0.6
+    outputs = run(
+        make_controller(land=False),
+        inputs_of(range(steps * TICKS), one_a_step(lost=np.flatnonzero(~arrives).tolist(), steps=steps)),
+    )
+    falls, misses, last, in_row, tracking = 0, 0, None, 0, False
+    for number in range(steps):  # the rule in a few lines: H lost in a row is the fallback, 3 in a row the way back
+        if arrives[number]:
+            last = number
+        in_row = in_row + 1 if arrives[number] else 0
+        if last is None:
+            continue
+        if tracking and number - last >= HORIZON:
+            tracking, in_row = False, 0
+            falls += 1
+        elif not tracking and (in_row >= 3 or falls == 0):
+            tracking = True
+        for output in outputs[number * TICKS : (number + 1) * TICKS]:
+            misses += (output.decision.mode is TRACK) != tracking
+            misses += not tracking and output.decision.mode not in FALLBACK
+    assert misses == 0
+    assert falls > 50
+    assert_sound(outputs)
+
+
+def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> None:
+    late = sample(boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS, position_m=(0.1, 0.0, 0.0))
+    samples = [*one_a_step(lost=[3, 4, 5]), late]
+    solver = StubSolver(small_plant())
+    outputs = run(make_controller(solver), inputs_of(range(7 * TICKS), samples))
+    assert [output.decision.age_steps for output in boundaries(outputs)] == [0, 0, 0, 1, 2, 2, 0]
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (5, 0), (6, 0)]
+    rebased = boundaries(outputs)[5]
+    assert rebased.plan is not None
+    assert rebased.estimate is not None
+    assert (rebased.plan.base_ns, rebased.plan.captured_ns) == (boundary_ns(5), boundary_ns(3) - 50 * MS)
+    assert rebased.plan.states[0] == rebased.estimate.mean  # predicted to the boundary, not as it was captured
+
+
+def test_row_5_a_packet_overtaken_by_a_newer_one_is_no_news_but_improves_the_estimate() -> None:
+    older = sample(boundary_ns(2) - 50 * MS, boundary_ns(3) + 10 * MS, position_m=(0.05, 0.0, 0.0))
+    newer = sample(boundary_ns(3) - 60 * MS, boundary_ns(3) - 55 * MS)
+    ticks = range(5 * TICKS)
+    overtaken = run(make_controller(), inputs_of(ticks, [*one_a_step(steps=2), newer, older]))
+    lost = run(make_controller(), inputs_of(ticks, [*one_a_step(steps=2), newer]))
+    assert flown(overtaken) == flown(lost) == [(0, 0), (1, 0), (1, 1), (3, 0), (3, 1)]
+    arrival = 3 * TICKS + 1
+    assert overtaken[arrival].decision.accepted == 1
+    assert overtaken[arrival].estimate != lost[arrival].estimate
+    assert [output.estimate for output in overtaken[:arrival]] == [output.estimate for output in lost[:arrival]]
+    assert [output.decision.age_steps for output in overtaken] == [output.decision.age_steps for output in lost]
+
+
+def test_row_5_a_packet_older_than_the_window_is_dropped_and_counted() -> None:
+    old = sample(boundary_ns(0) - 50 * MS, boundary_ns(12), position_m=(5.0, 0.0, 0.0))
+    plain = run(make_controller(), inputs_of(range(13 * TICKS), one_a_step()))
+    outputs = run(make_controller(), inputs_of(range(13 * TICKS), [*one_a_step(), old]))
+    last = outputs[12 * TICKS]
+    assert last.decision.rejected == 1
+    assert codes(last) == {"sample-too-old": 1}
+    assert [output.estimate for output in outputs] == [output.estimate for output in plain]
+
+
+def test_row_6_duplicates_are_dropped_and_counted() -> None:
+    samples = one_a_step()
+    twice = [*samples, *(msgspec.structs.replace(one, received_ns=one.received_ns + 40 * MS) for one in samples)]
+    plain = run(make_controller(), inputs_of(range(8 * TICKS), samples))
+    outputs = run(make_controller(), inputs_of(range(8 * TICKS), twice))
+    assert [output.setpoint for output in outputs] == [output.setpoint for output in plain]
+    assert [output.estimate for output in outputs] == [output.estimate for output in plain]
+    assert sum(output.decision.rejected for output in outputs) == 8
+    assert sum(codes(output).get("sample-duplicate", 0) for output in outputs) == 8
+
+
+def test_row_7_a_backlog_burst_is_one_solve_with_the_newest() -> None:
+    at_ns = boundary_ns(4)
+    backlog = [sample(at_ns - n * 20 * MS, at_ns) for n in range(140)]
+    np.random.default_rng(7).shuffle(backlog)
+    solver = StubSolver(small_plant())
+    outputs = run(make_controller(solver), inputs_of(range(5 * TICKS), [*one_a_step(steps=1), *backlog]))
+    burst = outputs[4 * TICKS]
+    assert [seq for seq, _ in solver.asked] == [0, 4]
+    assert burst.plan is not None
+    assert burst.plan.captured_ns == at_ns
+    assert (burst.decision.accepted, burst.decision.rejected) == (100, 40)  # window_s = 2 s holds 100 of 20 ms
+    assert codes(burst)["sample-too-old"] == 40
+    assert (burst.decision.mode, burst.decision.plan_seq) == (TRACK, 4)
+
+
+def bad(**changes: object) -> Callable[[PositionSample], PositionSample]:
+    return lambda one: msgspec.structs.replace(one, **changes)
+
+
+BAD_SAMPLES = {
+    "nan": bad(position_m=(math.nan, 0.0, 0.0)),
+    "inf": bad(position_m=(0.0, math.inf, 0.0)),
+    "minus inf": bad(position_m=(0.0, 0.0, -math.inf)),
+    "absurd": bad(position_m=(1000.1, 0.0, 0.0)),
+    "huge": bad(position_m=(1e308, 0.0, 0.0)),
+    "velocity nan": bad(velocity_mps=(0.0, math.nan, 0.0)),
+    "velocity absurd": bad(velocity_mps=(0.0, 0.0, -100.1)),
+    "std zero": bad(std_m=0.0),
+    "std negative": bad(std_m=-1.0),
+    "std nan": bad(std_m=math.nan),
+    "std inf": bad(std_m=math.inf),
+    "std huge": bad(std_m=1e200),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_SAMPLES)
+def test_row_12_a_sample_that_is_not_finite_or_absurd_counts_as_lost(fault: str) -> None:
+    spoil = BAD_SAMPLES[fault]
+    samples = [spoil(one) if number in (3, 4) else one for number, one in enumerate(one_a_step())]
+    lost = run(make_controller(), inputs_of(range(6 * TICKS), one_a_step(lost=[3, 4])))
+    outputs = run(make_controller(), inputs_of(range(6 * TICKS), samples))
+    assert [output.setpoint for output in outputs] == [output.setpoint for output in lost]
+    assert [output.estimate for output in outputs] == [output.estimate for output in lost]
+    assert [output.decision.age_steps for output in boundaries(outputs)] == [0, 0, 0, 1, 2, 0]
+    assert [output.decision.rejected for output in boundaries(outputs)] == [0, 0, 0, 1, 1, 0]
+    assert codes(boundaries(outputs)[3]) == {"sample-invalid": 1}
+
+
+def test_row_12_values_at_their_limits_count() -> None:
+    edge = sample(START_NS, position_m=(1000.0, -1000.0, 1000.0), velocity_mps=(100.0, -100.0, 0.0), std_m=1000.0)
+    output = run(make_controller(), inputs_of(range(1), [edge]))[0]
+    assert (output.decision.accepted, output.decision.rejected) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("captured_ns", "code"),
+    [
+        (boundary_ns(2) + TICK_NS + 1, "sample-future"),
+        (boundary_ns(2) + 3600 * 10**9, "sample-future"),
+        (2**32 * MS, "sample-future"),
+        (2**63 - 1, "sample-future"),
+        (2**64 + 5, "sample-future"),
+        (0, "sample-too-old"),
+        (-(2**32) * MS, "sample-too-old"),
+        (boundary_ns(2) - 2**32 * MS, "sample-too-old"),
+        (-(2**63), "sample-too-old"),
+    ],
+)
+def test_row_18_impossible_stamps_are_refused_without_an_exception(captured_ns: int, code: str) -> None:
+    odd = sample(captured_ns, boundary_ns(2))
+    plain = run(make_controller(), inputs_of(range(4 * TICKS), one_a_step()))
+    outputs = run(make_controller(), inputs_of(range(4 * TICKS), [*one_a_step(), odd]))
+    assert codes(outputs[2 * TICKS]) == {code: 1}
+    assert outputs[2 * TICKS].decision.rejected == 1
+    assert [output.setpoint for output in outputs] == [output.setpoint for output in plain]
+    assert [output.estimate for output in outputs] == [output.estimate for output in plain]
+
+
+def test_row_18_a_sample_that_arrives_after_the_tick_is_refused() -> None:
+    early = StepInput(tick=0, at_ns=START_NS, samples=(sample(START_NS, START_NS + 1),), vehicle=vehicle())
+    output = run(make_controller(), [early])[0]
+    assert codes(output) == {"sample-future": 1}
+
+
+def test_row_18_flying_across_2_to_the_32_milliseconds_changes_nothing() -> None:
+    shift = 2**32 * MS - boundary_ns(3)
+
+    def shifted(one: PositionSample) -> PositionSample:
+        return msgspec.structs.replace(one, captured_ns=one.captured_ns + shift, received_ns=one.received_ns + shift)
+
+    inputs = inputs_of(range(6 * TICKS), one_a_step(lost=[2]))
+    later = [
+        msgspec.structs.replace(inp, at_ns=inp.at_ns + shift, samples=tuple(map(shifted, inp.samples)))
+        for inp in inputs
+    ]
+    plain, wrapped = run(make_controller(), inputs), run(make_controller(), later)
+    assert flown(wrapped) == flown(plain)
+    means = [
+        (a.estimate.mean, b.estimate.mean) for a, b in zip(plain, wrapped, strict=True) if a.estimate and b.estimate
+    ]
+    assert len(means) == len(plain)
+    assert all(a == b for a, b in means)
+
+
+def test_row_21_missed_ticks_are_counted_and_there_is_one_setpoint_a_tick() -> None:
+    ticks = [tick for tick in range(6 * TICKS) if not 2 * TICKS <= tick < 4 * TICKS + 2]
+    outputs = run(make_controller(), inputs_of(ticks, one_a_step()))
+    woken = next(output for output in outputs if output.decision.tick == 4 * TICKS + 2)
+    assert woken.decision.missed_ticks == 2 * TICKS + 2
+    assert codes(woken)["missed-ticks"] == 2 * TICKS + 2
+    assert woken.decision.boundary
+    assert (woken.decision.step, woken.decision.plan_seq, woken.decision.plan_index) == (4, 4, 0)
+    assert woken.plan is not None
+    assert woken.plan.base_ns == boundary_ns(4)
+    stamps = [output.setpoint.at_ns for output in outputs if output.setpoint is not None]
+    assert stamps == [START_NS + tick * TICK_NS for tick in ticks]
+
+
+def test_row_21_oversleeping_past_the_horizon_is_the_fallback_in_the_tick_that_wakes() -> None:
+    ticks = [*range(TICKS), *range(9 * TICKS + 1, 10 * TICKS)]
+    outputs = run(make_controller(), inputs_of(ticks, one_a_step(steps=1)))
+    assert outputs[TICKS].decision.mode in FALLBACK
+    assert outputs[TICKS].decision.age_steps == 9
+
+
+def ending(status: SolveStatus) -> Fault:
+    return lambda answer: Answer.failed(answer.seq, status, answer.method)
+
+
+def raising(error: Exception) -> Fault:
+    def fail(answer: Answer) -> Answer:
+        raise error
+
+    return fail
+
+
+SOLVER_FAULTS: dict[str, tuple[Fault, SolveStatus]] = {
+    "infeasible": (ending(SolveStatus.INFEASIBLE), SolveStatus.INFEASIBLE),
+    "inaccurate": (ending(SolveStatus.INACCURATE), SolveStatus.INACCURATE),
+    "iteration limit": (ending(SolveStatus.ITERATION_LIMIT), SolveStatus.ITERATION_LIMIT),
+    "failed": (ending(SolveStatus.FAILED), SolveStatus.FAILED),
+    "overflow": (raising(OverflowError("too large")), SolveStatus.FAILED),
+    "division": (raising(ZeroDivisionError()), SolveStatus.FAILED),
+    "value": (raising(ValueError("NaN in the data")), SolveStatus.FAILED),
+    "singular": (raising(np.linalg.LinAlgError("singular matrix")), SolveStatus.FAILED),
+    "binding": (raising(RuntimeError("solver")), SolveStatus.FAILED),
+}
+
+
+@pytest.mark.parametrize("fault", SOLVER_FAULTS)
+def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_recorded(fault: str) -> None:
+    inject, status = SOLVER_FAULTS[fault]
+    controller, _ = with_faults({3: inject, 4: inject})
+    outputs = run(controller, inputs_of(range(6 * TICKS), one_a_step()))
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (5, 0)]
+    for output in boundaries(outputs)[3:5]:
+        assert (output.decision.solve, output.decision.news, output.decision.age_steps) == (status, True, 0)
+        assert output.plan is None
+        assert [(event.severity, event.code) for event in output.events] == [
+            (Severity.WARNING, f"solve-{status.value}")
+        ]
+    assert {output.decision.mode for output in outputs} == {TRACK}
+
+
+def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond() -> None:
+    inject, status = SOLVER_FAULTS["infeasible"]
+    controller, _ = with_faults(dict.fromkeys(range(3, 12), inject))
+    outputs = run(controller, inputs_of(range(14 * TICKS), one_a_step()))
+    assert flown(outputs)[2:7] == [(2, 0), (2, 1), (2, 2), (2, 3), (None, None)]
+    fallen = boundaries(outputs)[6]
+    assert (fallen.decision.age_steps, fallen.decision.solve) == (0, status)
+    assert fallen.decision.mode in FALLBACK
+    # Samples keep coming: from the third on a solve is tried at each boundary, and the first good one flies.
+    solves = [output.decision.solve for output in boundaries(outputs)[7:13]]
+    assert solves == [None, None, status, status, status, SolveStatus.OPTIMAL]
+    assert flown(outputs)[12:] == [(12, 0), (13, 0)]
+
+
+def test_row_22_a_programming_error_is_not_hidden() -> None:
+    controller, _ = with_faults({0: raising(AttributeError("a bug"))})
+    with pytest.raises(AttributeError):
+        run(controller, inputs_of(range(1), one_a_step()))
+
+
+@pytest.mark.parametrize("offset", [-1, 1, -4])
+def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
+    controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
+    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
+    late = boundaries(outputs)[3]
+    assert (late.decision.solve, late.plan) == (SolveStatus.LATE, None)
+    assert codes(late) == {"solve-late": 1}
+
+
+def spoiled(name: str, value: float) -> Fault:
+    def fault(answer: Answer) -> Answer:
+        arrays = {"inputs": answer.inputs.copy(), "states": answer.states.copy(), "reference": answer.reference.copy()}
+        arrays[name].flat[-1] = value
+        return replace(answer, inputs=arrays["inputs"], states=arrays["states"], reference=arrays["reference"])
+
+    return fault
+
+
+@pytest.mark.parametrize("name", ["inputs", "states", "reference"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, value: float) -> None:
+    controller, _ = with_faults({3: spoiled(name, value)})
+    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
+    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
+    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
+    assert_sound(outputs)
+
+
+def test_row_24_an_answer_of_the_wrong_shape_does_not_fly() -> None:
+    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=answer.inputs[1:])})
+    outputs = run(controller, inputs_of(range(4 * TICKS), one_a_step()))
+    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
+    assert flown(outputs)[3] == (2, 1)
+
+
+@pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
+def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: float, sent: float) -> None:
+    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
+    output = boundaries(run(controller, inputs_of(range(4 * TICKS), one_a_step())))[3]
+    assert output.setpoint is not None
+    assert output.setpoint.accel_mps2 == (sent, 0.0, 0.0)
+    assert output.setpoint.limited == ("clamp-north",)
+    assert output.decision.input == (sent,)
+
+
+def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> None:
+    rng = np.random.default_rng(24)
+    steps = 1500
+    pool: list[Fault] = [inject for inject, _ in SOLVER_FAULTS.values()]
+    pool += [spoiled("inputs", value) for value in (math.nan, 1e300, -40.0, 3.0)]
+    pool += [lambda answer: replace(answer, seq=answer.seq - 1)]
+    faults = {n: pool[int(rng.integers(len(pool)))] for n in range(steps) if rng.random() < 0.4}
+    samples = []
+    for number in range(steps):
+        captured_ns = boundary_ns(number) - int(rng.integers(0, DT_NS))
+        values = rng.normal(size=3) if rng.random() < 0.9 else rng.choice([math.nan, math.inf, 1e9, 999.0], size=3)
+        for _ in range(int(rng.choice([0, 1, 2], p=[0.35, 0.5, 0.15]))):
+            received_ns = captured_ns + int(rng.integers(0, 2 * DT_NS))
+            samples.append(sample(captured_ns, received_ns, (float(values[0]), float(values[1]), float(values[2]))))
+    ticks = [tick for tick in range(steps * TICKS) if rng.random() < 0.95]
+    controller = make_controller(StubSolver(small_plant(("north", "east")), faults=faults), land=False)
+    outputs = run(controller, inputs_of(ticks, samples))
+    assert_sound(outputs)
+    assert {output.decision.mode for output in outputs} >= {TRACK, ControlMode.BRAKE}
+    limited = {name for output in outputs if output.setpoint is not None for name in output.setpoint.limited}
+    assert limited >= {"clamp-north", "clamp-east"}

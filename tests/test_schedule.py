@@ -1,0 +1,124 @@
+"""Schedules: (6), (7), the counts of nested schedules, and what is refused."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from uavctl.errors import DesignError
+from uavctl.smpc.age import age_distribution
+from uavctl.smpc.schedule import Demand, fixed, greedy, nested
+
+H = 12
+
+
+def demand(tau: int = 4, horizon: int = H, p: float = 0.7, delta_x: float = 0.95, delta_u: float = 0.9) -> Demand:
+    return Demand(age_distribution(np.full(horizon, p)), horizon, tau, delta_x, delta_u)
+
+
+def test_fixed_delay_of_the_paper() -> None:
+    schedule = fixed(demand(), 5)
+    alpha = 1.0 - 0.3**5
+    np.testing.assert_allclose(schedule.alpha, [1.0] * 5 + [alpha] * 7)
+    # γ^x_t = δ_x / ∏_{r=1}^{t-1} α_r: the first stage that pays is t = 6.
+    np.testing.assert_allclose(schedule.gamma_x, [1.0] + [0.95] * 5 + [0.95 / alpha**i for i in range(7)])
+    np.testing.assert_allclose(schedule.gamma_u, [0.9] * 5 + [0.9 / alpha] * 7)
+    assert schedule.delays == (5,) * H
+
+
+def test_likelihoods_multiply_back_to_the_deltas() -> None:
+    schedule = fixed(demand(tau=3), [5] * 9 + [4] * 3)
+    np.testing.assert_allclose(schedule.gamma_u * schedule.alpha, 0.9)
+    for t in range(1, H + 1):
+        assert schedule.gamma_x[t] * np.prod(schedule.alpha[1:t]) == pytest.approx(0.95)
+
+
+def test_varying_link_enters_stage_by_stage() -> None:
+    p = np.array([0.7, 0.9, 0.8, 0.95, 0.7, 0.9, 0.99, 0.9])
+    schedule = fixed(Demand(age_distribution(p), 8, 2, 0.9, 0.9), 3)
+    # a(k+t) > 2 if the packets of t, t-1 and t-2 are all lost
+    expected = [1.0] * 3 + [1.0 - np.prod(1.0 - p[t - 3 : t]) for t in range(3, 8)]
+    np.testing.assert_allclose(schedule.alpha, expected)
+
+
+@pytest.mark.parametrize(("tau", "count", "kept"), [(4, 51, 38), (3, 117, 57)])
+def test_number_of_nested_schedules(tau: int, count: int, kept: int) -> None:
+    # 51 and 117: all nested schedules with γ < 1; γ <= 0.985 keeps 38 and 57 of them.
+    assert len(list(nested(demand(tau), 1.0))) == count
+    assert len(list(nested(demand(tau), 0.985))) == kept
+
+
+@pytest.mark.parametrize("gamma_max", [1.0, 0.985])
+def test_nested_schedules_are_those_of_a_blind_enumeration(gamma_max: float) -> None:
+    horizon, tau, q = 9, 3, 0.3
+    free = horizon - tau
+    expected = set()
+    for newest in product(*[range(-1, t) for t in range(free)]):
+        newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]
+        if any(later < earlier for earlier, later in zip(newest_all, newest_all[1:], strict=False)):
+            continue
+        alpha = [1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)]
+        if min(alpha) > 0.95 and 0.95 / np.prod(alpha) < 1.0 and 0.95 / np.prod(alpha) <= gamma_max:
+            expected.add(tuple(t - r for t, r in enumerate(newest_all)))
+    found = [schedule.delays for schedule in nested(demand(tau, horizon), gamma_max)]
+    assert set(found) == expected
+    assert len(found) == len(expected) > 1
+
+
+def test_nested_schedules_use_ever_newer_information() -> None:
+    for schedule in nested(demand(tau=3), 0.985):
+        newest = np.maximum(np.arange(H) - np.array(schedule.delays), -1)
+        assert np.all(np.diff(newest) >= 0)
+        assert schedule.delays[-3:] == (4, 4, 4)
+        assert schedule.gamma_x.max(where=np.arange(H + 1) > 0, initial=0.0) <= 0.985
+
+
+@pytest.mark.parametrize("tau", [3, 4])
+def test_greedy_is_nested_and_takes_the_newest_information_first(tau: int) -> None:
+    chosen = greedy(demand(tau), 0.985)
+    candidates = [schedule.delays for schedule in nested(demand(tau), 0.985)]
+    assert chosen.delays in candidates
+    # earliest stage first: no candidate feeds back newer information at the first stage where they differ
+    assert chosen.delays == min(candidates)
+
+
+def test_greedy_by_hand() -> None:
+    # α_3 = 0.973 for d = 3 would leave 0.973 · 0.99757^... below 0.95/0.985 = 0.9645, so stage 3 waits.
+    assert greedy(demand(4), 0.985).delays == (1, 2, 3, 4, 4, 4, 5, 5, 5, 5, 5, 5)
+
+
+def test_short_horizon_feeds_nothing_back() -> None:
+    (only,) = nested(demand(tau=4, horizon=6), 0.985)
+    assert only.alpha[:5].tolist() == [1.0] * 5
+    assert greedy(demand(tau=4, horizon=6), 0.985).delays == only.delays
+
+
+@pytest.mark.parametrize(
+    ("delays", "given", "message"),
+    [
+        ([5] * 11, demand(), r"schedule\.delays: .* is not 12 delays"),
+        ([5] * 11 + [0], demand(), r"schedule\.delays: .* at least 1 step"),
+        (0, demand(), r"schedule\.delays"),
+        ([5] * 11 + [3], demand(), r"schedule\.delays: d_11 = 3 is below 4: stage 11 is one of the last tau = 4"),
+        (4, demand(delta_x=0.995), r"smpc\.delta_x: 0\.995 is out of reach: .* stage 4 is usable .* 0\.9919"),
+        (4, demand(delta_u=0.995), r"smpc\.delta_u: 0\.995 is out of reach"),
+        (4, demand(tau=3), r"smpc\.delta_x: 0\.95 is out of reach: .* 0\.9370"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused(delays: int | list[int], given: Demand, message: str) -> None:
+    with pytest.raises(DesignError, match=message):
+        fixed(given, delays)
+
+
+def test_terminal_stages_may_be_shorter_than_tau_within_the_condition() -> None:
+    # d_t >= t - N + 1 from N = 8 on is all that is asked: 3, 3, 3, 4.
+    assert fixed(demand(delta_x=0.8, delta_u=0.8), [5] * 8 + [3, 3, 3, 4]).delays[-4:] == (3, 3, 3, 4)
+
+
+@pytest.mark.parametrize("p", [0.5, 0.3])
+def test_greedy_on_a_link_that_is_too_bad_is_refused(p: float) -> None:
+    with pytest.raises(DesignError, match=r"smpc\.delta_x: 0\.95 is out of reach"):
+        greedy(demand(p=p, tau=3), 0.985)
+    assert list(nested(demand(p=p, tau=3), 0.985)) == []

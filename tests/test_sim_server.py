@@ -1,0 +1,238 @@
+"""The same peers on real sockets of this machine, each run at most a second or two."""
+
+import multiprocessing
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from sim_rig import Client, decode
+
+from sim.server import Ready, grid_start, serve, serve_in_child
+from sim.sockets import cut_frames, open_port
+from uavctl.config import Config, load_config
+from uavctl.data import Truth
+from uavctl.errors import ConnectionSpecError
+
+S = 1_000_000_000
+HERE = ("127.0.0.1", 0)
+
+
+def config(*overrides: str) -> Config:
+    return load_config("room", ["link.loss=0", "sim.camera.rate_hz=50", "sim.camera.phase_s=0", *overrides])
+
+
+class Served:
+    """`serve` in a thread, with everything that it told."""
+
+    def __init__(self, config: Config, vehicle: str, mocap: str, *, duration_s: float | None, airborne: bool) -> None:
+        self.ready: Ready | None = None
+        self.truths: list[Truth] = []
+        self.is_ready, self.stop = threading.Event(), threading.Event()
+        self.thread = threading.Thread(
+            target=serve,
+            args=(config, vehicle, mocap),
+            kwargs={
+                "duration_s": duration_s,
+                "airborne": airborne,
+                "on_ready": self._on_ready,
+                "on_truth": self.truths.append,
+                "stop": self.stop.is_set,
+            },
+        )
+        self.thread.start()
+        assert self.is_ready.wait(5.0)
+
+    def _on_ready(self, ready: Ready) -> None:
+        self.ready = ready
+        self.is_ready.set()
+
+
+@contextmanager
+def serving(
+    config: Config, vehicle: str, mocap: str, *, duration_s: float | None = 1.0, airborne: bool = True
+) -> Iterator[Served]:
+    one = Served(config, vehicle, mocap, duration_s=duration_s, airborne=airborne)
+    try:
+        yield one
+    finally:
+        one.stop.set()
+        one.thread.join(5.0)
+    assert not one.thread.is_alive()
+
+
+def udp() -> tuple[socket.socket, str]:
+    """A bound client socket, and the URL by which the simulator sends to it."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(HERE)
+    sock.settimeout(2.0)
+    return sock, f"udpout://127.0.0.1:{sock.getsockname()[1]}"
+
+
+def listen(sock: socket.socket, until: Any, limit: int = 2000) -> list[Any]:
+    """Messages from a socket until one of them is what is waited for."""
+    got: list[Any] = []
+    for _ in range(limit):
+        data, sender = sock.recvfrom(65535)
+        for msg in decode(data):
+            msg.sender = sender
+            got.append(msg)
+            if until(msg):
+                return got
+    raise AssertionError("waited in vain")
+
+
+def is_a(kind: str) -> Any:
+    return lambda msg: msg.get_type() == kind
+
+
+def test_the_grid_is_shared_without_a_word() -> None:
+    assert grid_start(17, 5) == 20
+    assert grid_start(20, 5) == 20
+
+
+def test_udp_vehicle_and_cameras_send_to_the_client_and_obey_it() -> None:
+    vehicle, vehicle_url = udp()
+    mocap, mocap_url = udp()
+    with vehicle, mocap, serving(config(), vehicle_url, mocap_url, duration_s=None) as served:
+        client = Client()
+        assert served.ready is not None
+        assert (served.ready.vehicle, served.ready.mocap) == (vehicle_url, mocap_url)
+        assert served.ready.start_ns % (S // 5) == 0
+        beat = listen(vehicle, is_a("HEARTBEAT"))[-1]
+        assert beat.base_mode == 145
+        samples = [msg for _ in range(5) for msg in listen(mocap, is_a("VISION_POSITION_ESTIMATE"))]
+        # the cameras' clock counts from the start of the grid
+        assert [msg.usec % 20_000 for msg in samples] == [0] * 5
+        vehicle.sendto(client.timesync(77), beat.sender)
+        assert listen(vehicle, is_a("TIMESYNC"))[-1].ts1 == 77
+        moving = len(served.truths)
+        while not served.truths or served.truths[-1].input != (1.0, 0.0, 0.0):
+            vehicle.sendto(client.setpoint(1.0, 0.0, 0.0), beat.sender)
+            listen(vehicle, is_a("LOCAL_POSITION_NED"))
+        assert len(served.truths) > moving
+        assert [one.at_ns for one in served.truths] == [
+            served.ready.start_ns + k * S // 5 for k in range(len(served.truths))
+        ]
+
+
+def test_one_url_is_one_connection() -> None:
+    sock, url = udp()
+    with sock, serving(config(), url, url, duration_s=None) as served:
+        assert served.ready is not None
+        assert served.ready.vehicle == served.ready.mocap == url
+        first, second = listen(sock, is_a("HEARTBEAT")), listen(sock, is_a("VISION_POSITION_ESTIMATE"))
+        assert first[-1].sender == second[-1].sender
+
+
+def test_it_ends_with_its_duration_and_counts_the_time_from_the_grid() -> None:
+    vehicle, vehicle_url = udp()
+    mocap, mocap_url = udp()
+    with vehicle, mocap, serving(config(), vehicle_url, mocap_url, duration_s=0.5) as served:
+        served.thread.join(5.0)
+        assert not served.thread.is_alive()
+        assert [(one.at_ns - served.truths[0].at_ns) * 10 // S for one in served.truths] == [0, 2, 4]
+
+
+def test_nobody_listening_is_no_error() -> None:
+    vehicle, vehicle_url = udp()
+    mocap, mocap_url = udp()
+    vehicle.close()
+    mocap.close()
+    with serving(config(), vehicle_url, mocap_url, duration_s=0.4) as served:
+        served.thread.join(5.0)
+        assert len(served.truths) == 2
+
+
+def test_udpin_answers_whoever_speaks() -> None:
+    sock, _ = udp()
+    mocap, mocap_url = udp()
+    with sock, mocap, serving(config(), "udpin://127.0.0.1:0", mocap_url, duration_s=None) as served:
+        assert served.ready is not None
+        port = int(served.ready.vehicle.rsplit(":", 1)[1])
+        listen(mocap, is_a("VISION_POSITION_ESTIMATE"))  # time has begun
+        sock.sendto(b"garbage", ("127.0.0.1", port))
+        assert listen(sock, is_a("HEARTBEAT"))[-1].get_srcSystem() == 1
+
+
+def test_tcp_takes_a_client_a_stream_in_pieces_and_the_next_client() -> None:
+    mocap, mocap_url = udp()
+    ardupilot = config("sim.autopilot=ardupilot")
+    with mocap, serving(ardupilot, "tcpin://127.0.0.1:0", mocap_url, duration_s=None, airborne=False) as served:
+        assert served.ready is not None
+        address = ("127.0.0.1", int(served.ready.vehicle.rsplit(":", 1)[1]))
+        for ts1 in (1, 2):
+            with socket.create_connection(address, timeout=2.0) as sock:
+                stream = b"noise" + Client().timesync(ts1)
+                listen(mocap, is_a("VISION_POSITION_ESTIMATE"))
+                sock.sendall(stream[:11])
+                listen(mocap, is_a("VISION_POSITION_ESTIMATE"))
+                sock.sendall(stream[11:])
+                assert tcp_until(sock, "TIMESYNC").ts1 == ts1
+                assert tcp_until(sock, "HEARTBEAT").base_mode == 81
+
+
+def tcp_until(sock: socket.socket, kind: str) -> Any:
+    stream = bytearray()
+    for _ in range(500):
+        stream += sock.recv(4096)
+        for frame in cut_frames(stream):
+            (msg,) = decode(frame)
+            if msg.get_type() == kind:
+                return msg
+    raise AssertionError("waited in vain")
+
+
+def test_frames_are_cut_off_a_stream_whatever_the_pieces() -> None:
+    client = Client()
+    wanted = [client.timesync(1), client.setpoint(1.0, 2.0, 3.0), client.command(400, 1)]
+    stream, got = bytearray(), []
+    for byte in b"\x00\x11" + wanted[0] + b"\x22" + wanted[1] + wanted[2]:
+        stream.append(byte)
+        got += cut_frames(stream)
+    assert got == wanted
+    assert not stream
+    signed = bytearray(wanted[0])
+    signed[2] = 1
+    assert cut_frames(bytearray(bytes(signed) + bytes(13) + wanted[1])) == [bytes(signed) + bytes(13), wanted[1]]
+
+
+@pytest.mark.parametrize(
+    "url", ["serial:///dev/ttyX", "udpout://127.0.0.1", "udpout://127.0.0.1:99999", "14540", "tcpin://192.0.2.1:5760"]
+)
+def test_a_url_that_cannot_be_served_is_refused_with_what_to_do(url: str) -> None:
+    with pytest.raises(ConnectionSpecError, match=r"write udpout|choose another"):
+        open_port(url)
+
+
+def test_a_taken_port_is_refused() -> None:
+    sock, _ = udp()
+    with sock, pytest.raises(ConnectionSpecError, match="choose another port"):
+        open_port(f"udpin://127.0.0.1:{sock.getsockname()[1]}")
+
+
+def test_a_child_process_tells_through_a_pipe_and_stops_when_told() -> None:
+    vehicle, vehicle_url = udp()
+    mocap, mocap_url = udp()
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    stop = context.Event()
+    arguments = (there, stop, config(), vehicle_url, mocap_url, None, True)
+    with vehicle, mocap, here:
+        child = context.Process(target=serve_in_child, args=arguments)
+        child.start()
+        there.close()
+        assert here.poll(20.0)
+        ready = here.recv()
+        assert isinstance(ready, Ready)
+        first = here.recv()
+        assert isinstance(first, Truth)
+        assert first.at_ns == ready.start_ns
+        assert first.at_ns <= time.monotonic_ns()  # one clock for both processes
+        stop.set()
+        child.join(5.0)
+        assert child.exitcode == 0
+        child.close()

@@ -1,0 +1,151 @@
+"""What `fly` and `loopback` share: the recording's beginning and end, signals, the live line."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Protocol
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from logs.flight_data import FlightData
+from logs.journal import RecorderStatus
+from logs.reader import read
+from logs.report import write_report
+from logs.summary import FlightSummary, summarise
+from logs.topics import HEADER
+from uavctl import __version__
+from uavctl.cli.common import messages
+from uavctl.config import Config
+from uavctl.config.load import dump_config
+from uavctl.data import Header, Record
+from uavctl.loop import ControlLoop
+from uavctl.smpc.design import Design, design_record
+
+REFRESH_S = 0.25
+_LIBRARIES = ("numpy", "scipy", "clarabel", "pymavlink", "msgspec", "mcap")
+
+
+class Recording(Protocol):
+    """A recorder of either kind."""
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Record one value."""
+        ...
+
+    def close(self) -> RecorderStatus:
+        """End the recording."""
+        ...
+
+
+def recording_path(out: Path | None, name: str) -> Path:
+    """File of a new recording: in `out`, or in a folder of its own below `flights/`."""
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
+    folder = out if out is not None else Path("flights") / f"{stamp}-{name}"
+    return folder / "flight.mcap"
+
+
+def put_header(recorder: Recording, config: Config, design: Design, started_ns: int) -> None:
+    """Begin a recording with what is needed to decide alike."""
+    header = Header(
+        started_ns=started_ns,
+        started_utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        seed=config.sim.seed,
+        command=shlex.join(["uavctl", *sys.argv[1:]]),
+        config_toml=dump_config(config),
+        design_id=design.design_id,
+        design=design_record(design),
+        versions=versions(),
+        cpu=cpu(),
+    )
+    recorder.put(HEADER, started_ns, header)
+
+
+def versions() -> dict[str, str]:
+    """What decides alike must be of the same versions."""
+    found = {name: metadata.version(name) for name in _LIBRARIES}
+    return {"uavctl": __version__, "python": platform.python_version(), **found}
+
+
+def cpu() -> str:
+    """The CPU type: linear algebra kernels, and so the last bits, depend on it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary:
+    """Read the recording back, sum it up and write the page beside it.
+
+    Raises:
+        RecordingError: the recording cannot be read, or nothing was flown.
+    """
+    flight = FlightData.from_records(read(path))
+    page = path.with_suffix(".html")
+    summary = summarise(
+        flight, wall_s=wall_s, recording=str(path), report=str(page), recorder_dropped=status.dropped + status.refused
+    )
+    write_report(flight, summary, page)
+    return summary
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and SIGTERM into a question that the loop asks; a second signal ends at once."""
+    asked = threading.Event()
+
+    def ask(number: int, frame: object) -> None:
+        del frame
+        if asked.is_set():
+            raise SystemExit(128 + number)
+        asked.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def live_line(loop: ControlLoop, duration_s: float | None, tick_s: float) -> Iterator[None]:
+    """Show what the loop does while it flies, from a thread of its own, on standard error."""
+    columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
+    done = threading.Event()
+    with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
+        task = progress.add_task("waiting", total=duration_s)
+
+        def show() -> None:
+            while not done.wait(REFRESH_S):
+                decision = loop.decision
+                if decision is not None:
+                    progress.update(task, completed=decision.tick * tick_s, description=_line(loop))
+
+        thread = threading.Thread(target=show, name="live", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+
+def _line(loop: ControlLoop) -> str:
+    decision, vehicle, estimate = loop.decision, loop.vehicle, loop.estimate
+    if decision is None:
+        return "waiting"
+    mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
+    age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
+    accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
+    return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"

@@ -1,0 +1,184 @@
+"""`uavctl log`: what is in a recording, its repair, its replay, its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+from rich.table import Table
+
+from logs.flight_data import FlightData
+from logs.info import RecordingInfo
+from logs.info import info as recording_info
+from logs.reader import header, read
+from logs.recover import RecoverResult
+from logs.recover import recover as restore
+from logs.replay import ReplayResult
+from logs.replay import replay as replay_recording
+from logs.replay_tlog import ForeignReplay, replay_tlog
+from logs.report import write_report
+from logs.summary import render, summarise
+from logs.tlog import read_tlog
+from uavctl.build import build_controller, build_design
+from uavctl.cli.common import DEFAULTS, Common, messages
+from uavctl.cli.flying import cpu, versions
+from uavctl.config import Config
+from uavctl.config.load import parse
+from uavctl.data import Header, Sink
+from uavctl.errors import UsageError
+from uavctl.loop import VEHICLE, ControlLoop
+
+RECOVERED_WITH_LOSS = 3
+log_app = App(name="log", help="Recordings: info, recover, replay, report.")
+Flight = Annotated[Path, Parameter(help="the recording")]
+Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
+
+
+@log_app.command
+def info(flight: Flight, /, *, json: Json = False) -> int:
+    """Say what a recording holds: topics, rates, gaps, losses, and how it was made."""
+    found = recording_info(flight)
+    Common(json=json).show(found, lambda: _info_table(found))
+    return 0
+
+
+@log_app.command
+def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
+    """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
+    result = restore(flight, out)
+    Common(json=json).show(result, lambda: _recover_table(result))
+    return 0 if result.lossless else RECOVERED_WITH_LOSS
+
+
+@log_app.command
+def replay(
+    flight: Flight,
+    /,
+    *,
+    common: Common = DEFAULTS,
+    tolerance: Annotated[
+        float, Parameter(help="largest relative difference that counts as none; for another CPU type")
+    ] = 0.0,
+) -> int:
+    """Drive the recorded inputs through the same control loop and compare all that it decides.
+
+    A `.tlog` of somebody else's flight goes through parser, clock offset, estimator and controller of `--config`.
+    """
+    if flight.suffix == ".tlog":
+        return _replay_foreign(flight, common)
+    recorded = header(flight)
+    _warn_of_differences(recorded)
+    config = parse(recorded.config_toml, f"{flight} (configuration)").config
+    result = replay_recording(read(flight), _loop_maker(config), tolerance)
+    common.show(result, lambda: _replay_table(result))
+    return 0 if result.identical else 1
+
+
+@log_app.command
+def report(flight: Flight, /, *, out: Annotated[Path | None, Parameter(help="page to write")] = None) -> int:
+    """Write the page of a recording."""
+    page = out if out is not None else flight.with_suffix(".html")
+    data = FlightData.from_records(read(flight))
+    summary = summarise(data, wall_s=0.0, recording=str(flight), report=str(page))
+    write_report(data, summary, page)
+    Common().show(summary, lambda: render(summary))
+    return 0
+
+
+def _loop_maker(config: Config) -> Callable[[Sink], ControlLoop]:
+    controller = build_controller(config, build_design(config))
+    return lambda sink: ControlLoop(config, controller, sink, lambda: 0)
+
+
+def _replay_foreign(flight: Path, common: Common) -> int:
+    config = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load().config
+    packets = ((packet.at_ns, packet.data) for packet in read_tlog(flight) if not packet.outgoing)
+    tick_ns = round(config.daemon.tick_s * 1e9)
+    result = replay_tlog(packets, _loop_maker(config), link=VEHICLE, tick_ns=tick_ns)
+    if not result.positions:
+        raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
+    common.show(result, lambda: _foreign_table(result))
+    return 0
+
+
+def _warn_of_differences(recorded: Header) -> None:
+    """Versions and CPU type decide the last bits: say so before a difference is found."""
+    here = {**versions(), "cpu": cpu()}
+    there = {**recorded.versions, "cpu": recorded.cpu}
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
+            messages().print(
+                f"[yellow]recorded with {name} {there.get(name)}, here is {here.get(name)}: the last bits may differ"
+            )
+
+
+def _two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
+    table = Table(title=title, show_header=False, title_justify="left")
+    for name, value in rows:
+        table.add_row(name, str(value))
+    return table
+
+
+def _replay_table(result: ReplayResult) -> Table:
+    rows: list[tuple[str, object]] = [
+        ("decisions", result.decisions),
+        ("records compared", result.compared),
+        ("identical, bit for bit", "yes" if result.identical else "no"),
+    ]
+    first = result.first_difference
+    if first is not None:
+        rows += [
+            ("first difference", f"{first.topic} at {first.at_ns} ns, {first.field}"),
+            ("recorded", first.recorded),
+            ("replayed", first.replayed),
+        ]
+    return _two_columns("Replay", rows)
+
+
+def _recover_table(result: RecoverResult) -> Table:
+    return _two_columns(
+        "Recovered",
+        [
+            ("messages", result.messages),
+            ("messages lost", result.messages_lost),
+            ("bytes lost", result.lost_bytes),
+            *(("damage", text) for text in result.damage),
+        ],
+    )
+
+
+def _info_table(found: RecordingInfo) -> Table:
+    table = Table(
+        title=f"{', '.join(found.files)}: {found.duration_s:.1f} s, {found.bytes} bytes", title_justify="left"
+    )
+    for column in ("topic", "messages", "rate", "longest gap"):
+        table.add_column(column, justify="left" if column == "topic" else "right")
+    for topic in found.topics:
+        rate, gap = f"{topic.rate_hz:.1f}/s", f"{topic.longest_gap_s:.3f} s"
+        table.add_row(topic.topic, str(topic.messages), rate, gap)
+    state = "closed in order" if found.finished else "not closed: `uavctl log recover` makes a clean file"
+    caption = [state, f"{found.dropped} dropped, {found.missing} missing", *found.damage]
+    if found.origin is not None:
+        caption.append(f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})")
+    table.caption = "\n".join(caption)
+    return table
+
+
+def _foreign_table(result: ForeignReplay) -> Table:
+    ages = result.age_ms
+    rows: list[tuple[str, object]] = [
+        ("datagrams", result.datagrams),
+        ("positions", result.positions),
+        ("out of order", result.out_of_order),
+        ("accepted / refused", f"{result.accepted} / {result.rejected}"),
+        ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
+        ("solves", result.solves),
+        ("modes (ticks)", result.modes),
+        ("age at decisions (steps: times)", result.age_steps),
+    ]
+    if ages is not None:
+        spread = f"{ages.min:.0f}, {ages.p05:.0f}, {ages.p50:.0f}, {ages.p95:.0f}, {ages.max:.0f}"
+        rows.append(("capture to arrival [ms]: min, 5 %, median, 95 %, max", spread))
+    return _two_columns("Foreign recording through our controller", rows)

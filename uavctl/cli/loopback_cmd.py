@@ -1,0 +1,169 @@
+"""`uavctl loopback`: simulated vehicle, cameras, lossy channel and the controller together."""
+
+from __future__ import annotations
+
+import multiprocessing
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection as Pipe
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.progress import Progress
+
+from logs.disk import check_room
+from logs.recorder import Recorder, SyncRecorder
+from logs.summary import FlightSummary, render
+from sim.server import Ready, serve_in_child
+from sim.world import World
+from uavctl.build import build_controller, build_design
+from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
+from uavctl.clock import Ticker, monotonic_ns
+from uavctl.config import Config
+from uavctl.daemon import fly
+from uavctl.data import Outgoing, Sink, Truth
+from uavctl.errors import UavctlError
+from uavctl.flight.controller import Controller
+from uavctl.loop import ControlLoop
+from uavctl.smpc.design import Design
+from uavctl.transport import open_connection
+
+START_LIMIT_S = 20.0
+TRUTH = "/sim/truth"
+
+
+def loopback(
+    *,
+    common: Common = DEFAULTS,
+    udp: Annotated[bool, Parameter(negative=(), help="real UDP sockets and real time, else lockstep")] = False,
+    duration: Annotated[float | None, Parameter(help="length of the flight [s]; else duration_s")] = None,
+    seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed")] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+) -> int:
+    """Fly the simulated vehicle over a lossy link, record it, and report.
+
+    In virtual time the same seed gives the same flight, bit for bit.
+    """
+    given = {"duration_s": duration, "sim.seed": seed}
+    overrides = [f"{key}={value}" for key, value in given.items() if value is not None]
+    loaded = common.with_overrides(overrides).load()
+    config = _on_loopback(loaded.config) if udp else loaded.config
+    with located(loaded):
+        design = build_design(config)
+        controller = build_controller(config, design)
+    path = recording_path(out, config.name)
+    check_room(path, config.log.free_bytes)
+    summary = (_real_time if udp else _lockstep)(config, controller, design, path)
+    common.show(summary, lambda: render(summary))
+    return 0 if summary.steps and not summary.recorder_dropped else 1
+
+
+class _Timed:
+    """A loop in virtual time: nothing is ever late, and the time in the core is recorded."""
+
+    def __init__(self, loop: ControlLoop) -> None:
+        self._loop = loop
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+        self._loop.receive(link, data, at_ns)
+
+    def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
+        outgoing = self._loop.tick(tick, at_ns)
+        self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
+        return outgoing
+
+
+def _lockstep(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
+    recorder = SyncRecorder(path, config.log.chunk_bytes, config.log.queue)
+    put_header(recorder, config, design, started_ns=0)
+    loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+    with Progress(console=messages(), transient=True) as progress:
+        task = progress.add_task("flying in virtual time", total=config.duration_s)
+        world = World(
+            config,
+            _Timed(loop),
+            on_truth=lambda truth: recorder.put(TRUTH, truth.at_ns, truth),
+            on_progress=lambda flown_s: progress.update(task, completed=flown_s),
+        )
+        begun = time.perf_counter()
+        world.run(config.duration_s)
+        wall_s = time.perf_counter() - begun
+    return conclude(path, wall_s, recorder.close())
+
+
+def _real_time(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
+    recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
+    put_header(recorder, config, design, monotonic_ns())
+    loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+    urls = {"vehicle": config.daemon.vehicle, "mocap": config.daemon.mocap}
+    connections = {name: open_connection(url) for name, url in urls.items()}
+    tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
+    begun = time.perf_counter()
+    try:
+        with (
+            _simulator(config, recorder),
+            stop_on_signals() as stopped,
+            live_line(loop, config.duration_s, config.daemon.tick_s),
+        ):
+            fly(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=config.duration_s, stop_limit_s=0.0)
+    finally:
+        for connection in connections.values():
+            connection.close()
+        status = recorder.close()
+    return conclude(path, time.perf_counter() - begun, status)
+
+
+def _on_loopback(config: Config) -> Config:
+    """The same configuration with connections on free ports of this machine."""
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
+        one.bind(("127.0.0.1", 0))
+        other.bind(("127.0.0.1", 0))
+        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (one, other))
+    return msgspec.structs.replace(config, daemon=msgspec.structs.replace(config.daemon, vehicle=vehicle, mocap=mocap))
+
+
+@contextmanager
+def _simulator(config: Config, sink: Sink) -> Iterator[None]:
+    """The simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
+
+    Raises:
+        UavctlError: they do not start.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    stop = context.Event()
+    urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
+    child = context.Process(target=serve_in_child, args=(theirs, stop, config, *urls, None, True), name="simulator")
+    child.start()
+    theirs.close()
+    listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)
+    try:
+        if not ours.poll(START_LIMIT_S) or not isinstance(ours.recv(), Ready):
+            raise UavctlError(f"the simulator did not start within {START_LIMIT_S:g} s; see the messages above")
+        listener.start()
+        yield
+    finally:
+        stop.set()
+        child.join(START_LIMIT_S)
+        if child.is_alive():
+            child.kill()
+        if listener.ident is not None:
+            listener.join(START_LIMIT_S)
+        ours.close()
+
+
+def _listen(pipe: Pipe, sink: Sink) -> None:
+    """Hand the simulator's truth on until it hangs up."""
+    try:
+        while True:
+            told = pipe.recv()
+            if isinstance(told, Truth):
+                sink.put(TRUTH, told.at_ns, told)
+    except EOFError:
+        return

@@ -1,0 +1,119 @@
+"""`uavctl solve`: one decision."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from cyclopts import Parameter
+from numpy.typing import NDArray
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from uavctl.build import build_design, build_solver
+from uavctl.cli.common import DEFAULTS, Common, located
+from uavctl.config import Config
+from uavctl.data import SolveStatus
+from uavctl.errors import UsageError
+from uavctl.smpc.answer import Answer
+from uavctl.smpc.design import Design
+
+
+def solve(
+    *,
+    state: Annotated[
+        str, Parameter(allow_leading_hyphen=True, help="state now, axis by axis, as in 35,-2,-20,-4", metavar="X,V,...")
+    ],
+    method: Annotated[Literal["printed", "exact"] | None, Parameter(help="overrides solver.method")] = None,
+    common: Common = DEFAULTS,
+) -> int:
+    """Solve one decision problem, towards the configured target."""
+    loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
+    with located(loaded):
+        design = build_design(loaded.config)
+        solver = build_solver(design, loaded.config)
+    x = parse_state(state, design.plant.n_x)
+    start = time.perf_counter()
+    answer = solver.solve(0, x, design.target)
+    solve_us = (time.perf_counter() - start) * 1e6
+    common.show(solve_document(answer, solve_us), lambda: solve_picture(answer, design, loaded.config, solve_us))
+    return 0 if answer.status is SolveStatus.OPTIMAL else 1
+
+
+def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
+    """The state (n_x,) that a person typed.
+
+    Raises:
+        UsageError: It is not n_x finite numbers.
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n_x or not all(map(math.isfinite, numbers)):
+        raise UsageError(f"--state {text}: is not a state of this plant; give {n_x} numbers, joined by commas")
+    return np.array(numbers)
+
+
+def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
+    """The answer, for --json; what is infinite (no plan) is null."""
+    return {
+        "status": answer.status.value,
+        "cost": answer.cost,
+        "cost_lower": answer.cost_lower,
+        "gap": answer.gap,
+        "inputs": answer.inputs.tolist(),
+        "states": answer.states.tolist(),
+        "backoff_x": answer.backoff_x.tolist(),
+        "backoff_u": answer.backoff_u.tolist(),
+        "slack": answer.slack,
+        "offset": answer.offset,
+        "terminal_miss": answer.terminal_miss,
+        "reference": answer.reference.tolist(),
+        "method": answer.method,
+        "iterations": answer.iterations,
+        "solve_us": solve_us,
+    }
+
+
+def solve_picture(answer: Answer, design: Design, config: Config, solve_us: float) -> RenderableType:
+    """The plan as a table, stage by stage, with its largest back-offs."""
+    head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
+    if not answer.inputs.size:
+        return f"{head}; no plan"
+    facts = (
+        f"cost {answer.cost:.2f} (at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}), "
+        f"slack {answer.slack:.3g}, offset {answer.offset:.3g}"
+    )
+    plan = Table(
+        title="Plan: predicted means and inputs; largest back-off of a limit in the stage", title_justify="left"
+    )
+    names = state_names(design.plant.n_x, design.plant.axes)
+    for heading in ("t", *names, *(f"u_{axis[0]}" for axis in design.plant.axes), "back-off x", "back-off u"):
+        plan.add_column(heading, justify="right")
+    for t, state in enumerate(answer.states):
+        inputs, of_inputs = (answer.inputs[t], answer.backoff_u[t]) if t < design.horizon else ([], [])
+        blank = [""] * (design.plant.n_u - len(inputs))
+        plan.add_row(
+            str(t), *_figures(state), *_figures(inputs), *blank, _largest(answer.backoff_x[t]), _largest(of_inputs)
+        )
+    return Group(head, facts, "Predicted means, inputs, and the largest back-off from a limit, stage by stage:", plan)
+
+
+def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
+    """Names of the states, axis by axis: position, velocity, acceleration; plain numbers for other plants."""
+    each, rest = divmod(n_x, len(axes))
+    if rest or each > len("pva"):
+        return [f"x{i}" for i in range(n_x)]
+    return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:each]]
+
+
+def _figures(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
+    return [f"{value:.3f}" for value in values]
+
+
+def _largest(values: Sequence[float] | NDArray[np.float64]) -> str:
+    return f"{max(values):.3f}" if len(values) else ""

@@ -1,0 +1,163 @@
+"""Problem (19) as printed, in CVXPY: the reference that every faster form is measured against.
+
+Nothing is reduced here: the terminal condition is the full matrix inequality Σ_ξ - Ξ_H ⪰ 0, the gains are matrices,
+and the covariances come from the recursion (1). The target takes the place of the origin.
+
+(19c) has no interior, and an interior-point method shows it. On the paper's example (τ = 4, Clarabel 0.11) one axis
+ends INACCURATE, yet within 1e-6 of the optimum; the joint problem of both axes ends INACCURATE as well, 6e-7 off after
+several times as long, or fails. The status says so, and INACCURATE answers do not fly: this is the oracle and the
+yardstick, not a flight solver.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import cvxpy as cp
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import SolveStatus
+from uavctl.smpc.answer import Answer
+from uavctl.smpc.assemble import PartAnswer, assemble, inside
+from uavctl.smpc.components import Component, decompose, whole
+from uavctl.smpc.design import Design
+
+Array = NDArray[np.float64]
+
+METHOD = "printed"
+
+_STATUS = {
+    cp.OPTIMAL: SolveStatus.OPTIMAL,
+    cp.OPTIMAL_INACCURATE: SolveStatus.INACCURATE,
+    cp.INFEASIBLE: SolveStatus.INFEASIBLE,
+    cp.INFEASIBLE_INACCURATE: SolveStatus.INFEASIBLE,
+    cp.USER_LIMIT: SolveStatus.ITERATION_LIMIT,
+}
+
+
+class PrintedProblem:
+    """(19) for one component, compiled once with the state as a parameter."""
+
+    def __init__(self, design: Design, component: Component) -> None:
+        """Write the problem down for `component`; `whole(design)` makes it the joint problem."""
+        self.component, self._design = component, design
+        part, H, tau = component, design.horizon, design.terminal.tau
+        n_x, n_u = part.b.shape
+        n_w = part.e.shape[1]
+        root_w = _root(part.w)
+        self._x = cp.Parameter(n_x)
+        self._x_s = cp.Parameter(n_x)
+        self._u_s = cp.Parameter(n_u)
+
+        # (8): u_t = V_t x(k) + Σ_r M_{t,r} w(k+r), r <= t - d_t. x(k) is known, so V_t x(k) is a free vector v_t.
+        self._v = cp.Variable((H, n_u))
+        self._m = {
+            (t, r): cp.Variable((n_u, n_w)) for t in range(H) for r in range(max(0, t - design.schedule.delays[t] + 1))
+        }
+
+        # (1): means, and the matrices of all disturbances' effects, x_t - x̄_t = G_t w, u_t - v_t = M_t w.
+        mean = [self._x]
+        effect: list[cp.Expression] = [cp.Constant(np.zeros((n_x, H * n_w)))]
+        self._gain: list[cp.Expression] = []
+        for t in range(H):
+            blocks = [self._m.get((t, r), np.zeros((n_u, n_w))) for r in range(H)]
+            self._gain.append(cp.hstack(blocks) @ np.kron(np.eye(H), root_w))
+            enter = np.zeros((n_x, H * n_w))
+            enter[:, t * n_w : (t + 1) * n_w] = part.e @ root_w
+            mean.append(part.a @ mean[-1] + part.b @ self._v[t])
+            effect.append(part.a @ effect[-1] + part.b @ self._gain[-1] + enter)
+        self._effect = effect
+
+        # (18), (3): expectations are squares of means and traces of covariances.
+        r_x, r_u, r_xi = _root(part.q_x), _root(part.q_u), _root(part.p_xi)
+        xi_mean = cp.hstack([mean[t] - self._x_s for t in range(H - tau, H + 1)])
+        xi_effect = cp.vstack(effect[H - tau :])
+        cost = cp.sum_squares(r_xi @ xi_mean) + cp.sum_squares(r_xi @ xi_effect)
+        for t in range(H):
+            cost += cp.sum_squares(r_x @ (mean[t] - self._x_s)) + cp.sum_squares(r_x @ effect[t])
+            cost += cp.sum_squares(r_u @ (self._v[t] - self._u_s)) + cp.sum_squares(r_u @ self._gain[t])
+
+        # (9a), (9b): the confidence ellipsoid lies in the polytope.
+        constraints: list[cp.Constraint] = []
+        for t in range(1, H + 1):
+            for c, b in zip(part.c_x, part.b_x, strict=True):
+                constraints.append(c @ mean[t] + design.kappa_x[t] * cp.norm(c @ effect[t]) <= b)
+        for t in range(H):
+            for c, b in zip(part.c_u, part.b_u, strict=True):
+                constraints.append(c @ self._v[t] + design.kappa_u[t] * cp.norm(c @ self._gain[t]) <= b)
+
+        # (19c): ξ̄_H = 0 (here: at rest in the target), Σ_ξ - Ξ_H ⪰ 0 by its Schur complement.
+        constraints.append(xi_mean == 0)
+        constraints.append(cp.bmat([[part.sigma_xi, xi_effect], [xi_effect.T, np.eye(H * n_w)]]) >> 0)
+        self._problem = cp.Problem(cp.Minimize(cost), constraints)
+
+    def solve(self, x: Array, target: Array) -> PartAnswer:
+        """Solve for the whole plant's state (n_x,) and target (n_x,)."""
+        part, design = self.component, self._design
+        self._x.value, self._x_s.value = x[part.states], target[part.states]
+        self._u_s.value = part.u_eq @ self._x_s.value[part.positions]
+        status, cost, iterations = self._run()
+        if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
+            empty = np.zeros((0, 0))
+            return PartAnswer(
+                status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf
+            )
+        inputs, kept = inside(self._v.value, part.c_u, part.b_u)
+        effect = np.array([part.c_x @ g.value for g in self._effect])
+        gain = np.array([part.c_u @ m.value for m in self._gain])
+        return PartAnswer(
+            status=status if kept else SolveStatus.INACCURATE,
+            iterations=iterations,
+            inputs=inputs,
+            backoff_x=design.kappa_x[:, None] * np.linalg.norm(effect, axis=2),
+            backoff_u=design.kappa_u[:, None] * np.linalg.norm(gain, axis=2),
+            reference=self._x_s.value,
+            slack=0.0,
+            offset=0.0,
+            terminal_miss=0.0,
+            cost=cost,
+            cost_lower=cost,
+        )
+
+    def _run(self) -> tuple[SolveStatus, float, int]:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate")  # the status says so
+            try:
+                self._problem.solve(solver=cp.CLARABEL, max_iter=self._design.max_iterations, max_threads=1)
+            except cp.SolverError:
+                return SolveStatus.FAILED, np.inf, 0
+        status = _STATUS.get(self._problem.status, SolveStatus.FAILED)
+        iterations = self._problem.solver_stats.num_iters or 0
+        return status, float(self._problem.value), int(iterations)
+
+
+class PrintedSolver:
+    """Solves (19) as printed: hard constraints, the mean ends in the target.
+
+    CVXPY returns no dual objective, so `cost_lower` repeats the cost: the gap is unknown, not zero.
+    """
+
+    def __init__(self, design: Design, *, joint: bool = False) -> None:
+        """Compile the problem of every component, or one joint problem.
+
+        Raises:
+            DesignError: The design cannot be decomposed.
+        """
+        self._design = design
+        components = (whole(design),) if joint else decompose(design)
+        self._problems = tuple(PrintedProblem(design, component) for component in components)
+
+    def solve(self, seq: int, x: Array, target: Array) -> Answer:
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers."""
+        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(target))):
+            return Answer.failed(seq, SolveStatus.FAILED, METHOD)
+        parts = [(problem.component, problem.solve(x, target)) for problem in self._problems]
+        return assemble(self._design, seq, METHOD, x, parts)
+
+
+def _root(matrix: Array) -> Array:
+    """Symmetric root of a positive semi-definite matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root
