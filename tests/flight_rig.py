@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -18,6 +19,7 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
+Fault = Callable[[Answer], Answer]
 
 MS = 1_000_000
 DT_NS = 200 * MS
@@ -94,7 +96,7 @@ class StubSolver:
 
     plant: Plant
     horizon: int = HORIZON
-    faults: Mapping[int, Callable[[Answer], Answer]] = field(default_factory=dict)
+    faults: Mapping[int, Fault] = field(default_factory=dict)
     asked: list[tuple[int, Array]] = field(default_factory=list)
 
     def solve(self, seq: int, x: Array, target: Array) -> Answer:
@@ -199,3 +201,33 @@ def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState
         state, output = step(state, inp, controller)
         outputs.append(output)
     return outputs
+
+
+def boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
+    return [output for output in outputs if output.decision.boundary]
+
+
+def flown(outputs: list[StepOutput]) -> list[tuple[int | None, int | None]]:
+    """(plan, index) at each boundary."""
+    return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
+
+
+def codes(output: StepOutput) -> dict[str, int]:
+    return {event.code: event.count for event in output.events}
+
+
+def with_faults(faults: Mapping[int, Fault], axes: tuple[str, ...] = ("north",)) -> tuple[Controller, StubSolver]:
+    solver = StubSolver(small_plant(axes), faults=faults)
+    return make_controller(solver), solver
+
+
+def assert_sound(outputs: list[StepOutput], limits: tuple[float, ...] = (2.0, 2.0, 1.5), slew: float = 5.0) -> None:
+    """Every setpoint finite, bounded, slew-limited; every plan used within its horizon."""
+    before = (0.0, 0.0, 0.0)
+    for output in outputs:
+        assert output.decision.plan_index is None or 0 <= output.decision.plan_index < HORIZON
+        if output.setpoint is not None:
+            accel = output.setpoint.accel_mps2
+            assert all(math.isfinite(a) and abs(a) <= limit for a, limit in zip(accel, limits, strict=True))
+            assert max(abs(a - b) for a, b in zip(accel, before, strict=True)) <= slew + 1e-12
+            before = accel

@@ -79,7 +79,7 @@ def paper(**changes: Any) -> Design:
 def coupled() -> Design:
     """Two axes that drag at one another, with a short horizon and a good link."""
     return paper(
-        plant=paper_plant(coupling=0.05),
+        plant=paper_plant(coupling=0.1),
         horizon=5,
         tau=1,
         delays=2,

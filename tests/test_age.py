@@ -76,7 +76,7 @@ def test_information_probability() -> None:
     # w(k+r) is known at t if x(k+r+1) is: P(a <= t - r - 1) = 1 - q^(t-r)
     for t in range(1, 12):
         for r in range(t):
-            assert information_probability(mu, t, r) == pytest.approx(1.0 - 0.3 ** (t - r) if r else 1.0 - 0.3**t)
+            assert information_probability(mu, t, r) == pytest.approx(1.0 - 0.3 ** (t - r))
         assert information_probability(mu, t, t) == 0.0
 
 

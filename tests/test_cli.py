@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -152,13 +153,17 @@ def test_help_tells_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_a_fresh_process_writes_one_document_and_keeps_to_one_thread() -> None:
-    # The variables only count if they are set before numpy is imported.
-    script = "import sys; from uavctl.cli import main; assert 'numpy' not in sys.modules; main()"
+    # The variable only counts if it is set before numpy is imported.
+    script = (
+        "import atexit, os, sys; from uavctl.cli import main; assert 'numpy' not in sys.modules;"
+        "atexit.register(lambda: sys.stderr.write(os.environ['OMP_NUM_THREADS'])); main()"
+    )
     done = subprocess.run(
         [sys.executable, "-c", script, "design", "--config", "paper", "--json"],
+        env={name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"},
         capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, done.stderr) == (0, "1")
     assert json.loads(done.stdout)["tau"] == 4
     done = subprocess.run(
         [sys.executable, "-m", "uavctl", "--version"], capture_output=True, text=True, check=False, timeout=60

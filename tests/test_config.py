@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
@@ -216,6 +216,7 @@ _LEAVES = st.one_of(st.integers(), st.booleans(), st.text(max_size=5), st.floats
 _VALUES = st.recursive(_LEAVES, lambda inner: st.lists(inner, max_size=3), max_leaves=6)
 
 
+@settings(deadline=None)
 @given(st.dictionaries(st.sampled_from("abc"), st.dictionaries(st.sampled_from("xyz"), _VALUES, min_size=1)))
 def test_index_agrees_with_a_document_written_line_by_line(document: dict[str, dict[str, object]]) -> None:
     written, wanted = [], {}

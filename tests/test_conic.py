@@ -210,12 +210,12 @@ def test_plan_depends_on_the_difference_to_the_target_only() -> None:
     solver = ConicSolver(paper(state_set=wide))
     move = np.array([5000.0, 0.0, -3000.0, 0.0])
     here, there = solver.solve(0, START, ORIGIN), solver.solve(0, START + move, ORIGIN + move)
-    assert there.inputs == pytest.approx(here.inputs, abs=1e-5)
+    assert there.inputs == pytest.approx(here.inputs, abs=1e-3)
     assert there.cost == pytest.approx(here.cost, rel=1e-8)
 
 
 def test_start_outside_the_limits_uses_slack_and_says_so(paper_solver: ConicSolver) -> None:
-    answer = paper_solver.solve(0, np.array([0.0, 7.5, 0.0, 0.0]), ORIGIN)
+    answer = paper_solver.solve(0, np.array([0.0, 14.0, 0.0, 0.0]), ORIGIN)
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.slack > 0.1
     worst = np.max(answer.states[1:, 1] + answer.backoff_x[1:, 2] - 7.0)

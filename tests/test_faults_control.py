@@ -1,4 +1,4 @@
-"""Faults of the link, the messages, the clock and the solver, one test a row of the table of faults.
+"""Faults of the link, the messages and the clock, one test a row of the table of faults.
 
 Each fault is injected, and the reaction asserted from the records of the ticks alone.
 """
@@ -7,20 +7,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 from flight_rig import (
-    DT_NS,
     HORIZON,
     MS,
     START_NS,
     TICK_NS,
     TICKS,
     StubSolver,
+    assert_sound,
+    boundaries,
     boundary_ns,
+    codes,
+    flown,
     inputs_of,
     make_controller,
     one_a_step,
@@ -31,43 +33,10 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, PositionSample, Severity, SolveStatus, StepInput
-from uavctl.flight.step import Controller, StepOutput
-from uavctl.smpc.answer import Answer
+from uavctl.data import ControlMode, PositionSample, StepInput
 
 TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
-Fault = Callable[[Answer], Answer]
-
-
-def boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
-    return [output for output in outputs if output.decision.boundary]
-
-
-def flown(outputs: list[StepOutput]) -> list[tuple[int | None, int | None]]:
-    """(plan, index) at each boundary."""
-    return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
-
-
-def codes(output: StepOutput) -> dict[str, int]:
-    return {event.code: event.count for event in output.events}
-
-
-def with_faults(faults: dict[int, Fault], axes: tuple[str, ...] = ("north",)) -> tuple[Controller, StubSolver]:
-    solver = StubSolver(small_plant(axes), faults=faults)
-    return make_controller(solver), solver
-
-
-def assert_sound(outputs: list[StepOutput], limits: tuple[float, ...] = (2.0, 2.0, 1.5), slew: float = 5.0) -> None:
-    """Every setpoint finite, bounded, slew-limited; every plan used within its horizon."""
-    before = (0.0, 0.0, 0.0)
-    for output in outputs:
-        assert output.decision.plan_index is None or 0 <= output.decision.plan_index < HORIZON
-        if output.setpoint is not None:
-            accel = output.setpoint.accel_mps2
-            assert all(math.isfinite(a) and abs(a) <= limit for a, limit in zip(accel, limits, strict=True))
-            assert max(abs(a - b) for a, b in zip(accel, before, strict=True)) <= slew + 1e-12
-            before = accel
 
 
 def test_row_1_one_loss_is_played_out_in_the_same_tick() -> None:
@@ -298,131 +267,3 @@ def test_row_21_oversleeping_past_the_horizon_is_the_fallback_in_the_tick_that_w
     outputs = run(make_controller(), inputs_of(ticks, one_a_step(steps=1)))
     assert outputs[TICKS].decision.mode in FALLBACK
     assert outputs[TICKS].decision.age_steps == 9
-
-
-def ending(status: SolveStatus) -> Fault:
-    return lambda answer: Answer.failed(answer.seq, status, answer.method)
-
-
-def raising(error: Exception) -> Fault:
-    def fail(answer: Answer) -> Answer:
-        raise error
-
-    return fail
-
-
-SOLVER_FAULTS: dict[str, tuple[Fault, SolveStatus]] = {
-    "infeasible": (ending(SolveStatus.INFEASIBLE), SolveStatus.INFEASIBLE),
-    "inaccurate": (ending(SolveStatus.INACCURATE), SolveStatus.INACCURATE),
-    "iteration limit": (ending(SolveStatus.ITERATION_LIMIT), SolveStatus.ITERATION_LIMIT),
-    "failed": (ending(SolveStatus.FAILED), SolveStatus.FAILED),
-    "overflow": (raising(OverflowError("too large")), SolveStatus.FAILED),
-    "division": (raising(ZeroDivisionError()), SolveStatus.FAILED),
-    "value": (raising(ValueError("NaN in the data")), SolveStatus.FAILED),
-    "singular": (raising(np.linalg.LinAlgError("singular matrix")), SolveStatus.FAILED),
-    "binding": (raising(RuntimeError("solver")), SolveStatus.FAILED),
-}
-
-
-@pytest.mark.parametrize("fault", SOLVER_FAULTS)
-def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_recorded(fault: str) -> None:
-    inject, status = SOLVER_FAULTS[fault]
-    controller, _ = with_faults({3: inject, 4: inject})
-    outputs = run(controller, inputs_of(range(6 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (5, 0)]
-    for output in boundaries(outputs)[3:5]:
-        assert (output.decision.solve, output.decision.news, output.decision.age_steps) == (status, True, 0)
-        assert output.plan is None
-        assert [(event.severity, event.code) for event in output.events] == [
-            (Severity.WARNING, f"solve-{status.value}")
-        ]
-    assert {output.decision.mode for output in outputs} == {TRACK}
-
-
-def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond() -> None:
-    inject, status = SOLVER_FAULTS["infeasible"]
-    controller, _ = with_faults(dict.fromkeys(range(3, 12), inject))
-    outputs = run(controller, inputs_of(range(14 * TICKS), one_a_step()))
-    assert flown(outputs)[2:7] == [(2, 0), (2, 1), (2, 2), (2, 3), (None, None)]
-    fallen = boundaries(outputs)[6]
-    assert (fallen.decision.age_steps, fallen.decision.solve) == (0, status)
-    assert fallen.decision.mode in FALLBACK
-    # Samples keep coming: from the third on a solve is tried at each boundary, and the first good one flies.
-    solves = [output.decision.solve for output in boundaries(outputs)[7:13]]
-    assert solves == [None, None, status, status, status, SolveStatus.OPTIMAL]
-    assert flown(outputs)[12:] == [(12, 0), (13, 0)]
-
-
-def test_row_22_a_programming_error_is_not_hidden() -> None:
-    controller, _ = with_faults({0: raising(AttributeError("a bug"))})
-    with pytest.raises(AttributeError):
-        run(controller, inputs_of(range(1), one_a_step()))
-
-
-@pytest.mark.parametrize("offset", [-1, 1, -4])
-def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
-    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
-    late = boundaries(outputs)[3]
-    assert (late.decision.solve, late.plan) == (SolveStatus.LATE, None)
-    assert codes(late) == {"solve-late": 1}
-
-
-def spoiled(name: str, value: float) -> Fault:
-    def fault(answer: Answer) -> Answer:
-        arrays = {"inputs": answer.inputs.copy(), "states": answer.states.copy(), "reference": answer.reference.copy()}
-        arrays[name].flat[-1] = value
-        return replace(answer, inputs=arrays["inputs"], states=arrays["states"], reference=arrays["reference"])
-
-    return fault
-
-
-@pytest.mark.parametrize("name", ["inputs", "states", "reference"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, value: float) -> None:
-    controller, _ = with_faults({3: spoiled(name, value)})
-    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
-    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
-    assert_sound(outputs)
-
-
-def test_row_24_an_answer_of_the_wrong_shape_does_not_fly() -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=answer.inputs[1:])})
-    outputs = run(controller, inputs_of(range(4 * TICKS), one_a_step()))
-    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
-    assert flown(outputs)[3] == (2, 1)
-
-
-@pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
-def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: float, sent: float) -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
-    output = boundaries(run(controller, inputs_of(range(4 * TICKS), one_a_step())))[3]
-    assert output.setpoint is not None
-    assert output.setpoint.accel_mps2 == (sent, 0.0, 0.0)
-    assert output.setpoint.limited == ("clamp-north",)
-    assert output.decision.input == (sent,)
-
-
-def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> None:
-    rng = np.random.default_rng(24)
-    steps = 1500
-    pool: list[Fault] = [inject for inject, _ in SOLVER_FAULTS.values()]
-    pool += [spoiled("inputs", value) for value in (math.nan, 1e300, -40.0, 3.0)]
-    pool += [lambda answer: replace(answer, seq=answer.seq - 1)]
-    faults = {n: pool[int(rng.integers(len(pool)))] for n in range(steps) if rng.random() < 0.4}
-    samples = []
-    for number in range(steps):
-        captured_ns = boundary_ns(number) - int(rng.integers(0, DT_NS))
-        values = rng.normal(size=3) if rng.random() < 0.9 else rng.choice([math.nan, math.inf, 1e9, 999.0], size=3)
-        for _ in range(int(rng.choice([0, 1, 2], p=[0.35, 0.5, 0.15]))):
-            received_ns = captured_ns + int(rng.integers(0, 2 * DT_NS))
-            samples.append(sample(captured_ns, received_ns, (float(values[0]), float(values[1]), float(values[2]))))
-    ticks = [tick for tick in range(steps * TICKS) if rng.random() < 0.95]
-    controller = make_controller(StubSolver(small_plant(("north", "east")), faults=faults), land=False)
-    outputs = run(controller, inputs_of(ticks, samples))
-    assert_sound(outputs)
-    assert {output.decision.mode for output in outputs} >= {TRACK, ControlMode.BRAKE}
-    limited = {name for output in outputs if output.setpoint is not None for name in output.setpoint.limited}
-    assert limited >= {"clamp-north", "clamp-east"}

@@ -10,13 +10,14 @@ import threading
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from recording_fakes import Clock, Disk, Item, flight, own, record_flight
 
 from logs.chunks import Damage, Message, scan
 from logs.disk import DiskFile, OutputFile
 from logs.encoding import encode
 from logs.info import info
-from logs.reader import read, records
+from logs.reader import read, records, segment_files
 from logs.recorder import Recorder, SyncRecorder
 from logs.recover import recover
 from logs.topics import RecorderNote
@@ -82,6 +83,9 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
         recorder.put(*extra)
         assert recorder.close().ok
         assert own(list(read(path))) == [*items, extra]
+        for file in segment_files(path):  # each has one header, however often it was tried
+            topics = [item.definition.topic for item in scan(file) if isinstance(item, Message)]
+            assert (topics[0], topics.count("/uavctl/header")) == ("/uavctl/header", 1)
 
 
 def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
@@ -186,7 +190,7 @@ def test_31_killed_process_loses_the_open_chunk_at_most(tmp_path: Path, kind: st
     items = flight(20000)
     for number in range(7):
         path, out = tmp_path / f"{number}.mcap", tmp_path / f"{number}-out.mcap"
-        put = killed_recording(path, kind, rng.randrange(1, 600))
+        put = killed_recording(path, kind, rng.randrange(1, 300))
         result = recover(path, out)
         got = own(list(read(out)))
         assert got == items[: len(got)]
@@ -264,4 +268,24 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
             assert [item for item in found if isinstance(item, Message)] == [
                 item for item in whole if item.offset != offset
             ]
-            assert [item.offset for item in found if isinstance(item, Damage)] == [offset]
+            assert [(item.offset, item.torn) for item in found if isinstance(item, Damage)] == [(offset, False)]
+
+
+def test_32_damage_between_the_chunks_is_refused_after_all_messages(tmp_path: Path) -> None:
+    path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    items = record_flight(path, 30)
+    data = path.read_bytes()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    for chunk in summary.chunk_indexes:
+        at = chunk.chunk_start_offset + chunk.chunk_length  # the first index record after it
+        for position in (at, at + 1, at + 2, at + 7, at + 12, at + 20):
+            path.write_bytes(flipped(data, position, 4))
+            assert readable(path) == (items, True) or position < at + 15
+            out.unlink(missing_ok=True)
+            result = recover(path, out)
+            assert own(list(read(out))) == items
+            assert result.messages_lost == 0
+            # after the last chunk nothing tells whether there was another one
+            assert result.lossless or chunk is summary.chunk_indexes[-1]

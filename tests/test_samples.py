@@ -49,6 +49,11 @@ def test_an_overtaken_sample_changes_nothing() -> None:
     assert taken([(200, [captured(200)]), (250, [captured(150)])]).fresh == 1
 
 
+def test_the_same_instant_from_a_second_source_counts_once() -> None:
+    intake = taken([(200, [captured(200), captured(200, source="second")])])
+    assert (intake.accepted, intake.fresh) == (2, 1)
+
+
 def test_refused_samples_do_not_count() -> None:
     again = captured(200)
     future = captured(501, received_ms=450)

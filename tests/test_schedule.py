@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_fixed_delay_of_the_paper() -> None:
     alpha = 1.0 - 0.3**5
     np.testing.assert_allclose(schedule.alpha, [1.0] * 5 + [alpha] * 7)
     # γ^x_t = δ_x / ∏_{r=1}^{t-1} α_r: the first stage that pays is t = 6.
-    np.testing.assert_allclose(schedule.gamma_x, [1.0] + [0.95] * 5 + [0.95 / alpha**i for i in range(7)])
+    np.testing.assert_allclose(schedule.gamma_x, [1.0] + [0.95] * 5 + [0.95 / alpha**i for i in range(1, 8)])
     np.testing.assert_allclose(schedule.gamma_u, [0.9] * 5 + [0.9 / alpha] * 7)
     assert schedule.delays == (5,) * H
 
@@ -39,7 +39,7 @@ def test_varying_link_enters_stage_by_stage() -> None:
     p = np.array([0.7, 0.9, 0.8, 0.95, 0.7, 0.9, 0.99, 0.9])
     schedule = fixed(Demand(age_distribution(p), 8, 2, 0.9, 0.9), 3)
     # a(k+t) > 2 if the packets of t, t-1 and t-2 are all lost
-    expected = [1.0] * 3 + [1.0 - np.prod(1.0 - p[t - 3 : t]) for t in range(3, 8)]
+    expected = [1.0] * 3 + [1.0 - float(np.prod(1.0 - p[t - 3 : t])) for t in range(3, 8)]
     np.testing.assert_allclose(schedule.alpha, expected)
 
 
@@ -57,7 +57,7 @@ def test_nested_schedules_are_those_of_a_blind_enumeration(gamma_max: float) -> 
     expected = set()
     for newest in product(*[range(-1, t) for t in range(free)]):
         newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]
-        if any(later < earlier for earlier, later in zip(newest_all, newest_all[1:], strict=False)):
+        if any(later < earlier for earlier, later in pairwise(newest_all)):
             continue
         alpha = [1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)]
         if min(alpha) > 0.95 and 0.95 / np.prod(alpha) < 1.0 and 0.95 / np.prod(alpha) <= gamma_max:
@@ -85,7 +85,8 @@ def test_greedy_is_nested_and_takes_the_newest_information_first(tau: int) -> No
 
 
 def test_greedy_by_hand() -> None:
-    # α_3 = 0.973 for d = 3 would leave 0.973 · 0.99757^... below 0.95/0.985 = 0.9645, so stage 3 waits.
+    # d_3 = 3 would leave 0.973 · 0.9919 · 0.99757 · 0.99927 · 0.99978 · 0.99757⁴ = 0.9526 at best, and
+    # 0.95 / 0.985 = 0.9645 is asked for: stage 3 feeds back nothing.
     assert greedy(demand(4), 0.985).delays == (1, 2, 3, 4, 4, 4, 5, 5, 5, 5, 5, 5)
 
 

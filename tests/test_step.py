@@ -69,7 +69,8 @@ def test_plans_at_the_first_boundary_with_a_position_and_holds_the_input_until_t
         assert decision.input == tuple(stub_inputs(number, HORIZON, 1)[0])
         assert setpoint.accel_mps2 == (decision.input[0], 0.0, 0.0)
         assert (setpoint.source, setpoint.limited, setpoint.at_ns) == (SetpointSource.PLAN, (), decision.at_ns)
-        assert (output.plan is not None) == decision.boundary
+        assert (output.plan is not None) == decision.news == decision.boundary
+        assert decision.solve is (SolveStatus.OPTIMAL if decision.boundary else None)
         assert output.estimate is not None
         assert output.estimate.at_ns == decision.at_ns == START_NS + tick * TICK_NS
 

@@ -154,7 +154,12 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     """The radio link that carries positions: the design's assumption, and the simulator's channel."""
 
     loss: Annotated[
-        float, Meta(ge=0, lt=1, description="probability that a packet is lost; the design uses p = 1 − lossⁿ, n samples in time each Δt")
+        float,
+        Meta(
+            ge=0,
+            lt=1,
+            description="probability that a packet is lost; the design uses p = 1 − lossⁿ, n samples in time each Δt",
+        ),
     ] = 0.0
     model: Annotated[
         Literal["bernoulli", "gilbert-elliott"], Meta(description="loss model of the simulated channel")

@@ -62,7 +62,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     why_not = unready(inp.vehicle)
     stopping = inp.stop or (state.fallback is not None and state.fallback.stopping)
     if why_not and stopping:
-        ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns, stopping=True)
+        ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns)
         return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
     if why_not:
         return Choice(replace(state, plan=None, fallback=None), why_not)

@@ -147,7 +147,9 @@ def _search(
     spec: DesignSpec, demand: Demand, terminal: Terminal, cost_of: Callable[[Design, Array], float | None] | None
 ) -> Design:
     """Least mean cost over the named states among the nested schedules that keep all of them feasible."""
-    if cost_of is None or not len(spec.search_states):
+    if cost_of is None:
+        raise DesignError("schedule.rule", "rule `search` has no cost to minimise here", "use rule `fixed` or `greedy`")
+    if not len(spec.search_states):
         raise DesignError(
             "schedule.search_states", "rule `search` has no states to minimise the cost over", "name some"
         )
