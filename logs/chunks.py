@@ -67,6 +67,10 @@ class _BadRecordError(Exception):
     """What stands here is not the record that it should be."""
 
 
+class _TornRecordError(_BadRecordError):
+    """The record goes on beyond the end of the file."""
+
+
 Buffer = bytes | mmap.mmap
 
 
@@ -119,7 +123,7 @@ def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
             later = _next_chunk(data, at + 1)
             if later is None:
                 later = _data_end(data)
-            torn = later is None and data[-len(MAGIC) :] != MAGIC
+            torn = later is None and isinstance(error, _TornRecordError)
             later = size if later is None else later
             yield Damage(path, at, later - at, f"chunk or index {error}", torn=torn)
             at, damaged = later, True
@@ -170,10 +174,10 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
 def _whole(data: Buffer, at: int) -> int:
     """Length of the record at `at`, its head included, if it may stand between chunks and is not torn."""
     if at + _RECORD.size > len(data):
-        raise _BadRecordError("is torn")
+        raise _TornRecordError("is torn")
     opcode, length = _RECORD.unpack_from(data, at)
     if at + _RECORD.size + length > len(data):
-        raise _BadRecordError("is torn")
+        raise _TornRecordError("is torn")
     inner = at + _RECORD.size
     if opcode == Opcode.CHUNK:
         good = length >= _CHUNK_FIELDS

@@ -104,6 +104,12 @@ class FlightData:
         return tuple(sample for one in self.step_inputs if one.tick not in refusing for sample in one.samples)
 
     @cached_property
+    def flown(self) -> tuple[Decision, ...]:
+        """Ticks up to the operator's stop: what comes after it is the hand-over, not the flight."""
+        stopped = min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+        return tuple(d for d in self.decisions if stopped is None or d.at_ns < stopped)
+
+    @cached_property
     def tick_ns(self) -> int:
         """Time between two ticks; 0 when there was only one."""
         first, last = self.decisions[0], self.decisions[-1]
@@ -168,7 +174,7 @@ class Steps:
     @classmethod
     def of(cls, flight: FlightData) -> Self:
         """Collect the flown boundaries of a flight."""
-        decisions = tuple(d for d in flight.decisions if d.boundary and d.mode in FLOWN)
+        decisions = tuple(d for d in flight.flown if d.boundary and d.mode in FLOWN)
         at_ns = np.array([d.at_ns for d in decisions], dtype=np.int64)
         n_x, n_u = len(flight.design.target), len(flight.design.q_u)
         known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates

@@ -24,6 +24,7 @@ from uavctl.errors import RecordingError
 
 SYNC_S = 1.0
 RETRY_S = 1.0
+LAST_TRIES = 3  # files that closing may begin on a failing disk
 _MAX_TIME_NS = 2**64 - 1
 
 
@@ -125,9 +126,9 @@ class Journal:
             self._fail(error)
 
     def finish(self) -> None:
-        """Write all that waits and close the file; a failed write gets one more try in a new file."""
+        """Write all that waits and close the file; after a failed write, in a new file."""
         self.closed = True
-        for _ in range(2):
+        for _ in range(LAST_TRIES):
             self._retry_s = self._clock()
             self.drain(self._limit)
             if self._segment is not None:

@@ -84,7 +84,7 @@ def replay(
         if isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, StepInput):
-            loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop)
+            deque(loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop), maxlen=0)
         if _is_compared(topic):
             compared += 1
             decisions += topic == "/uavctl/decision"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 
 import msgspec
@@ -74,7 +74,7 @@ def replay_tlog(
     for at_ns, data in packets:
         start_ns = at_ns if start_ns is None else start_ns
         while start_ns + tick * tick_ns < at_ns:
-            loop.tick(tick, start_ns + tick * tick_ns)
+            deque(loop.tick(tick, start_ns + tick * tick_ns), maxlen=0)
             tick += 1
         loop.receive(link, data, at_ns)
         datagrams += 1

@@ -39,7 +39,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     received: int  # positions: sent - lost when simulated, else samples accepted
     lost: int | None  # positions that the simulated channel lost; None for a real flight
     max_age: int  # largest age of information at a flown boundary [steps]
-    fallbacks: int  # entries into braking, holding or landing
+    fallbacks: int  # entries into braking, holding or landing, but for the operator's stop
     state_violations: int  # flown boundaries with the state outside its set
     input_violations: int  # flown boundaries with the input outside its set
     slack_used: int  # flown plans in which a constraint or the terminal equality gave way
@@ -72,7 +72,7 @@ def summarise(
 ) -> FlightSummary:
     """Figures of a flight; `recording` and `report` are paths as the user should see them."""
     steps = flight.steps
-    flown = [d for d in flight.decisions if d.mode in FLOWN]
+    flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}
     accepted = sum(d.accepted for d in flight.decisions)
     last = flight.truths[-1] if flight.truths else None
@@ -85,7 +85,7 @@ def summarise(
         received=accepted if last is None else last.sent - last.lost,
         lost=None if last is None else last.lost,
         max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
-        fallbacks=_fallback_entries([d.mode for d in flight.decisions]),
+        fallbacks=_fallback_entries([d.mode for d in flight.flown]),
         state_violations=int(np.count_nonzero(state_outside(flight))),
         input_violations=int(np.count_nonzero(input_outside(flight))),
         slack_used=sum(
@@ -216,7 +216,7 @@ def count(amount: int, noun: str) -> str:
 
 def _fallback_entries(modes: list[ControlMode]) -> int:
     entered = sum(b in FALLBACK and a not in FALLBACK for a, b in pairwise(modes))
-    return entered + (modes[0] in FALLBACK)
+    return entered + (bool(modes) and modes[0] in FALLBACK)
 
 
 def _outside(values: Floats, c: Matrix, b: Vector, tolerance: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

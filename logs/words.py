@@ -72,9 +72,9 @@ def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
     spans = flight.spans(FALLBACK)
     if not spans:
         return ["The fallback was never needed."]
-    first = next(d for d in flight.decisions if d.mode in FALLBACK)
+    first = next(d for d in flight.flown if d.mode in FALLBACK)
     total_s = sum(end - begin for begin, end in spans)
-    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.decisions if d.mode in FALLBACK)]
+    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.flown if d.mode in FALLBACK)]
     course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
     times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
     return [

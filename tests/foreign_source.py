@@ -11,7 +11,7 @@ import socket
 import sys
 import time
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ARMED_CUSTOM = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 PX4_OFFBOARD = 6 << 16

@@ -27,13 +27,17 @@ PAPER_UPPER = np.array([50.0, 7.0, 20.0, 8.0])
 TWO = np.eye(2)
 
 
+def kron(left: Array, right: list[list[float]]) -> Array:
+    return np.asarray(np.kron(left, np.array(right)), dtype=np.float64)
+
+
 def paper_plant(w: Array | None = None, coupling: float = 0.0) -> Plant:
-    a = np.kron(TWO, [[1.0, 0.79], [0.0, 0.61]])
+    a = kron(TWO, [[1.0, 0.79], [0.0, 0.61]])
     a[1, 3] = a[3, 1] = coupling
     return Plant(
         a=a,
-        b=np.kron(TWO, [[0.21], [0.39]]),
-        e=np.kron(TWO, [[0.5], [1.0]]),
+        b=kron(TWO, [[0.21], [0.39]]),
+        e=kron(TWO, [[0.5], [1.0]]),
         w=0.6 * np.eye(2) if w is None else w,
         dt_s=1.0,
         axes=("north", "east"),
@@ -55,7 +59,7 @@ def paper_spec(**changes: Any) -> DesignSpec:
         delta_x=0.95,
         delta_u=0.9,
         delta_tau=0.99,
-        k_tau=np.kron(TWO, [[-0.058, -1.172]]),
+        k_tau=kron(TWO, [[-0.058, -1.172]]),
         link_p=np.full(12, 0.7),
         target_m=(0.0, 0.0, 0.0),
         rule="fixed",
@@ -98,7 +102,7 @@ def room(**changes: Any) -> Design:
         q_x=np.diag([10.0, 1.0, 0.1] * 3),
         q_u=np.eye(3),
         tau=3,
-        k_tau=np.kron(np.eye(3), [[-1.060, -1.444, -0.696]]),
+        k_tau=kron(np.eye(3), [[-1.060, -1.444, -0.696]]),
         target_m=(1.5, 1.0, -1.2),
         # Stages 4 and 5 feed nothing back: enough likelihood is left for a feasible schedule.
         delays=[6] * 7 + [4] * 5,

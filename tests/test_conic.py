@@ -187,7 +187,7 @@ def test_solution_keeps_every_row_of_the_printed_problem(
 
 def test_rows_are_kept_by_a_coupled_plant_and_in_a_room(room_solver: ConicSolver) -> None:
     cross, box = coupled(), room()
-    near = ROOM_TARGET + [-0.3, 0, 0, 0.2, 0, 0, 0.1, 0, 0]
+    near = ROOM_TARGET + np.array([-0.3, 0, 0, 0.2, 0, 0, 0.1, 0, 0])
     for least in (
         independent_rows(cross, ConicSolver(cross), np.array([4.0, -1.0, -3.0, 0.5]), ORIGIN),
         independent_rows(box, room_solver, near, ROOM_TARGET),

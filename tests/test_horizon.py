@@ -45,7 +45,8 @@ def simulate(
 
 def psd_root(matrix: Array) -> Array:
     values, vectors = np.linalg.eigh(matrix)
-    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+    return root
 
 
 CASES = {
@@ -80,7 +81,8 @@ def test_prediction_is_what_the_recursion_gives(case: tuple[Design, Horizon]) ->
     omega = rng.normal(size=(horizon.steps, part.e.shape[1]))
     free = rng.normal(size=(horizon.free, n_u))
     v = np.vstack([free, np.tile(part.u_eq @ y, (horizon.tau, 1))])
-    states, inputs = simulate(horizon, x, v, gains_of(horizon, theta), omega @ psd_root(part.w))
+    noise_w: Array = omega @ psd_root(part.w)
+    states, inputs = simulate(horizon, x, v, gains_of(horizon, theta), noise_w)
     for t in range(horizon.steps + 1):
         mean = horizon.phi[t] @ x + horizon.gamma[t] @ free.ravel() + horizon.gamma_eq[t] @ y
         noise = horizon.state_noise(t, np.eye(n_x)).at(theta).reshape(n_x, -1) @ omega.ravel()

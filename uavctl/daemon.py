@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from uavctl.clock import Ticker, monotonic_ns
-from uavctl.loop import ControlLoop
+from uavctl.errors import UavctlError
+from uavctl.loop import VEHICLE, ControlLoop
 from uavctl.transport import Connection, wait
 
 
@@ -30,12 +31,20 @@ def fly(
         stop_requested: asked once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
         stop_limit_s: the hand-over is cut off after this time [s]; 0 ends without one.
+
+    Raises:
+        UavctlError: the vehicle's connection was closed by the other side.
     """
     first_ns: int | None = None
     stop_ns: int | None = None
     while not loop.finished:
         due = ticker.next()
         _receive_until(loop, connections, due.at_ns)
+        if connections[VEHICLE].closed:
+            raise UavctlError(
+                f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
+                "the vehicle's own failsafe has it. See to the link and start again"
+            )
         started_ns = monotonic_ns()
         first_ns = due.at_ns if first_ns is None else first_ns
         over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9

@@ -7,6 +7,7 @@ written to a recording and read back without loss.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Protocol
 
@@ -254,6 +255,6 @@ class Flyer(Protocol):
         """Take one datagram that arrived at `at_ns`."""
         ...
 
-    def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
-        """Run the control tick of the grid time `at_ns`; returns the bytes to send."""
+    def tick(self, tick: int, at_ns: int) -> Iterable[Outgoing]:
+        """Run the control tick of the grid time `at_ns`; gives the bytes to send, to be taken to the last one."""
         ...

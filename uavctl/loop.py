@@ -7,7 +7,7 @@ it learns and chooses goes to the sink, in the order in which it happened.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import msgspec
 
@@ -19,7 +19,6 @@ from uavctl.data import (
     Estimate,
     Event,
     Outgoing,
-    Plan,
     PositionSample,
     Record,
     Sink,
@@ -34,6 +33,7 @@ from uavctl.mavlink.mode import HandOver, Seen, Sending, State, look
 VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
+LAND_REQUESTS = 5
 
 
 def raw_topic(link: str, *, outgoing: bool) -> str:
@@ -75,15 +75,17 @@ class ControlLoop:
         self._inbox: deque[tuple[int, PositionSample | VehicleStatus]] = deque()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
+        self._requests = 0
+        self._asked_ns = 0
         self.vehicle: VehicleStatus | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
-        self.plan: Plan | None = None
 
     @property
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
-        return self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
+        over = self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
+        return over and not self._must_ask_again()
 
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram that arrived at `at_ns`; ticks before that time will not see it."""
@@ -94,31 +96,22 @@ class ControlLoop:
             else:
                 self._inbox.append((at_ns, item))
 
-    def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> tuple[Outgoing, ...]:
-        """Run the control tick of grid time `at_ns`; returns the bytes to send."""
+    def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> Iterator[Outgoing]:
+        """Run the control tick of grid time `at_ns`; yields the bytes to send, each as soon as it is known.
+
+        Heartbeats and TIMESYNC come before the decision, so that a solve does not delay a round trip.
+        """
+        inp = self._gather(tick, at_ns, missed_ticks, stop)
+        for name, link in self._links.items():
+            for data in link.due(at_ns):
+                yield self._send(name, data, at_ns)
         begun = self._stopwatch()
-        samples, heard = self._take_due(at_ns)
-        inp = StepInput(
-            tick=tick,
-            at_ns=at_ns,
-            samples=samples,
-            vehicle=self._flyable(at_ns),
-            missed_ticks=missed_ticks,
-            stop=stop,
-        )
-        self._put("/uavctl/step_input", at_ns, inp)
-        for status in heard:
-            self._put("/uavctl/vehicle", status.at_ns, status)
         self._state, out = step(self._state, inp, self._controller)
         self._last_step_ns = self._stopwatch() - begun
-        self._remember(out)
+        self.decision, self.estimate = out.decision, out.estimate
         self._record(out, at_ns)
-        outgoing = self._outgoing(out, at_ns)
-        for one in outgoing:
-            sent = Datagram(at_ns=at_ns, link=one.link, outgoing=True, data=one.data)
-            self._put(raw_topic(one.link, outgoing=True), at_ns, sent)
+        yield from self._command(out, at_ns)
         self._record_stats(at_ns)
-        return outgoing
 
     def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
         """Record what the shell measured around the last tick."""
@@ -135,6 +128,22 @@ class ControlLoop:
                 capture_to_send_ns=None if estimate is None else at_ns + send_ns - estimate.captured_ns,
             ),
         )
+
+    def _gather(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
+        """All that the tick may know; recorded first, so that a replay knows when the tick ran."""
+        samples, heard = self._take_due(at_ns)
+        inp = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=samples,
+            vehicle=self._flyable(at_ns),
+            missed_ticks=missed_ticks,
+            stop=stop,
+        )
+        self._put("/uavctl/step_input", at_ns, inp)
+        for status in heard:
+            self._put("/uavctl/vehicle", status.at_ns, status)
+        return inp
 
     def _take_due(self, at_ns: int) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...]]:
         """Samples and vehicle states that arrived up to `at_ns`; the newest state is taken over."""
@@ -158,11 +167,6 @@ class ControlLoop:
             return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} (released to the pilot)")
         return vehicle
 
-    def _remember(self, out: StepOutput) -> None:
-        self.decision = out.decision
-        self.estimate = out.estimate
-        self.plan = out.plan or self.plan
-
     def _record(self, out: StepOutput, at_ns: int) -> None:
         if out.estimate is not None:
             self._put("/uavctl/estimate", at_ns, out.estimate)
@@ -174,16 +178,27 @@ class ControlLoop:
         for event in out.events:
             self._put("/uavctl/event", at_ns, event)
 
-    def _outgoing(self, out: StepOutput, at_ns: int) -> tuple[Outgoing, ...]:
+    def _command(self, out: StepOutput, at_ns: int) -> Iterator[Outgoing]:
+        """What the vehicle is told: a setpoint, the request to land, or nothing."""
         sending, events = self._hand_over.update(at_ns, self.vehicle, ready=out.setpoint is not None, land=out.land)
         for event in events:
             self._put("/uavctl/event", at_ns, event)
-        messages = [Outgoing(link=name, data=data) for name, link in self._links.items() for data in link.due(at_ns)]
+        link = self._links[VEHICLE]
         if sending in (Sending.SETPOINTS, Sending.NEUTRAL) and out.setpoint is not None:
-            messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].setpoint(out.setpoint)))
-        if sending is Sending.LAND:
-            messages.append(Outgoing(link=VEHICLE, data=self._links[VEHICLE].land(at_ns)))
-        return tuple(messages)
+            yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
+        if sending is Sending.LAND or (self._must_ask_again() and at_ns - self._asked_ns >= SECOND_NS):
+            self._requests += 1
+            self._asked_ns = at_ns
+            yield self._send(VEHICLE, link.land(at_ns), at_ns)
+
+    def _must_ask_again(self) -> bool:
+        """Whether the vehicle was asked to land, does not do so yet, and may be asked again."""
+        vehicle, asked = self.vehicle, self._hand_over.state is State.LANDING
+        return asked and vehicle is not None and vehicle.external and vehicle.armed and self._requests < LAND_REQUESTS
+
+    def _send(self, link: str, data: bytes, at_ns: int) -> Outgoing:
+        self._put(raw_topic(link, outgoing=True), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=True, data=data))
+        return Outgoing(link=link, data=data)
 
     def _record_stats(self, at_ns: int) -> None:
         if self._next_stats_ns is None:

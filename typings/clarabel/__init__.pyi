@@ -45,8 +45,6 @@ class DefaultSettings:
     tol_gap_abs: float
     tol_gap_rel: float
     tol_feas: float
-    iterative_refinement_reltol: float
-    iterative_refinement_abstol: float
     def __init__(self) -> None: ...
 
 class DefaultSolution:

@@ -73,10 +73,9 @@ class _Timed:
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         self._loop.receive(link, data, at_ns)
 
-    def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
-        outgoing = self._loop.tick(tick, at_ns)
+    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+        yield from self._loop.tick(tick, at_ns)
         self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
-        return outgoing
 
 
 def _lockstep(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:

@@ -1,0 +1,106 @@
+"""Which schedules can meet the terminal condition, and what a state costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from optimisation_cases import ORIGIN, PAPER_COST, START, paper, paper_plant, paper_spec, room
+
+from uavctl.errors import DesignError
+from uavctl.smpc.components import decompose
+from uavctl.smpc.conic import ConicSolver
+from uavctl.smpc.design import make_design
+from uavctl.smpc.feasibility import check_schedule, optimal_cost
+from uavctl.smpc.horizon import Horizon
+from uavctl.smpc.printed import PrintedSolver
+from uavctl.smpc.reduction import terminal_bound
+from uavctl.smpc.sets import Polytope
+
+GOOD_LINK = np.full(12, 0.8)
+
+
+def test_the_papers_schedule_leaves_a_margin() -> None:
+    assert check_schedule(paper()) == pytest.approx(0.1995, abs=1e-4)
+
+
+def test_margin_is_reached_by_no_gain_beyond_it() -> None:
+    """No random gain of the schedule does better than s*."""
+    design = paper()
+    margin = check_schedule(design)
+    horizon = Horizon(decompose(design)[0], 12, 4, design.schedule)
+    bound = terminal_bound(horizon, move_constants=False)
+    rng = np.random.default_rng(7)
+    sizes = [
+        np.linalg.norm(bound.y.at(scale * rng.normal(size=horizon.n_theta)).reshape(bound.rows, bound.columns), 2)
+        for scale in np.geomspace(1e-3, 1.0, 200)
+    ]
+    assert 1.0 - np.min(sizes) ** 2 <= margin
+
+
+def test_longer_delays_leave_less_margin() -> None:
+    shorter, longer = (check_schedule(paper(delays=delay, link_p=GOOD_LINK)) for delay in (4, 5))
+    assert shorter > longer + 0.1
+    assert longer > 0
+
+
+@pytest.mark.parametrize("delays", [6, [5] * 11 + [6], [8] * 12], ids=str)
+def test_schedule_slower_than_the_terminal_law_is_refused(delays: int | list[int]) -> None:
+    with pytest.raises(DesignError, match=r"schedule\.delays: the schedule is slower than the terminal law") as refused:
+        check_schedule(paper(delays=delays, link_p=GOOD_LINK))
+    assert refused.value.key == "schedule.delays"
+
+
+def test_no_feedback_at_all_is_refused() -> None:
+    with pytest.raises(DesignError, match="slower than the terminal law"):
+        check_schedule(paper(delays=12))
+
+
+def test_room_has_a_feasible_schedule_and_one_delay_too_long_at_stage_7_has_none() -> None:
+    assert check_schedule(room()) > 0.05
+    with pytest.raises(DesignError, match=r"s\* = -"):
+        check_schedule(room(delays=[5] * 9 + [4] * 3))
+
+
+def test_undisturbed_axis_is_no_obstacle() -> None:
+    disturbed = check_schedule(paper())
+    assert check_schedule(paper(plant=paper_plant(w=np.diag([0.6, 0.0])))) == pytest.approx(disturbed, abs=1e-6)
+
+
+def test_terminal_condition_with_a_singular_transition_is_reduced_again() -> None:
+    """K A⁻¹ B = 0 makes F singular: s* of the plain condition is 0, yet there is a feasible interior."""
+    plant = paper_plant()
+    position = -0.058
+    drive = np.linalg.solve(plant.a, plant.b)[:2, 0]
+    gain = np.kron(np.eye(2), [[position, -position * drive[0] / drive[1]]])
+    wide = Polytope.from_box([-300.0, -80.0] * 2, [300.0, 80.0] * 2)
+    design = paper(k_tau=gain, state_set=wide, input_set=Polytope.from_box([-75.0] * 2, [75.0] * 2))
+    horizon = Horizon(decompose(design)[0], 12, 4, design.schedule)
+    bound = terminal_bound(horizon)
+    assert (bound.rows, bound.fixed.offset.size) == (5, bound.columns)
+    assert check_schedule(design) > 1e-4
+    exact = ConicSolver(design).solve(0, START, ORIGIN)
+    assert exact.cost == pytest.approx(PrintedSolver(design).solve(0, START, ORIGIN).cost, rel=1e-5)
+
+
+def test_optimal_cost_is_the_papers_and_none_where_constraints_give_way() -> None:
+    design = paper()
+    assert optimal_cost(design, START) == pytest.approx(PAPER_COST, abs=0.01)
+    for outside in ([80.0, 60.0, 0.0, 0.0], [48.0, 7.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]):
+        assert optimal_cost(design, np.array(outside)) is None
+    assert optimal_cost(paper(delays=6), ORIGIN) is None
+
+
+def test_search_takes_the_cheapest_of_its_candidates() -> None:
+    spec = replace(paper_spec(), horizon=9, rule="search", search_states=np.array([[5.0, -1.0, -3.0, 1.0]]))
+    seen: list[float | None] = []
+
+    def cost_of(design: object, x: object) -> float | None:
+        seen.append(optimal_cost(design, x))  # type: ignore[arg-type]  # make_design's own arguments
+        return seen[-1]
+
+    chosen = make_design(spec, cost_of)
+    known = [cost for cost in seen if cost is not None]
+    assert len(seen) > 1
+    assert optimal_cost(chosen, spec.search_states[0]) == min(known)
