@@ -18,8 +18,8 @@ import msgspec
 from logs.disk import OutputFile, later_segments, segment_path
 from logs.encoding import encode
 from logs.segment import Entry, Segment
-from logs.topics import HEADER, RECORDER, RecorderNote, definition, raw_topic, record_type
-from uavctl.data import Datagram, Record
+from logs.topics import HEADER, RECORDER, RecorderNote, definition, record_type
+from uavctl.data import Datagram, Record, raw_topic
 from uavctl.errors import RecordingError
 
 SYNC_S = 1.0

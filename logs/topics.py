@@ -96,12 +96,6 @@ _RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time =
 
 
 @lru_cache(maxsize=256)
-def raw_topic(link: str, *, outgoing: bool) -> str:
-    """Topic of a connection's raw bytes in one direction."""
-    return f"/raw/{link}/{'out' if outgoing else 'in'}"
-
-
-@lru_cache(maxsize=256)
 def raw_link(topic: str) -> tuple[str, bool] | None:
     """Connection name and whether outgoing, of a raw topic; None for any other topic."""
     match = _RAW.fullmatch(topic)

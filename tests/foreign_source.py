@@ -55,18 +55,15 @@ def main(port: int) -> None:
             accel = [message.afx, message.afy, message.afz]
             masks.add(message.type_mask)
             received.append((now - start, max(map(abs, accel))))
-    print(
-        json.dumps(
-            {
-                "setpoints": len(received),
-                "in_pause": sum(FLIGHT_S < t < FLIGHT_S + PAUSE_S for t, _ in received),
-                "largest_mps2": max((a for _, a in received), default=0.0),
-                "masks": sorted(masks),
-                "position_m": [round(p, 3) for p in position],
-                "velocity_mps": [round(v, 3) for v in velocity],
-            }
-        )
-    )
+    seen = {
+        "setpoints": len(received),
+        "in_pause": sum(FLIGHT_S < t < FLIGHT_S + PAUSE_S for t, _ in received),
+        "largest_mps2": max((a for _, a in received), default=0.0),
+        "masks": sorted(masks),
+        "position_m": [round(p, 3) for p in position],
+        "velocity_mps": [round(v, 3) for v in velocity],
+    }
+    sys.stdout.write(json.dumps(seen) + "\n")
 
 
 def send(sock: socket.socket, out: mavlink.MAVLink, message: mavlink.MAVLink_message) -> None:

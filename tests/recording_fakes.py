@@ -8,8 +8,7 @@ from pathlib import Path
 
 from logs.disk import DiskFile, OutputFile
 from logs.recorder import SyncRecorder
-from logs.topics import raw_topic
-from uavctl.data import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity
+from uavctl.data import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity, raw_topic
 
 HEADER = Header(
     started_ns=5,

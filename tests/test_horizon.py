@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from optimisation_cases import coupled, paper, paper_plant, room
+from optimisation_cases import TAU_3, coupled, paper, paper_plant, room
 
 from uavctl.errors import DesignError
 from uavctl.smpc.components import Component, decompose, whole
@@ -54,6 +54,7 @@ CASES = {
     "joint": (paper, lambda design: (whole(design),)),
     "coupled": (coupled, decompose),
     "room": (room, decompose),
+    "room, tau = 3": (lambda: room(**TAU_3), decompose),
 }
 
 
@@ -76,7 +77,7 @@ def test_prediction_is_what_the_recursion_gives(case: tuple[Design, Horizon]) ->
     _, horizon = case
     part, rng = horizon.component, np.random.default_rng(1)
     n_x, n_u = part.b.shape
-    x, y = rng.normal(size=n_x), rng.normal(size=part.x_eq.shape[1])
+    x, y = rng.normal(size=(n_x,)), rng.normal(size=(part.x_eq.shape[1],))
     theta = rng.normal(size=horizon.n_theta)
     omega = rng.normal(size=(horizon.steps, part.e.shape[1]))
     free = rng.normal(size=(horizon.free, n_u))

@@ -248,10 +248,10 @@ def test_operator_stop_without_a_vehicle_to_hand_over_only_stops() -> None:
     assert [output.setpoint is None for output in outputs] == [False] * 2 + [True] * 4
 
 
-def test_operator_stop_before_the_first_position_hands_over_at_once() -> None:
-    outputs = run(make_controller(), inputs_of(range(4), [], stop_from=2))
-    assert modes(outputs) == [WAIT, WAIT, LAND, STOPPED]
-    assert [output.land for output in outputs] == [False, False, True, False]
+def test_operator_stop_before_the_first_position_hands_over_in_the_next_tick() -> None:
+    outputs = run(make_controller(), inputs_of(range(5), [], stop_from=2))
+    assert modes(outputs) == [WAIT, WAIT, BRAKE, LAND, STOPPED]
+    assert [output.land for output in outputs] == [False, False, False, True, False]
 
 
 def test_the_same_inputs_give_the_same_bits_from_a_rebuilt_controller_too() -> None:

@@ -5,9 +5,9 @@ import json
 import msgspec
 import pytest
 
-from logs.topics import TOPICS, definition, raw_link, raw_topic, record_type, topics_page
+from logs.topics import TOPICS, definition, raw_link, record_type, topics_page
 from uavctl import data
-from uavctl.data import Datagram, Decision, Record
+from uavctl.data import Datagram, Decision, Record, raw_topic
 
 
 def test_every_recorded_type_has_one_topic() -> None:

@@ -1,6 +1,6 @@
 """All checks of the tree, one stage after the other; the first that fails ends the run.
 
-`make test` and continuous integration run this; `--write-docs` only writes the generated page.
+`make test` and continuous integration run this; `--write-docs` only writes the generated pages.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from logs.topics import topics_page
 from uavctl.config.reference import render
 
 ROOT = Path(__file__).resolve().parent.parent
-REFERENCE = ROOT / "docs" / "configuration.md"
+PAGES = {ROOT / "docs" / "configuration.md": render, ROOT / "docs" / "topics.md": topics_page}
 BIN = Path(sys.executable).parent
 _THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
 
@@ -54,10 +55,11 @@ def run(command: Sequence[str | Path], *, cwd: Path = ROOT, extra: Mapping[str, 
     return done.stdout
 
 
-def check_reference() -> str:
-    """The configuration page is what the types say."""
-    if not REFERENCE.exists() or REFERENCE.read_text(encoding="utf-8") != render():
-        raise StageError(f"{REFERENCE.relative_to(ROOT)} is not up to date; run `make docs`")
+def check_pages() -> str:
+    """The generated pages are what the types say."""
+    for page, text in PAGES.items():
+        if not page.exists() or page.read_text(encoding="utf-8") != text():
+            raise StageError(f"{page.relative_to(ROOT)} is not up to date; run `make docs`")
     return ""
 
 
@@ -92,7 +94,7 @@ STAGES: tuple[tuple[str, Callable[[], str]], ...] = (
     ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
     ("mypy", lambda: run([BIN / "mypy"])),
     ("import contracts", lambda: run([BIN / "lint-imports"])),
-    ("docs/configuration.md", check_reference),
+    ("generated pages of docs/", check_pages),
     ("wheel, outside the checkout", check_wheel),
     ("pytest", check_tests),
 )
@@ -101,7 +103,8 @@ STAGES: tuple[tuple[str, Callable[[], str]], ...] = (
 def main(arguments: Sequence[str]) -> int:
     """Run the stages; 0 if all of them pass."""
     if list(arguments) == ["--write-docs"]:
-        REFERENCE.write_text(render(), encoding="utf-8")
+        for page, text in PAGES.items():
+            page.write_text(text(), encoding="utf-8")
         return 0
     for name, stage in STAGES:
         start = time.monotonic()

@@ -193,6 +193,11 @@ class Datagram(Record, frozen=True, kw_only=True):
     data: bytes
 
 
+def raw_topic(link: str, *, outgoing: bool) -> str:
+    """Topic of a connection's raw bytes in one direction."""
+    return f"/raw/{link}/{'out' if outgoing else 'in'}"
+
+
 class LinkStats(Record, frozen=True, kw_only=True):
     """Counters of one connection since the start."""
 

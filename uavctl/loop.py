@@ -25,6 +25,7 @@ from uavctl.data import (
     StepInput,
     Timing,
     VehicleStatus,
+    raw_topic,
 )
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
 from uavctl.mavlink.link import Link
@@ -34,11 +35,6 @@ VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 LAND_REQUESTS = 5
-
-
-def raw_topic(link: str, *, outgoing: bool) -> str:
-    """Topic of a connection's raw bytes in one direction."""
-    return f"/raw/{link}/{'out' if outgoing else 'in'}"
 
 
 def make_links(config: Config) -> dict[str, Link]:

@@ -46,19 +46,20 @@ def fly(
     path = recording_path(out, config.name)
     check_room(path, config.log.free_bytes)
     connections = _connect(config)
-    recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
-    put_header(recorder, config, design, monotonic_ns())
-    loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     begun = time.perf_counter()
-    messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
-    try:
-        with stop_on_signals() as stopped, live_line(loop, duration, config.daemon.tick_s):
-            run_daemon(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=duration)
-    finally:
-        for connection in connections.values():
-            connection.close()
-        status = recorder.close()
+    with stop_on_signals() as stopped:
+        recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
+        try:
+            put_header(recorder, config, design, monotonic_ns())
+            loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+            messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
+            with live_line(loop, recorder, duration, config.daemon.tick_s):
+                run_daemon(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=duration)
+        finally:
+            for connection in connections.values():
+                connection.close()
+            status = recorder.close()
     summary = conclude(path, time.perf_counter() - begun, status)
     common.show(summary, lambda: render(summary))
     return 0 if summary.steps and status.ok else 1

@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Protocol
 
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from logs.flight_data import FlightData
@@ -31,6 +32,8 @@ from uavctl.loop import ControlLoop
 from uavctl.smpc.design import Design, design_record
 
 REFRESH_S = 0.25
+# How long another thread may keep the control thread waiting for the interpreter [s].
+SWITCH_INTERVAL_S = 0.0005
 _LIBRARIES = ("numpy", "scipy", "clarabel", "pymavlink", "msgspec", "mcap")
 
 
@@ -43,6 +46,10 @@ class Recording(Protocol):
 
     def close(self) -> RecorderStatus:
         """End the recording."""
+        ...
+
+    def status(self) -> RecorderStatus:
+        """How it is doing."""
         ...
 
 
@@ -90,6 +97,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
     Raises:
         RecordingError: the recording cannot be read, or nothing was flown.
     """
+    tell_losses(status)
     flight = FlightData.from_records(read(path))
     page = path.with_suffix(".html")
     summary = summarise(
@@ -119,8 +127,9 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def live_line(loop: ControlLoop, duration_s: float | None, tick_s: float) -> Iterator[None]:
+def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[None]:
     """Show what the loop does while it flies, from a thread of its own, on standard error."""
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
     done = threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
@@ -130,7 +139,8 @@ def live_line(loop: ControlLoop, duration_s: float | None, tick_s: float) -> Ite
             while not done.wait(REFRESH_S):
                 decision = loop.decision
                 if decision is not None:
-                    progress.update(task, completed=decision.tick * tick_s, description=_line(loop))
+                    line = _line(loop) + _alarm(recorder.status())
+                    progress.update(task, completed=decision.tick * tick_s, description=line)
 
         thread = threading.Thread(target=show, name="live", daemon=True)
         thread.start()
@@ -149,3 +159,21 @@ def _line(loop: ControlLoop) -> str:
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
     accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
     return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"
+
+
+def _alarm(status: RecorderStatus) -> str:
+    """What a person has to know of the recording while it is being made."""
+    if status.ok:
+        return ""
+    return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
+
+
+def tell_losses(status: RecorderStatus) -> None:
+    """Say after a flight what the recording lacks, and why."""
+    if status.failures or not status.ok:
+        messages().print(
+            f"[bold red]warning:[/] the recording lacks {status.dropped + status.refused + status.waiting} records "
+            f"({escape(status.reason or status.refusal or 'the disk was too slow')}); what is in it is whole. "
+            f"Files: {escape(', '.join(status.segments))}",
+            soft_wrap=True,
+        )

@@ -108,7 +108,7 @@ def _real_time(config: Config, controller: Controller, design: Design, path: Pat
         with (
             _simulator(config, recorder),
             stop_on_signals() as stopped,
-            live_line(loop, config.duration_s, config.daemon.tick_s),
+            live_line(loop, recorder, config.duration_s, config.daemon.tick_s),
         ):
             fly(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=config.duration_s, stop_limit_s=0.0)
     finally:

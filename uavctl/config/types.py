@@ -118,7 +118,9 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
     delays: Annotated[
         int | tuple[int, ...], Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]")
     ] = 0
-    gamma_max: Annotated[float, Meta(gt=0, lt=1, description="`search` keeps every γ at or below this")] = 0.985
+    gamma_max: Annotated[float, Meta(gt=0, lt=1, description="`search` and `greedy` keep every γ at or below this")] = (
+        0.985
+    )
     search_states: Annotated[Rows, Meta(description="states (n_x each) over whose mean cost `search` minimises")] = ()
 
 
@@ -214,7 +216,9 @@ class FrameConfig(Section, frozen=True, kw_only=True):
 class EstimatorConfig(Section, frozen=True, kw_only=True):
     """Kalman filter."""
 
-    position_std_m: Annotated[float, Meta(gt=0, description="standard deviation of a position sample, each axis [m]")]
+    position_std_m: Annotated[
+        float, Meta(gt=0, description="least standard deviation believed of a position sample, each axis [m]")
+    ]
     velocity_std_mps: Annotated[
         float, Meta(gt=0, description="standard deviation of a velocity sample, each axis [m/s]")
     ] = 0.05

@@ -1,0 +1,135 @@
+"""`uavctl fly` as a process, on real sockets, with a vehicle that shares no code with it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loopback_rig import make_loop
+
+from logs.reader import read, records
+from logs.replay import replay
+from uavctl.config import load_config
+from uavctl.config.load import parse
+from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
+
+SOURCE = Path(__file__).parent / "foreign_source.py"
+LIMIT_S = 60.0
+
+
+def free_port() -> int:
+    with socket.socket(type=socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@contextmanager
+def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    url = f"udpin://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "uavctl", "fly", "--vehicle", url, "--mocap", url, "--out", str(out), "--json"]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "recording to" in line:
+                break
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def source(port: int) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, str(SOURCE), str(port)], capture_output=True, text=True, check=True, timeout=LIMIT_S
+    )
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, Any], int, Path]:
+    """What the source saw, what the daemon summed up, its exit code, and the recording; SIGINT ends it."""
+    out = tmp_path_factory.mktemp("flight")
+    port = free_port()
+    with daemon(port, out) as process:
+        seen = source(port)
+        process.send_signal(signal.SIGINT)
+        summary, _ = process.communicate(timeout=LIMIT_S)
+        return seen, json.loads(summary), process.returncode, out / "flight.mcap"
+
+
+Flown = tuple[dict[str, Any], dict[str, Any], int, Path]
+
+
+def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target(flown: Flown) -> None:
+    seen, summary, code, _ = flown
+    assert code == 0
+    assert seen["setpoints"] > 150
+    assert seen["masks"] == [3135]  # acceleration only, vehicles.md
+    assert 0.1 < seen["largest_mps2"] <= 2.0 + 1e-6
+    assert seen["position_m"] == pytest.approx(load_config("room").target.position_m, abs=0.15)
+    assert summary["received"] > 50 and summary["lost"] is None
+
+
+def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:
+    decisions = [d for d in records(flown[3], Decision) if d.boundary and d.age_steps is not None]
+    horizon = load_config("room").smpc.horizon
+    at = next(i for i, d in enumerate(decisions) if d.mode in (ControlMode.BRAKE, ControlMode.HOLD))
+    assert decisions[at].age_steps == horizon
+    assert [d.age_steps for d in decisions[at - horizon : at]] == list(range(horizon))
+    assert all(d.mode is ControlMode.TRACK for d in decisions[at - horizon : at])
+    assert any(d.mode is ControlMode.TRACK and d.news for d in decisions[at + 1 :])
+    assert flown[1]["fallbacks"] == 1
+
+
+def test_setpoints_go_on_in_the_pause_and_the_hand_over_brakes(flown: Flown) -> None:
+    assert flown[0]["in_pause"] > 50
+    assert [s.source for s in records(flown[3], Setpoint)][-1] is SetpointSource.BRAKE
+    assert [d.mode for d in records(flown[3], Decision)][-1] in (ControlMode.LAND, ControlMode.STOPPED)
+
+
+def test_the_recording_replays_identically(flown: Flown) -> None:
+    header = next(records(flown[3], Header))
+    config = parse(header.config_toml, "recording").config
+    result = replay(read(flown[3]), lambda sink: make_loop(config, sink))
+    assert result.identical, result.first_difference
+    assert result.decisions > 200
+
+
+def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
+    with daemon(free_port(), tmp_path) as process:
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=LIMIT_S)
+        assert process.returncode == 1  # ran, but flew nothing
+    decisions = list(records(tmp_path / "flight.mcap", Decision))
+    assert decisions[-1].mode is ControlMode.STOPPED
+
+
+def test_the_pilot_engages_and_nobody_else(flown: Flown) -> None:
+    # The table itself is tested in test_mode; here: nobody but the pilot engaged.
+    hand_overs = [e.text for e in records(flown[3], Event) if e.code == "hand-over"]
+    assert hand_overs[0].startswith("waiting -> engaged")
+
+
+def test_a_port_in_use_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"udpin://127.0.0.1:{taken.getsockname()[1]}"
+        command = [sys.executable, "-m", "uavctl", "fly", "--vehicle", url, "--out", str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+    assert done.returncode == 2
+    assert url in done.stderr and "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
