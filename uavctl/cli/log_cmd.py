@@ -18,7 +18,7 @@ from logs.recover import recover as restore
 from logs.replay import ReplayResult
 from logs.replay import replay as replay_recording
 from logs.replay_tlog import ForeignReplay, replay_tlog
-from logs.report import write_report
+from logs.report import picture, write_report
 from logs.summary import render, summarise
 from logs.tlog import read_tlog
 from uavctl.build import build_controller, build_design
@@ -77,13 +77,22 @@ def replay(
 
 
 @log_app.command
-def report(flight: Flight, /, *, out: Annotated[Path | None, Parameter(help="page to write")] = None) -> int:
-    """Write the page of a recording."""
+def report(
+    flight: Flight,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="page to write; else beside the recording")] = None,
+    svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
+    json: Json = False,
+) -> int:
+    """Write the page of a recording: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     data = FlightData.from_records(read(flight))
     summary = summarise(data, wall_s=0.0, recording=str(flight), report=str(page))
     write_report(data, summary, page)
-    Common().show(summary, lambda: render(summary))
+    if svg is not None:
+        svg.write_text(picture(data), encoding="utf-8")
+    Common(json=json).show(summary, lambda: render(summary))
     return 0
 
 

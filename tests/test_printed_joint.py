@@ -1,0 +1,26 @@
+"""How the joint problem as printed ends in a general solver: recorded, because it decides what is compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uavctl.build import build_design
+from uavctl.config import load_config
+from uavctl.data import SolveStatus
+from uavctl.smpc.printed import SOLVERS_OWN, PrintedSolver
+
+START = np.array([35.0, -2.0, -20.0, -4.0])
+
+
+def test_the_joint_form_does_not_end_optimal_under_the_solver_s_own_settings() -> None:
+    design = build_design(load_config("paper"))
+    answer = PrintedSolver(design, joint=True, regularization=SOLVERS_OWN).solve(0, START, design.target)
+    assert answer.status in (SolveStatus.INACCURATE, SolveStatus.FAILED)
+
+
+def test_with_more_regularization_it_ends_optimal_at_the_cost_of_the_axes() -> None:
+    design = build_design(load_config("paper"))
+    joint = PrintedSolver(design, joint=True).solve(0, START, design.target)
+    assert joint.status is SolveStatus.OPTIMAL
+    assert joint.cost == pytest.approx(61669.93, abs=0.01)
