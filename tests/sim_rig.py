@@ -8,10 +8,12 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.peers import MOCAP, VEHICLE, Peers
-from uavctl.config import Config
+from uavctl.config import Config, load_config
 
 S = 1_000_000_000
 ACCEL_ONLY = 3135
+ARM, SET_MODE, LAND, TAKE_OFF, INTERVAL = 400, 176, 21, 22, 511
+CALM = ["plant.wind_std_mps2=[1e-9,1e-9,1e-9]", "sim.start_position_m=[0.0,0.0,-1.5]"]
 
 
 def decode(data: bytes) -> list[Any]:
@@ -96,3 +98,16 @@ class Bench:
     @property
     def speed_mps(self) -> float:
         return math.hypot(*self.peers.vehicle.velocity_mps)
+
+
+def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
+    return Bench(load_config("room", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne)
+
+
+def flying(one: Bench) -> tuple[float, ...]:
+    return tuple(one.peers.vehicle.input.tolist())
+
+
+def heartbeat(one: Bench) -> Any:
+    one.wait(1.0)
+    return one.of("HEARTBEAT")[-1]

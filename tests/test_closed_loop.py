@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def test_paper_flies_200_steps_without_slack_and_replays_identically(first: int)
         assert summary.fallbacks == 0
         outside += summary.state_violations
         config = load_config("paper", [f"sim.seed={seed}"])
-        result = replay(memory.entries, lambda sink, config=config: make_loop(config, sink))  # type: ignore[misc]
+        result = replay(memory.entries, partial(make_loop, config))
         assert result.identical, result.first_difference
         assert result.decisions == 2000
     assert outside < 0.01 * 4 * 200

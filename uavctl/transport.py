@@ -14,6 +14,7 @@ import os
 import selectors
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Protocol, cast
@@ -130,7 +131,7 @@ def _device_and_baud(url: str, rest: str) -> tuple[str, int]:
     return device, int(baud)
 
 
-class _Base:
+class _Base(ABC):
     """Counters and clock of every connection."""
 
     def __init__(self, url: str, now: Callable[[], int]) -> None:
@@ -161,9 +162,9 @@ class _Base:
 
     _ends_on_error = False
 
+    @abstractmethod
     def _read(self) -> bytes | None:
         """Read once; None if what came is not to be handed on. BlockingIOError if nothing is there."""
-        raise NotImplementedError
 
 
 class _Socket(_Base):
