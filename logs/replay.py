@@ -24,6 +24,7 @@ COMPARED = frozenset(
         "/uavctl/decision",
         "/uavctl/setpoint",
         "/uavctl/vehicle",
+        "/uavctl/event",
     }
 )
 Key = tuple[str, int]
@@ -59,37 +60,55 @@ class _Produced:
             self.waiting[topic, at_ns].append(record)
 
     def take(self, topic: str, at_ns: int) -> Record | None:
+        """The next record said under this topic and time."""
         queue = self.waiting.get((topic, at_ns))
-        return queue.popleft() if queue else None
+        found = queue.popleft() if queue else None
+        if queue is not None and not queue:
+            del self.waiting[topic, at_ns]
+        return found
+
+    def unsaid(self) -> Difference | None:
+        """What the loop has said and the recording has not."""
+        for topic, at_ns in self.waiting:
+            return Difference(topic=topic, at_ns=at_ns, field="", recorded="nothing", replayed="a record")
+        return None
 
 
 def replay(
     messages: Iterable[tuple[str, int, Record]],
     make_loop: Callable[[Sink], ControlLoop],
     tolerance: float = 0.0,
+    *,
+    finished: bool = True,
 ) -> ReplayResult:
-    """Drive a loop with the recorded inputs and compare all that it says.
+    """Drive a loop with the recorded inputs and compare all that it says, and that it says no more.
 
     Args:
         messages: (topic, log time [ns], record) in the order of recording.
         make_loop: builds the loop from the recording's configuration, around the given sink.
         tolerance: largest difference of two numbers that counts as none, relative to the larger
             of 1 and their size; 0 compares bit for bit. For a recording of another CPU type.
+        finished: the recording was closed in order; a torn one's last tick may lack records.
     """
     produced = _Produced()
     loop = make_loop(produced)
     decisions = compared = 0
     first: Difference | None = None
     for topic, at_ns, record in messages:
-        if isinstance(record, Datagram) and not record.outgoing:
-            loop.receive(record.link, record.data, record.at_ns)
-        elif isinstance(record, StepInput):
+        if isinstance(record, StepInput):
+            # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
+            first = first or produced.unsaid()
             deque(loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop), maxlen=0)
+        elif isinstance(record, Datagram) and not record.outgoing:
+            loop.receive(record.link, record.data, record.at_ns)
         if _is_compared(topic):
             compared += 1
             decisions += topic == "/uavctl/decision"
             first = first or _difference(topic, at_ns, record, produced.take(topic, at_ns), tolerance)
-    return ReplayResult(decisions=decisions, compared=compared, identical=first is None, first_difference=first)
+    if finished:
+        first = first or produced.unsaid()
+    identical = first is None and decisions > 0
+    return ReplayResult(decisions=decisions, compared=compared, identical=identical, first_difference=first)
 
 
 def _is_compared(topic: str) -> bool:

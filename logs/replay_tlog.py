@@ -78,6 +78,9 @@ def replay_tlog(
             tick += 1
         loop.receive(link, data, at_ns)
         datagrams += 1
+    if start_ns is not None:  # the tick that sees the last packets
+        deque(loop.tick(tick, start_ns + tick * tick_ns), maxlen=0)
+        tick += 1
     return _figures(collector, datagrams, tick)
 
 
@@ -85,6 +88,7 @@ def _figures(collector: _Collector, datagrams: int, ticks: int) -> ForeignReplay
     captured = np.array([s.captured_ns for s in collector.samples], dtype=np.int64)
     age_ms = np.array([(s.received_ns - s.captured_ns) * 1e-6 for s in collector.samples])
     boundaries = [d for d in collector.decisions if d.boundary]
+    ages = Counter(d.age_steps for d in boundaries if d.age_steps is not None)
     return ForeignReplay(
         datagrams=datagrams,
         positions=len(captured),
@@ -96,7 +100,7 @@ def _figures(collector: _Collector, datagrams: int, ticks: int) -> ForeignReplay
         solves=dict(Counter(d.solve.value for d in collector.decisions if d.solve is not None)),
         modes=dict(Counter(d.mode.value for d in collector.decisions)),
         age_ms=_quantiles(age_ms),
-        age_steps=dict(sorted(Counter(str(d.age_steps) for d in boundaries if d.age_steps is not None).items())),
+        age_steps={str(age): count for age, count in sorted(ages.items())},
     )
 
 

@@ -29,11 +29,10 @@ FAST, STILL = 1.0, 0.019
         (BRAKE, False, 2 * S, math.nan, PARAMETERS, HOLD),
         (BRAKE, False, 0, FAST, replace(PARAMETERS, brake_s=0.0), HOLD),
         (BRAKE, True, 2 * S - 1, FAST, PARAMETERS, BRAKE),
-        (BRAKE, True, 2 * S, FAST, PARAMETERS, LAND),
-        (BRAKE, True, 0, STILL, PARAMETERS, BRAKE),  # the last setpoint that the vehicle keeps is a brake
-        (BRAKE, True, 1, STILL, PARAMETERS, LAND),
-        (BRAKE, True, 1, STILL, STAY, STOPPED),
-        (BRAKE, True, 2 * S, FAST, STAY, STOPPED),
+        (BRAKE, True, 2 * S, FAST, PARAMETERS, HOLD),  # zero is the last setpoint that the vehicle keeps
+        (BRAKE, True, 0, STILL, PARAMETERS, HOLD),
+        (HOLD, True, 1, STILL, PARAMETERS, LAND),
+        (HOLD, True, 1, FAST, STAY, STOPPED),
         (HOLD, False, 3 * S - 1, FAST, PARAMETERS, HOLD),
         (HOLD, False, 3 * S, FAST, PARAMETERS, LAND),
         (HOLD, False, 99 * S, STILL, STAY, HOLD),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,7 @@ from logs.replay import replay
 from logs.replay_tlog import replay_tlog
 from logs.tlog import read_tlog
 from uavctl.config import load_config
-from uavctl.data import Datagram, Decision, Plan
+from uavctl.data import Datagram, Decision, Event, Plan, Setpoint, StepInput
 from uavctl.loop import VEHICLE
 
 DATA = Path(__file__).parent / "data"
@@ -65,6 +66,27 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
         lambda sink: make_loop(load_config("paper"), sink),
     )
     assert not result.identical
+
+
+def test_what_the_loop_says_beyond_the_recording_is_found(flown: Memory) -> None:
+    for kind in (Plan, Setpoint, Event):
+        poorer = [entry for entry in flown.entries if not isinstance(entry[2], kind)]
+        result = replay(poorer, lambda sink: make_loop(load_config("paper"), sink))
+        assert not result.identical and result.first_difference is not None
+        assert result.first_difference.recorded == "nothing"
+
+
+def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: Memory) -> None:
+    last = max(i for i, (_, _, r) in enumerate(flown.entries) if isinstance(r, StepInput))
+    torn = flown.entries[: last + 1]
+    build = partial(make_loop, load_config("paper"))
+    assert replay(torn, build, finished=False).identical
+    assert not replay(torn, build).identical
+
+
+def test_a_recording_without_a_decision_is_not_identical(flown: Memory) -> None:
+    result = replay(flown.entries[:1], lambda sink: make_loop(load_config("paper"), sink))
+    assert not result.identical and result.decisions == 0
 
 
 def test_a_foreign_recording_goes_through_parser_clock_estimator_and_controller() -> None:

@@ -265,3 +265,26 @@ def test_a_flood_does_not_hold_the_loop() -> None:
         for _ in range(300):
             peer.sendto(FRAME, ("127.0.0.1", port_of(connection)))
         assert 0 < len(connection.receive()) <= 256
+
+
+def test_setpoints_go_to_the_vehicle_and_not_to_cameras_that_spoke_first_on_the_same_port() -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as cameras, socket.socket(type=socket.SOCK_DGRAM) as vehicle:
+        connection = open_connection("udpin://127.0.0.1:0")
+        try:
+            port = port_of(connection)
+            for one in (cameras, vehicle):
+                one.settimeout(5.0)
+                one.sendto(b"\xfd" + one.getsockname()[1].to_bytes(2, "big"), ("127.0.0.1", port))
+            arrived: list[bytes] = []
+            while len(arrived) < 2:
+                wait({"one": connection}, time.monotonic_ns() + 1_000_000_000)
+                batch = connection.receive()
+                arrived += [data for data, _ in batch]
+                own = b"\xfd" + vehicle.getsockname()[1].to_bytes(2, "big")
+                for index, (data, _) in enumerate(batch):
+                    if data == own:
+                        connection.answer(index)
+            connection.send(b"setpoint")
+            assert vehicle.recv(64) == b"setpoint"
+        finally:
+            connection.close()

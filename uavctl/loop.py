@@ -67,12 +67,13 @@ class ControlLoop:
         self._stopwatch = stopwatch
         self._links = make_links(config)
         self._hand_over = HandOver()
-        self._state = initial_state(controller)
+        self._state = initial_state()
         self._inbox: deque[tuple[int, PositionSample | VehicleStatus]] = deque()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
         self._requests = 0
         self._asked_ns = 0
+        self.heard_vehicle = False  # whether the last datagram came from the vehicle that is flown
         self.vehicle: VehicleStatus | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
@@ -86,7 +87,9 @@ class ControlLoop:
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram that arrived at `at_ns`; ticks before that time will not see it."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
+        self.heard_vehicle = False
         for item in self._links[link].receive(data, at_ns):
+            self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._put("/uavctl/event", at_ns, item)
             else:
@@ -169,8 +172,6 @@ class ControlLoop:
         if out.plan is not None:
             self._put("/uavctl/plan", at_ns, out.plan)
         self._put("/uavctl/decision", at_ns, out.decision)
-        if out.setpoint is not None:
-            self._put("/uavctl/setpoint", at_ns, out.setpoint)
         for event in out.events:
             self._put("/uavctl/event", at_ns, event)
 
@@ -180,12 +181,19 @@ class ControlLoop:
         for event in events:
             self._put("/uavctl/event", at_ns, event)
         link = self._links[VEHICLE]
-        if sending in (Sending.SETPOINTS, Sending.NEUTRAL) and out.setpoint is not None:
+        takes = sending in (Sending.SETPOINTS, Sending.NEUTRAL) and not self._pilot_took_over()
+        if takes and out.setpoint is not None:
+            self._put("/uavctl/setpoint", at_ns, out.setpoint)
             yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
         if sending is Sending.LAND or (self._must_ask_again() and at_ns - self._asked_ns >= SECOND_NS):
             self._requests += 1
             self._asked_ns = at_ns
             yield self._send(VEHICLE, link.land(at_ns), at_ns)
+
+    def _pilot_took_over(self) -> bool:
+        """Whether a heartbeat that came after this late tick's grid time says that the vehicle is no longer ours."""
+        flown = self.vehicle is not None and self.vehicle.external
+        return flown and any(isinstance(item, VehicleStatus) and not item.external for _, item in self._inbox)
 
     def _must_ask_again(self) -> bool:
         """Whether the vehicle was asked to land, does not do so yet, and may be asked again."""
@@ -200,7 +208,7 @@ class ControlLoop:
         if self._next_stats_ns is None:
             self._next_stats_ns = at_ns
         if at_ns >= self._next_stats_ns:
-            self._next_stats_ns += SECOND_NS
+            self._next_stats_ns = at_ns + SECOND_NS
             for link in self._links.values():
                 self._put("/uavctl/link", at_ns, link.stats(at_ns))
 

@@ -49,6 +49,10 @@ class Connection(Protocol):
         """All that has arrived: (data, monotonic time of reading [ns]); empty if nothing has."""
         ...
 
+    def answer(self, index: int) -> None:
+        """Send to the sender of the `index`-th datagram of the last `receive`, where a connection has several peers."""
+        ...
+
     def send(self, data: bytes) -> None:
         """Send, or drop and count; never blocks, never raises."""
         ...
@@ -160,6 +164,10 @@ class _Base(ABC):
                 arrived.append((data, self._now()))
         return arrived
 
+    def answer(self, index: int) -> None:
+        """See `Connection`."""
+        del index  # there is only one peer
+
     _ends_on_error = False
 
     @abstractmethod
@@ -192,14 +200,17 @@ class _Socket(_Base):
 
 
 class _UdpIn(_Socket):
-    """Bound UDP socket. It answers the first peer that speaks MAVLink; another one only after silence.
+    """Bound UDP socket. It answers the peer that it was told to, and until then the first one that speaks MAVLink.
 
-    What others send is handed on too: cameras and vehicle may share a port.
+    What others send is handed on too: cameras and vehicle may share a port. A first speaker that falls silent is
+    followed by another one; who was chosen by `answer` stays until another one is.
     """
 
     def __init__(self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int]) -> None:
         super().__init__(url, family, socket.SOCK_DGRAM, now)
         self._peer: Address | None = None
+        self._chosen = False
+        self._senders: list[Address] = []
         self._heard_ns = 0
         self._attempt(
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
@@ -210,11 +221,24 @@ class _UdpIn(_Socket):
         data, peer = self._socket.recvfrom(_LARGEST)
         now_ns = self._now()
         if data[:1] and data[0] in _MAVLINK:
-            if self._peer is None or now_ns - self._heard_ns > PEER_SILENCE_NS:
+            silent = now_ns - self._heard_ns > PEER_SILENCE_NS
+            if self._peer is None or (silent and not self._chosen):
                 self._peer = peer
             if peer == self._peer:
                 self._heard_ns = now_ns
-        return data or None
+        if not data:
+            return None
+        self._senders.append(peer)
+        return data
+
+    def receive(self) -> list[tuple[bytes, int]]:
+        """See `Connection`."""
+        self._senders.clear()
+        return super().receive()
+
+    def answer(self, index: int) -> None:
+        """See `Connection`."""
+        self._peer, self._chosen = self._senders[index], True
 
     def send(self, data: bytes) -> None:
         """See `Connection`; without a peer there is nobody to send to, which is no error."""

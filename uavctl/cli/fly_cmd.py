@@ -20,6 +20,8 @@ from uavctl.daemon import fly as run_daemon
 from uavctl.loop import ControlLoop
 from uavctl.transport import Connection, open_connection
 
+LANDING_S = 10.0  # after braking: for asking the vehicle to land
+
 
 def fly(
     *,
@@ -55,7 +57,9 @@ def fly(
             loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
             messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
             with live_line(loop, recorder, duration, config.daemon.tick_s):
-                run_daemon(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=duration)
+                limit_s = config.fallback.brake_s + LANDING_S
+                ticker = Ticker(tick_ns, dt_ns)
+                run_daemon(loop, connections, ticker, stopped, duration_s=duration, stop_limit_s=limit_s)
         finally:
             for connection in connections.values():
                 connection.close()

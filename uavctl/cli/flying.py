@@ -101,7 +101,11 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
     flight = FlightData.from_records(read(path))
     page = path.with_suffix(".html")
     summary = summarise(
-        flight, wall_s=wall_s, recording=str(path), report=str(page), recorder_dropped=status.dropped + status.refused
+        flight,
+        wall_s=wall_s,
+        recording=str(path),
+        report=str(page),
+        recorder_dropped=0 if status.ok else status.dropped + status.refused + status.waiting,
     )
     write_report(flight, summary, page)
     return summary
@@ -129,6 +133,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 @contextmanager
 def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[None]:
     """Show what the loop does while it flies, from a thread of its own, on standard error."""
+    before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
     done = threading.Event()
@@ -149,6 +154,7 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
         finally:
             done.set()
             thread.join()
+            sys.setswitchinterval(before_s)
 
 
 def _line(loop: ControlLoop) -> str:

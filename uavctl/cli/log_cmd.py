@@ -68,10 +68,15 @@ def replay(
     """
     if flight.suffix == ".tlog":
         return _replay_foreign(flight, common)
+    if common.overrides or common.config != DEFAULTS.config:
+        raise UsageError(
+            "--config and --set are for a .tlog: a recording of ours is replayed with its own configuration"
+        )
     recorded = header(flight)
     _warn_of_differences(recorded)
     config = parse(recorded.config_toml, f"{flight} (configuration)").config
-    result = replay_recording(read(flight), _loop_maker(config), tolerance)
+    finished = recording_info(flight).finished
+    result = replay_recording(read(flight), _loop_maker(config), tolerance, finished=finished)
     common.show(result, lambda: _replay_table(result))
     return 0 if result.identical else 1
 

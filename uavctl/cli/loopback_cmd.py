@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
 from typing import Annotated
@@ -78,44 +78,61 @@ class _Timed:
         self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
 
 
+class _InterruptedError(Exception):
+    """The operator asked for the end of a flight in virtual time."""
+
+
 def _lockstep(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
     recorder = SyncRecorder(path, config.log.chunk_bytes, config.log.queue)
-    put_header(recorder, config, design, started_ns=0)
-    loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
-    with Progress(console=messages(), transient=True) as progress:
-        task = progress.add_task("flying in virtual time", total=config.duration_s)
-        world = World(
-            config,
-            _Timed(loop),
-            on_truth=lambda truth: recorder.put(TRUTH, truth.at_ns, truth),
-            on_progress=lambda flown_s: progress.update(task, completed=flown_s),
-        )
-        begun = time.perf_counter()
-        world.run(config.duration_s)
+    begun = time.perf_counter()
+    try:
+        put_header(recorder, config, design, started_ns=0)
+        loop = _Timed(ControlLoop(config, controller, recorder, time.perf_counter_ns))
+        with (
+            suppress(_InterruptedError),
+            stop_on_signals() as stopped,
+            Progress(console=messages(), transient=True) as progress,
+        ):
+            task = progress.add_task("flying in virtual time", total=config.duration_s)
+
+            def show(flown_s: float) -> None:
+                progress.update(task, completed=flown_s)
+                if stopped():
+                    raise _InterruptedError
+
+            def record(truth: Truth) -> None:
+                recorder.put(TRUTH, truth.at_ns, truth)
+
+            world = World(config, loop, on_truth=record, on_progress=show)
+            begun = time.perf_counter()
+            world.run(config.duration_s)
+    finally:
         wall_s = time.perf_counter() - begun
-    return conclude(path, wall_s, recorder.close())
+        status = recorder.close()
+    return conclude(path, wall_s, status)
 
 
 def _real_time(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
-    recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
-    put_header(recorder, config, design, monotonic_ns())
-    loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
-    urls = {"vehicle": config.daemon.vehicle, "mocap": config.daemon.mocap}
-    connections = {name: open_connection(url) for name, url in urls.items()}
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
-    begun = time.perf_counter()
-    try:
-        with (
-            _simulator(config, recorder),
-            stop_on_signals() as stopped,
-            live_line(loop, recorder, config.duration_s, config.daemon.tick_s),
-        ):
-            fly(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=config.duration_s, stop_limit_s=0.0)
-    finally:
+    urls = {"vehicle": config.daemon.vehicle, "mocap": config.daemon.mocap}
+    with ExitStack() as stack:
+        stopped = stack.enter_context(stop_on_signals())
+        connections = {name: open_connection(url) for name, url in urls.items()}
         for connection in connections.values():
-            connection.close()
-        status = recorder.close()
-    return conclude(path, time.perf_counter() - begun, status)
+            stack.callback(connection.close)
+        recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
+        try:
+            put_header(recorder, config, design, monotonic_ns())
+            loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+            stack.enter_context(_simulator(config, recorder))
+            stack.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            begun = time.perf_counter()
+            fly(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=config.duration_s, stop_limit_s=0.0)
+            wall_s = time.perf_counter() - begun
+            stack.close()  # the simulator's last words go into the recording
+        finally:
+            status = recorder.close()
+    return conclude(path, wall_s, status)
 
 
 def _on_loopback(config: Config) -> Config:
@@ -143,7 +160,7 @@ def _simulator(config: Config, sink: Sink) -> Iterator[None]:
     theirs.close()
     listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)
     try:
-        if not ours.poll(START_LIMIT_S) or not isinstance(ours.recv(), Ready):
+        if not _ready(ours):
             raise UavctlError(f"the simulator did not start within {START_LIMIT_S:g} s; see the messages above")
         listener.start()
         yield
@@ -155,6 +172,14 @@ def _simulator(config: Config, sink: Sink) -> Iterator[None]:
         if listener.ident is not None:
             listener.join(START_LIMIT_S)
         ours.close()
+
+
+def _ready(pipe: Pipe) -> bool:
+    """Wait for the simulator's ports; False if it ended or took too long."""
+    try:
+        return pipe.poll(START_LIMIT_S) and isinstance(pipe.recv(), Ready)
+    except EOFError:
+        return False
 
 
 def _listen(pipe: Pipe, sink: Sink) -> None:

@@ -84,11 +84,10 @@ def advance(fallback: Fallback, at_ns: int, speed_mps: float, parameters: Fallba
         return _to(fallback, ControlMode.STOPPED, at_ns)
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
     if mode is ControlMode.BRAKE and (speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s):
-        if fallback.stopping:
-            if elapsed_s <= 0.0:  # a vehicle keeps its last setpoint for a while: that one must be a brake
-                return fallback
-            return _to(fallback, ControlMode.LAND if parameters.land else ControlMode.STOPPED, at_ns)
         return _to(fallback, ControlMode.HOLD, at_ns)
+    if mode is ControlMode.HOLD and fallback.stopping:
+        # A vehicle keeps its last setpoint for a while: that one is HOLD's zero, sent at least once.
+        return _to(fallback, ControlMode.LAND if parameters.land else ControlMode.STOPPED, at_ns)
     if mode is ControlMode.HOLD and parameters.land and elapsed_s >= parameters.hold_s:
         return _to(fallback, ControlMode.LAND, at_ns)
     return fallback

@@ -1,0 +1,146 @@
+"""The control loop without clock and sockets: what goes to the vehicle, and what never does."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from loopback_rig import Memory, make_loop
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_rig import decode
+
+from sim.peers import Peers
+from uavctl.config import load_config
+from uavctl.data import ControlMode, Datagram, Event, Setpoint, SetpointSource
+
+TICK_NS = 50_000_000
+OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)
+
+
+class Rig:
+    """The loop against the simulated peers; the vehicle's heartbeats can be replaced by ones of our own."""
+
+    def __init__(self, *overrides: str) -> None:
+        self.config = load_config("room", overrides)
+        self.memory = Memory()
+        self.loop = make_loop(self.config, self.memory)
+        self.peers = Peers(self.config, 0)
+        self.tick = 0
+        self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def run(self, ticks: int, *, stop: bool = False, deaf: bool = False, listening: bool = True) -> list[str]:
+        """Names of the messages that the vehicle was sent; `deaf` takes the vehicle's own words away."""
+        sent: list[str] = []
+        for _ in range(ticks):
+            at_ns = self.tick * TICK_NS
+            for arrival_ns, link, data in self.peers.advance(at_ns):
+                if not (deaf and link == "vehicle"):
+                    self.loop.receive(link, data, arrival_ns)
+            for one in self.loop.tick(self.tick, at_ns, stop=stop):
+                if one.link == "vehicle":
+                    sent += [message.get_type() for message in decode(one.data)]
+                if listening:
+                    self.peers.receive(one.link, one.data, at_ns)
+            self.tick += 1
+        return sent
+
+    def heartbeat(self, custom_mode: int, *, armed: bool = True, late_ns: int = 0) -> None:
+        base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+        message = self._mav.heartbeat_encode(
+            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base, custom_mode, mavlink.MAV_STATE_ACTIVE
+        )
+        self.loop.receive("vehicle", message.pack(self._mav), self.tick * TICK_NS + late_ns)
+
+
+SETPOINT, LAND = "SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"
+
+
+def test_an_armed_vehicle_in_its_external_mode_gets_one_setpoint_a_tick() -> None:
+    rig = Rig()
+    rig.run(4)  # the first position is under way
+    assert rig.run(100).count(SETPOINT) == 100
+    assert rig.loop.decision is not None and rig.loop.decision.mode is ControlMode.TRACK
+
+
+def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back() -> None:
+    rig = Rig()
+    rig.run(40)
+    rig.heartbeat(HOLD_MODE)
+    after = rig.run(1, deaf=True)
+    rig.heartbeat(OFFBOARD)
+    after += rig.run(100, deaf=True)
+    assert SETPOINT not in after and LAND not in after
+    released_ns = next(e.at_ns for e in rig.memory.of(Event) if "released" in e.text)
+    assert max(s.at_ns for s in rig.memory.of(Setpoint)) < released_ns  # what is recorded is what was sent
+
+
+def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() -> None:
+    rig = Rig()
+    rig.run(40)
+    rig.heartbeat(HOLD_MODE, late_ns=20_000_000)  # came after the tick's grid time, before the tick ran
+    assert SETPOINT not in rig.run(2, deaf=True)
+
+
+def test_a_silent_vehicle_gets_no_setpoints_until_it_is_heard_again() -> None:
+    rig = Rig()
+    rig.run(40)
+    during = rig.run(100, deaf=True)
+    assert during.count(SETPOINT) <= 61  # three seconds without a heartbeat
+    assert SETPOINT not in rig.run(20, deaf=True)
+    rig.heartbeat(OFFBOARD)
+    assert rig.run(20, deaf=True).count(SETPOINT) == 20
+    told = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
+    assert len(told) == 2 and "lost" in told[0] and "back" in told[1]
+
+
+def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
+    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    sent = rig.run(400)
+    assert sent.count(LAND) == 1
+    assert rig.peers.autopilot.mode_name == "AUTO.LAND"
+    assert rig.loop.finished
+    assert SETPOINT not in sent[sent.index(LAND) :]
+
+
+def test_landing_is_asked_for_again_once_a_second_and_five_times_at_most() -> None:
+    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    # The vehicle does not hear us: it stays in OFFBOARD, as far as its heartbeats tell.
+    sent = rig.run(60)
+    for _ in range(400):
+        if rig.tick % 10 == 0:
+            rig.heartbeat(OFFBOARD)
+        sent += rig.run(1, deaf=True, listening=False)
+    assert sent.count(LAND) == 5
+    asked = [d.at_ns for d in rig.memory.of(Datagram) if d.outgoing and decode(d.data)[0].get_type() == LAND]
+    assert all(b - a == 1_000_000_000 for a, b in pairwise(asked))
+    assert rig.loop.finished
+
+
+def test_landing_is_not_asked_for_again_once_the_vehicle_lands() -> None:
+    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    sent = rig.run(60)
+    while LAND not in sent:
+        if rig.tick % 10 == 0:
+            rig.heartbeat(OFFBOARD)
+        sent += rig.run(1, deaf=True, listening=False)
+    rig.heartbeat(LAND_MODE)
+    assert LAND not in rig.run(100, deaf=True, listening=False)
+
+
+def test_the_operator_s_stop_brakes_sends_zero_and_asks_for_landing() -> None:
+    rig = Rig()
+    rig.run(30)  # on its way, at speed
+    sent = rig.run(200, stop=True)
+    setpoints = rig.memory.of(Setpoint)
+    braking = [s for s in setpoints if s.source is SetpointSource.BRAKE]
+    assert len(braking) > 5
+    assert setpoints[-1].source is SetpointSource.HOLD and setpoints[-1].accel_mps2 == (0.0, 0.0, 0.0)
+    assert sent.count(LAND) == 1 and rig.loop.finished
+    assert rig.peers.autopilot.mode_name == "AUTO.LAND"
+
+
+def test_without_landing_the_stop_ends_with_zero_and_asks_for_nothing() -> None:
+    rig = Rig("fallback.land=false", "fallback.brake_s=0.2")
+    rig.run(30)
+    sent = rig.run(100, stop=True)
+    assert LAND not in sent and rig.loop.finished
+    assert rig.memory.of(Setpoint)[-1].accel_mps2 == (0.0, 0.0, 0.0)
