@@ -74,16 +74,21 @@ def later_segments(path: Path) -> tuple[Path, ...]:
 
 
 def check_room(path: Path, free_bytes: int) -> int:
-    """Free space for the recording `path` [bytes].
+    """Free space for the new recording `path` [bytes]; its folder is made.
 
     Raises:
-        RecordingError: less than `free_bytes`, or the folder cannot be made or written.
+        RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.
     """
     try:
+        taken = [one for one in (path, *later_segments(path)) if one.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
     except OSError as error:
-        raise RecordingError(f"{path.parent}: no room for a recording ({error}); choose another folder") from error
+        raise RecordingError(
+            f"{path.parent}: the folder cannot be made ({error.strerror}); choose another folder for the recording"
+        ) from error
+    if taken:
+        raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another folder")
     if not os.access(path.parent, os.W_OK):
         raise RecordingError(f"{path.parent}: not writable; choose another folder for the recording")
     if free < free_bytes:

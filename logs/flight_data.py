@@ -106,8 +106,18 @@ class FlightData:
     @cached_property
     def flown(self) -> tuple[Decision, ...]:
         """Ticks up to the operator's stop: what comes after it is the hand-over, not the flight."""
-        stopped = min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+        stopped = self.stopped_ns
         return tuple(d for d in self.decisions if stopped is None or d.at_ns < stopped)
+
+    @cached_property
+    def stopped_ns(self) -> int | None:
+        """When the operator asked for the hand-over [ns]; None if nobody did."""
+        return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+
+    @cached_property
+    def virtual_time(self) -> bool:
+        """Whether ticks were measured and none was late by a single nanosecond: no real clock does that."""
+        return bool(self.timings) and not any(timing.lateness_ns for timing in self.timings)
 
     @cached_property
     def tick_ns(self) -> int:
@@ -136,17 +146,18 @@ class FlightData:
         return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
     def spans(self, modes: Collection[ControlMode]) -> list[tuple[float, float]]:
-        """Spans of time [s] in which the mode was one of `modes`."""
+        """Spans of flown time [s], so none after the operator's stop, in which the mode was one of `modes`."""
         spans: list[tuple[float, float]] = []
         begun: int | None = None
-        for decision in self.decisions:
+        for decision in self.flown:
             if decision.mode in modes and begun is None:
                 begun = decision.at_ns
             elif decision.mode not in modes and begun is not None:
                 spans.append((self._second(begun), self._second(decision.at_ns)))
                 begun = None
         if begun is not None:
-            spans.append((self._second(begun), self.duration_s))
+            end_s = self.duration_s if self.stopped_ns is None else self._second(self.stopped_ns)
+            spans.append((self._second(begun), end_s))
         return spans
 
     def lost_at_s(self) -> Floats:
@@ -210,4 +221,4 @@ def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
     known = np.array([truth.at_ns for truth in flight.truths], dtype=np.int64)
     inside = np.searchsorted(known, at_ns + flight.design.dt_ns) - 1
     index = np.where(known[inside] > at_ns, inside, _nearest(known, at_ns))
-    return np.array([truth.input for truth in flight.truths])[index].reshape(len(at_ns), -1)
+    return np.array([truth.input for truth in flight.truths])[index].reshape(len(at_ns), len(flight.design.q_u))

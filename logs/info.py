@@ -12,6 +12,7 @@ from logs.encoding import decode
 from logs.reader import segment_files, walk
 from logs.topics import HEADER, RECORDER, RecorderNote
 from uavctl.data import Header
+from uavctl.errors import RecordingError
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,7 +90,7 @@ def info(path: Path) -> RecordingInfo:
     """Summary of a recording, finished, torn or damaged.
 
     Raises:
-        RecordingError: there is no such recording, or a file of it is none.
+        RecordingError: there is no such recording, it holds nothing, or a file of it is none.
     """
     courses: dict[str, _Course] = {}
     damage: list[str] = []
@@ -115,6 +116,8 @@ def info(path: Path) -> RecordingInfo:
             record = decode(topic, item.data, item.at_ns)
             note = record if isinstance(record, RecorderNote) else note
             origin = _origin(record) if isinstance(record, Header) else origin
+    if not courses and not damage:
+        raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
     files = segment_files(path)
     flown = [one for topic, one in courses.items() if topic not in (HEADER, RECORDER)] or list(courses.values())
     start_ns = min((one.first_ns for one in flown), default=0)

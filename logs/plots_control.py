@@ -104,7 +104,7 @@ def _draw_held(ax: Axes, t_s: Floats, values: Floats, dt_s: float, shade: str) -
 
 
 def timing(flight: FlightData) -> Iterator[Drawing]:
-    """Decision times and tick lateness, if the shell measured any."""
+    """Decision times, if the shell measured any, and tick lateness, if there can be any."""
     if not flight.timings:
         return
     solved = {d.tick for d in flight.decisions if d.solve is not None}
@@ -112,6 +112,8 @@ def timing(flight: FlightData) -> Iterator[Drawing]:
     yield _times(
         flight, "time-decision", "Decision time", flight.seconds([t.at_ns for t in chosen]), decision_times_us(flight)
     )
+    if flight.virtual_time:
+        return
     late_us = np.array([t.lateness_ns for t in flight.timings]) * 1e-3
     yield _times(flight, "time-late", "Tick lateness", flight.seconds([t.at_ns for t in flight.timings]), late_us)
 

@@ -82,7 +82,7 @@ def header(path: Path) -> Header:
     """
     for record in records(path, Header):
         return record
-    raise RecordingError(f"{path}: no header; it was ended before its first chunk was written")
+    raise RecordingError(f"{path}: no header: it was ended before its first chunk was written, or that chunk was lost")
 
 
 def _good(path: Path) -> Iterator[Message]:

@@ -26,7 +26,7 @@ class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
     lost_bytes: int  # damaged bytes that held messages, or may have
     chunks_bad: int  # damaged places, a torn end included
     finished: bool  # every file of the recording had been closed in order
-    damage: tuple[str, ...]  # in words: file, offset, reason
+    damage: tuple[str, ...]  # in words: file, offset, reason; and if losses at the end cannot be counted
 
     @property
     def lossless(self) -> bool:
@@ -43,6 +43,7 @@ class _Tally:
         self.lost_bytes = 0
         self.damage: list[Damage] = []
         self.finished = True
+        self.open_ended = False  # nothing tells how many messages came after the last restored one
         self._next: int | None = None
         self._doubtful_bytes = 0  # damaged since the last message
 
@@ -60,7 +61,12 @@ class _Tally:
         self.damage.append(item)
         self._doubtful_bytes += item.length
 
+    def file_ended(self, item: End) -> None:
+        self.finished &= item.finished
+        self.open_ended = not item.finished  # of the last file: a later one's numbers tell what an earlier one lost
+
     def end(self) -> None:
+        self.open_ended |= self._doubtful_bytes > 0
         self.lost_bytes += self._doubtful_bytes
         self._doubtful_bytes = 0
 
@@ -101,20 +107,23 @@ def _copy(src: Path, segment: Segment) -> RecoverResult:
         if isinstance(item, Damage):
             tally.damaged(item)
         elif isinstance(item, End):
-            tally.finished &= item.finished
+            tally.file_ended(item)
         else:
             tally.message(item)
             at_ns = item.at_ns
             if not item.repeated:
                 segment.add(Entry(item.definition, tally.messages, item.at_ns, item.data))
     tally.end()
+    damage = [str(one) for one in tally.damage]
+    if tally.open_ended:
+        damage.append(f"{src}: the end is torn or damaged: messages after the last restored one cannot be counted")
     result = RecoverResult(
         messages=tally.messages,
         messages_lost=tally.messages_lost,
         lost_bytes=tally.lost_bytes,
         chunks_bad=len(tally.damage),
         finished=tally.finished,
-        damage=tuple(map(str, tally.damage)),
+        damage=tuple(damage),
     )
     if not result.lossless:
         segment.add(Entry(definition(RECORDER), tally.messages + 1, at_ns, encode(_note(src, result, at_ns))))

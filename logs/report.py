@@ -13,6 +13,7 @@ from logs.plots_control import picture
 from logs.summary import FlightSummary, rows
 from logs.words import story
 from uavctl.data import Event
+from uavctl.errors import RecordingError
 
 __all__ = ["picture", "report_html", "write_report"]
 
@@ -21,6 +22,7 @@ _TARGET = Mark("dotted", "target", "target")
 _ESTIMATE = Mark("line", "estimate", "estimate")
 _FALLBACK = Mark("band", "fallback", "fallback")
 _NO_PLAN = "No plan was flown, so there is nothing to compare."
+_LATENESS = "lateness is from a tick's deadline to its start"
 _NO_TIMING = "No times were measured in this flight."
 
 
@@ -28,9 +30,13 @@ def write_report(flight: FlightData, summary: FlightSummary, path: Path) -> None
     """Write the page.
 
     Raises:
-        OSError: the file cannot be written.
+        RecordingError: the file cannot be written.
     """
-    path.write_text(report_html(flight, summary), encoding="utf-8")
+    text = report_html(flight, summary)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
 
 
 def report_html(flight: FlightData, summary: FlightSummary) -> str:
@@ -125,9 +131,10 @@ def _plans_section(flight: FlightData) -> Section:
 
 def _timing_section(flight: FlightData) -> Section:
     drawings = list(plots_control.timing(flight))
+    late = "in virtual time no tick is late" if flight.virtual_time else _LATENESS
     return Section(
         "Time taken",
-        "Decision time is spent in the core at ticks that solve; lateness is from a tick's deadline to its start.",
+        f"Decision time is spent in the core at ticks that solve; {late}.",
         page.grid(drawings) if drawings else page.paragraph(_NO_TIMING),
     )
 

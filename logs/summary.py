@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from itertools import pairwise
 
 import msgspec
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 
 from logs.design_view import Floats
 from logs.flight_data import FALLBACK, FLOWN, FlightData
@@ -25,6 +27,15 @@ class Spread(msgspec.Struct, frozen=True, kw_only=True):
     p50: float | None = None
     p99: float | None = None
     max: float | None = None
+
+
+class Ending(StrEnum):
+    """What became of the vehicle, as far as the controller was concerned."""
+
+    FLYING = "flying"  # the recording ends in flight
+    LANDED = "landed by the fallback"
+    HANDED_OVER = "handed over by the operator"
+    WAITING = "waiting"  # for positions, or for a vehicle that takes setpoints
 
 
 class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,7 +57,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru
     recording: str | None
     report: str | None
-    wall_s: float
+    wall_s: float | None  # None when it is not known any more
     decision_us: Spread  # time in the core, ticks with a solve (all ticks if there was none)
     tick_lateness_us: Spread
     state_source: str  # "truth", or "estimate" when the true state is unknown
@@ -60,17 +71,21 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
     final_error_m: float | None  # distance from the target at the last flown boundary
     recorder_dropped: int  # records that the disk was too slow for
+    ended: Ending
 
 
 def summarise(
     flight: FlightData,
     *,
-    wall_s: float,
+    wall_s: float | None,
     recording: str | None = None,
     report: str | None = None,
     recorder_dropped: int = 0,
 ) -> FlightSummary:
-    """Figures of a flight; `recording` and `report` are paths as the user should see them."""
+    """Figures of a flight.
+
+    `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day.
+    """
     steps = flight.steps
     flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}
@@ -98,7 +113,7 @@ def summarise(
         decision_us=spread(decision_times_us(flight)),
         tick_lateness_us=spread(np.array([timing.lateness_ns for timing in flight.timings]) * 1e-3),
         state_source="truth" if steps.from_truth else "estimate",
-        real_time_factor=flight.duration_s / wall_s if wall_s > 0 else None,
+        real_time_factor=flight.duration_s / wall_s if wall_s else None,
         accepted=accepted,
         rejected=sum(d.rejected for d in flight.decisions),
         solves=len(solves),
@@ -108,6 +123,7 @@ def summarise(
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
         final_error_m=float(error_m[-1]) if len(error_m) else None,
         recorder_dropped=recorder_dropped,
+        ended=_ending(flight),
     )
 
 
@@ -154,7 +170,7 @@ def render(summary: FlightSummary) -> Table:
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for name, value in rows(summary):
-        table.add_row(name, value)
+        table.add_row(name, Text(value))  # paths and names may look like markup
     return table
 
 
@@ -163,9 +179,9 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     s = summary
     lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
     seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
-    speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
     found = [
-        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s in {number(s.wall_s)} s{speed}"),
+        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
+        ("Ended", s.ended.value),
         ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
         ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),
@@ -175,7 +191,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
         ("Cost", f"{s.cost:.6g}{seen}"),
         ("Distance from target", _distance(s)),
         ("Decision time", _times(s.decision_us)),
-        ("Tick lateness", f"{_times(s.tick_lateness_us)}; {s.missed_ticks} ticks missed"),
+        _punctuality(s),
     ]
     if s.recorder_dropped:
         found.append(("Recording", f"{s.recorder_dropped} records dropped: the disk was too slow"))
@@ -183,10 +199,24 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     return found
 
 
+def _pace(s: FlightSummary) -> str:
+    if s.wall_s is None:
+        return ""
+    speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
+    return f" in {number(s.wall_s)} s{speed}"
+
+
+def _punctuality(s: FlightSummary) -> tuple[str, str]:
+    if s.tick_lateness_us.max == 0 and not s.missed_ticks:
+        return "Clock", "virtual time"
+    return "Tick lateness", f"{_times(s.tick_lateness_us)}; {s.missed_ticks} ticks missed"
+
+
 def _distance(s: FlightSummary) -> str:
     if s.final_error_m is None or s.settled_error_m is None:
         return "not flown"
-    return f"{number(s.final_error_m)} m at the end; {number(s.settled_error_m)} m over the last quarter (rms)"
+    final, settled = number(s.final_error_m), number(s.settled_error_m)
+    return f"{final} m at the last flown step; {settled} m over the last quarter (rms)"
 
 
 def _share(part: int, whole: int) -> str:
@@ -212,6 +242,15 @@ def number(value: float, decimals: int = 3) -> str:
 def count(amount: int, noun: str) -> str:
     """An amount with its noun, e.g. "1 step"."""
     return f"{amount} {noun}{'' if amount == 1 else 's'}"
+
+
+def _ending(flight: FlightData) -> Ending:
+    modes = [decision.mode for decision in flight.flown]
+    if ControlMode.LAND in modes:  # for one tick; nobody flies after it
+        return Ending.LANDED
+    if not modes or modes[-1] is ControlMode.WAIT:
+        return Ending.WAITING
+    return Ending.FLYING if flight.stopped_ns is None else Ending.HANDED_OVER
 
 
 def _fallback_entries(modes: list[ControlMode]) -> int:

@@ -7,32 +7,28 @@ from itertools import groupby
 import numpy as np
 
 from logs.flight_data import FALLBACK, FLOWN, FlightData
-from logs.summary import FlightSummary, count, input_outside, number, position_error_m, state_outside
+from logs.summary import Ending, FlightSummary, count, input_outside, number, position_error_m, state_outside
 from uavctl.data import ControlMode
 
-_ENDINGS = {
-    ControlMode.WAIT: "At the end the controller was waiting for positions or for a vehicle to fly.",
-    ControlMode.TRACK: "At the end a plan was being flown.",
+_IN_FLIGHT = {
     ControlMode.BRAKE: "The recording ends while the fallback was braking.",
     ControlMode.HOLD: "The recording ends while the fallback held zero acceleration.",
-    ControlMode.LAND: "The flight ended in the vehicle's own landing, which the fallback asked for.",
-    ControlMode.STOPPED: "At the end the vehicle had been handed over.",
 }
 
 
 def story(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Sentences that say what happened; each is true of this flight's data."""
     if summary.final_error_m is None or summary.settled_error_m is None:
-        last = flight.decisions[-1]
-        return [f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}.", _ENDINGS[last.mode]]
+        last = (flight.flown or flight.decisions)[-1]
+        return [f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}."]
     return [
         _engaged(flight, summary, summary.final_error_m, summary.settled_error_m),
         _silence(flight, summary),
-        *_fallback(flight, summary),
+        _fallback(flight, summary),
         _state_limits(flight, summary),
         _input_limits(flight, summary),
         _plans(summary),
-        _ENDINGS[flight.decisions[-1].mode],
+        _ending(flight, summary),
     ]
 
 
@@ -68,19 +64,19 @@ def _silence(flight: FlightData, s: FlightSummary) -> str:
     )
 
 
-def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
+def _fallback(flight: FlightData, s: FlightSummary) -> str:
+    if not s.fallbacks:
+        return "The fallback was never needed."
     spans = flight.spans(FALLBACK)
-    if not spans:
-        return ["The fallback was never needed."]
     first = next(d for d in flight.flown if d.mode in FALLBACK)
     total_s = sum(end - begin for begin, end in spans)
     modes = [mode.value for mode, _ in groupby(d.mode for d in flight.flown if d.mode in FALLBACK)]
     course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
     times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
-    return [
+    return (
         f"The fallback {course}took over {times}, for {number(total_s)} s in all; "
         f"{'' if s.fallbacks == 1 else 'first '}at {number(spans[0][0])} s: {first.reason}."
-    ]
+    )
 
 
 def _state_limits(flight: FlightData, s: FlightSummary) -> str:
@@ -116,6 +112,32 @@ def _plans(s: FlightSummary) -> str:
     ended = "every one of them optimal" if not s.failed_solves else f"{s.failed_solves} without an optimum"
     slack = "no constraint had to give way" if not s.slack_used else f"in {s.slack_used} flown a constraint gave way"
     return f"{count(s.solves, 'plan')} {_were(s.solves)} computed, {ended}; {slack}."
+
+
+def _ending(flight: FlightData, s: FlightSummary) -> str:
+    last = flight.flown[-1]
+    if s.ended is Ending.LANDED:
+        landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
+        return f"The fallback had the vehicle land after {_seconds(flight, landed_ns)}."
+    if s.ended is Ending.WAITING:
+        return f"At the end the controller was waiting: {last.reason}."
+    if flight.stopped_ns is not None:
+        return f"The operator ended the flight after {_seconds(flight, flight.stopped_ns)}; {_hand_over(flight)}."
+    return _IN_FLIGHT.get(last.mode, "At the end a plan was being flown.")
+
+
+def _hand_over(flight: FlightData) -> str:
+    """What the controller did after the operator's stop."""
+    modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
+    if ControlMode.LAND in modes:
+        return "the vehicle was handed over to its own landing"
+    if ControlMode.STOPPED in modes:
+        return "the vehicle was handed over"
+    return "the recording ends before the vehicle was handed over"
+
+
+def _seconds(flight: FlightData, at_ns: int) -> str:
+    return f"{number(float(flight.seconds([at_ns])[0]))} s"
 
 
 def _were(number: int) -> str:

@@ -15,6 +15,7 @@ from uavctl.config.types import Config
 from uavctl.data import Truth
 
 VEHICLE, MOCAP = "vehicle", "mocap"
+VEHICLES = {"linear": Vehicle}
 Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
 
 
@@ -40,7 +41,7 @@ class Peers:
         on_truth: Callable[[Truth], None] | None = None,
     ) -> None:
         for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
-        self.vehicle = Vehicle(config, for_vehicle, start_ns)
+        self.vehicle = VEHICLES[config.sim.plant](config, for_vehicle, start_ns)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
         self.channel = Channel(config.link, for_channel, start_ns)
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)

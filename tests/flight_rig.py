@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from uavctl.data import PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.data import ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
@@ -164,6 +164,14 @@ def one_a_step(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 *
     return [sample(boundary_ns(number) - 50 * MS, boundary_ns(number) - 50 * MS + delay_ns) for number in kept]
 
 
+def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
+    """One sample at each boundary up to `step` that shows a steady motion, then none."""
+    return [
+        sample(boundary_ns(n), position_m=(speed_mps * 0.2 * n, 0, 0), velocity_mps=(speed_mps, 0, 0))
+        for n in range(step + 1)
+    ]
+
+
 def inputs_of(
     ticks: Iterable[int],
     samples: Iterable[PositionSample],
@@ -196,7 +204,7 @@ def inputs_of(
 
 def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState | None = None) -> list[StepOutput]:
     outputs = []
-    state = initial_state(controller) if state is None else state
+    state = initial_state() if state is None else state
     for inp in inputs:
         state, output = step(state, inp, controller)
         outputs.append(output)
@@ -205,6 +213,10 @@ def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState
 
 def boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
     return [output for output in outputs if output.decision.boundary]
+
+
+def modes(outputs: list[StepOutput]) -> list[ControlMode]:
+    return [output.decision.mode for output in outputs]
 
 
 def flown(outputs: list[StepOutput]) -> list[tuple[int | None, int | None]]:

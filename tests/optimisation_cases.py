@@ -112,6 +112,6 @@ def room(**changes: Any) -> Design:
         k_tau=kron(np.eye(3), [[-0.814, -1.209, -0.710]]),
         target_m=(1.5, 1.0, -1.2),
         search_states=np.zeros((0, 9)),
-        offset_weight=1000.0,
+        offset_weight=300.0,  # as in the preset
     )
     return make_design(replace(spec, **changes))

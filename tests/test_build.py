@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.build import build_controller, build_design, build_plant, build_solver, build_spec, link_probability
+from sim.channel import Channel
+from uavctl.build import (
+    build_controller,
+    build_design,
+    build_plant,
+    build_solver,
+    build_spec,
+    link_probability,
+    mean_loss,
+)
 from uavctl.config import load_config, presets
 from uavctl.data import SolveStatus
-from uavctl.errors import DesignError
+from uavctl.errors import ConfigError, DesignError
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.printed import PrintedSolver
 
@@ -32,6 +41,9 @@ def test_a_room_has_three_states_an_axis() -> None:
     assert speed[7] == pytest.approx(0.5 / 0.3)
 
 
+BURSTS = ["link.model=gilbert-elliott", "link.burst_enter=0.1", "link.burst_leave=0.4", "link.burst_loss=0.8"]
+
+
 @pytest.mark.parametrize(
     ("preset", "overrides", "p"),
     [
@@ -39,15 +51,53 @@ def test_a_room_has_three_states_an_axis() -> None:
         ("room", [], 0.7),
         ("room", ["link.loss=0"], 1.0),
         # Two of four samples in 0.2 s are sure to arrive within 0.03 + 0.04 s of delay: 1 - 0.3².
-        ("room", ["sim.camera.rate_hz=20"], 0.91),
-        ("room", ["sim.camera.rate_hz=20", "sim.camera.latency_s=0.05"], 0.7),
-        ("room", ["link.delay_s=0.5"], 0.7),
+        ("room", ["source.rate_hz=20"], 0.91),
+        ("room", ["source.rate_hz=20", "link.delay_s=0.07"], 0.7),
+        ("paper", ["source.rate_hz=10"], 1.0 - 0.3**10),
+        # What the simulator's cameras do is no assumption of the design.
+        ("room", ["sim.camera.rate_hz=20", "sim.camera.latency_s=0.1"], 0.7),
+        # A fifth of the time in the bad state: 0.8 · 0.1 + 0.2 · 0.8 lost.
+        ("paper", [*BURSTS, "link.loss=0.1"], 0.76),
+        ("paper", [*BURSTS, "link.loss=0.1", "source.rate_hz=2"], 1.0 - 0.24**2),
+        ("paper", [*BURSTS, "link.burst_enter=0"], 0.7),
+        # Another model's keys are without effect.
+        ("paper", [*BURSTS, "link.model=bernoulli"], 0.7),
     ],
 )
 def test_the_link_s_probability_counts_samples_that_are_in_time(preset: str, overrides: list[str], p: float) -> None:
     config = load_config(preset, overrides)
     assert link_probability(config) == pytest.approx(p, abs=1e-12)
     assert build_spec(config).link_p.tolist() == [link_probability(config)] * 12
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "figures"),
+    [
+        (["link.delay_s=0.5"], "link.delay_s", r"0\.5 \+ 0\.04 s .* step of 0\.2 s"),
+        (["link.delay_s=0.125", "link.jitter_s=0.075"], "link.delay_s", r"0\.125 \+ 0\.075 s"),
+        (["link.delay_s=0.16", "source.rate_hz=50"], "link.delay_s", r"0\.16 \+ 0\.04 s"),
+        (["source.rate_hz=5"], "source.rate_hz", r"5 positions a second .* 0\.13 s .* at least 7\.692"),
+        (["source.rate_hz=50", "link.delay_s=0.15"], "source.rate_hz", r"50 positions .* 0\.01 s .* at least 100"),
+    ],
+)
+def test_a_link_that_no_position_crosses_in_time_is_refused(overrides: list[str], key: str, figures: str) -> None:
+    with pytest.raises(DesignError, match=figures) as caught:
+        link_probability(load_config("room", overrides))
+    assert caught.value.key == key
+
+
+def test_a_burst_that_is_never_left_is_no_configuration() -> None:
+    with pytest.raises(ConfigError, match=r"link\.burst_leave"):
+        load_config("paper", ["link.model=gilbert-elliott", "link.burst_leave=0"])
+
+
+def test_mean_loss_is_that_of_the_simulated_channel() -> None:
+    link = load_config("paper", [*BURSTS, "link.loss=0.1"]).link
+    channel, packets = Channel(link, np.random.SeedSequence(3), 0), 40_000
+    for n in range(packets):
+        channel.push(n, b"x")
+    # Bursts make the share's deviation 0.0029 instead of 0.0021: five of them.
+    assert channel.counters.lost / packets == pytest.approx(mean_loss(link), abs=0.0146)
 
 
 def test_open_sides_make_no_rows_and_weights_are_diagonal() -> None:

@@ -12,7 +12,7 @@ from loopback_rig import flight, lockstep, make_loop
 from logs.replay import replay
 from logs.summary import summarise
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SolveStatus, Truth
+from uavctl.data import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
 
 
 @pytest.mark.parametrize("first", range(0, 20, 4))
@@ -113,8 +113,16 @@ def test_plans_are_optimal_and_certified() -> None:
 def test_every_setpoint_is_within_the_last_gate_s_limits() -> None:
     config = load_config("room")
     limit = np.array(config.limits.accel_mps2)
-    bursts = ("link.model=gilbert-elliott", "link.burst_enter=0.2", "link.burst_leave=0.1")
+    # A quarter is lost on average, in bursts of ten on average: some are longer than the horizon.
+    bursts = (
+        "link.model=gilbert-elliott",
+        "link.loss=0.1",
+        "link.burst_enter=0.02",
+        "link.burst_leave=0.1",
+        "link.blackout=[[8,12]]",
+    )
     setpoints = lockstep("room", 20.0, *bursts).of(Setpoint)
     assert len(setpoints) > 300
+    assert {SetpointSource.PLAN, SetpointSource.HOLD} <= {setpoint.source for setpoint in setpoints}
     for setpoint in setpoints:
         assert np.all(np.abs(setpoint.accel_mps2) <= limit)

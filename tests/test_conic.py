@@ -112,7 +112,8 @@ def test_infeasible_where_the_printed_problem_is(paper_design: Design, paper_sol
     seen = set()
     for x in rng.uniform(PAPER_LOWER, PAPER_UPPER, size=(12, 4)):
         hard = is_hard(paper_solver.solve(0, x, ORIGIN))
-        assert hard == (printed.solve(0, x, ORIGIN).status is not SolveStatus.INFEASIBLE)
+        status = printed.solve(0, x, ORIGIN).status
+        assert status is (SolveStatus.OPTIMAL if hard else SolveStatus.INFEASIBLE)
         seen.add(hard)
     assert seen == {True, False}
 
@@ -327,6 +328,22 @@ def test_room_from_the_far_corner(room_solver: ConicSolver) -> None:
     assert answer.offset > 1.0
     assert np.all(answer.inputs <= [2.0, 2.0, 1.5])
     assert answer.states[-1] == pytest.approx(answer.reference, abs=1e-6)
+
+
+def test_the_room_s_offset_weight_is_exact_and_a_small_one_is_not(room_solver: ConicSolver) -> None:
+    """Where 3e4 brings the plan into the target without slack, the preset's 300 does so too."""
+    heavy, light = ConicSolver(room(offset_weight=3e4)), ConicSolver(room(offset_weight=1.0))
+    rng = np.random.default_rng(12)
+    in_reach: list[Array] = []
+    while len(in_reach) < 20:
+        x = ROOM_TARGET + rng.uniform(-1.0, 1.0, 9) * np.tile([1.0, 0.6, 0.5], 3)
+        answer = heavy.solve(0, x, ROOM_TARGET)
+        if answer.status is SolveStatus.OPTIMAL and is_hard(answer):
+            in_reach.append(x)
+    answers = [room_solver.solve(0, x, ROOM_TARGET) for x in in_reach]
+    assert {answer.status for answer in answers} == {SolveStatus.OPTIMAL}
+    assert max(answer.offset for answer in answers) < 1e-5
+    assert max(light.solve(0, x, ROOM_TARGET).offset for x in in_reach) > 1e-2
 
 
 def test_room_is_reached_by_replanning(room_solver: ConicSolver) -> None:

@@ -197,6 +197,8 @@ def test_record_is_json_without_infinity(name: str) -> None:
     assert [row["item"] for row in record["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
     assert set(record["assumptions"][0]) == {"item", "ok", "value", "limit", "text"}
     assert record["spectral_radius"] == design.terminal.spectral_radius
+    # 258.6 for each of the paper's two axes; the room's is the least that a static gain leaves.
+    assert record["stationary_cost"] == pytest.approx({"paper": 517.2, "room": 0.2636}[name], rel=5e-4)
 
 
 def test_record_of_a_design_without_state_limits() -> None:

@@ -34,6 +34,7 @@ from flight_rig import (
 )
 
 from uavctl.data import ControlMode, PositionSample, StepInput
+from uavctl.flight.samples import STAMP_TOLERANCE_NS
 
 TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
@@ -76,15 +77,15 @@ def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
         inputs_of(range(steps * TICKS), one_a_step(lost=np.flatnonzero(~arrives).tolist(), steps=steps)),
     )
     falls, misses, last, in_row, tracking = 0, 0, None, 0, False
-    for number in range(steps):  # the rule in a few lines: H lost in a row is the fallback, 3 in a row the way back
+    for number in range(steps):  # the rule in a few lines: age H is the fallback, 3 samples since then the way back
         if arrives[number]:
             last = number
-        in_row = in_row + 1 if arrives[number] else 0
+        in_row += int(arrives[number])
         if last is None:
             continue
-        if tracking and number - last >= HORIZON:
+        if number - last >= HORIZON:
+            falls += tracking
             tracking, in_row = False, 0
-            falls += 1
         elif not tracking and (in_row >= 3 or falls == 0):
             tracking = True
         for output in outputs[number * TICKS : (number + 1) * TICKS]:
@@ -201,7 +202,7 @@ def test_row_12_values_at_their_limits_count() -> None:
 @pytest.mark.parametrize(
     ("captured_ns", "code"),
     [
-        (boundary_ns(2) + TICK_NS + 1, "sample-future"),
+        (boundary_ns(2) + STAMP_TOLERANCE_NS + 1, "sample-future"),
         (boundary_ns(2) + 3600 * 10**9, "sample-future"),
         (2**32 * MS, "sample-future"),
         (2**63 - 1, "sample-future"),
@@ -260,6 +261,23 @@ def test_row_21_missed_ticks_are_counted_and_there_is_one_setpoint_a_tick() -> N
     assert woken.plan.base_ns == boundary_ns(4)
     stamps = [output.setpoint.at_ns for output in outputs if output.setpoint is not None]
     assert stamps == [START_NS + tick * TICK_NS for tick in ticks]
+
+
+def test_row_21_a_missed_boundary_at_which_the_age_reaches_the_horizon_is_the_fallback_in_the_next_tick() -> None:
+    late = sample(
+        boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS
+    )  # so that the plan ends after the age has reached H
+    after_the_boundary = sample(boundary_ns(7) + 10 * MS)
+    samples = [*one_a_step(steps=3), late, after_the_boundary]
+    ticks = [tick for tick in range(8 * TICKS) if tick != 7 * TICKS]
+    punctual = run(make_controller(), inputs_of(range(8 * TICKS), samples))[7 * TICKS]
+    woken = run(make_controller(), inputs_of(ticks, samples))[7 * TICKS]
+    assert woken.decision.tick == 7 * TICKS + 1
+    assert (woken.decision.boundary, woken.decision.accepted) == (True, 1)
+    for decision in (punctual.decision, woken.decision):
+        assert decision.mode in FALLBACK
+        assert (decision.age_steps, decision.fresh) == (HORIZON, 0)
+        assert decision.reason == "age of information 4 has reached H = 4"
 
 
 def test_row_21_oversleeping_past_the_horizon_is_the_fallback_in_the_tick_that_wakes() -> None:

@@ -121,8 +121,18 @@ def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, val
     assert_sound(outputs)
 
 
-def test_row_24_an_answer_of_the_wrong_shape_does_not_fly() -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=answer.inputs[1:])})
+WRONG_SHAPES: dict[str, Fault] = {
+    "too few inputs": lambda answer: replace(answer, inputs=answer.inputs[1:]),
+    "inputs of two axes": lambda answer: replace(answer, inputs=np.repeat(answer.inputs, 2, axis=1)),
+    "flat inputs": lambda answer: replace(answer, inputs=answer.inputs[:, 0]),
+    "too few states": lambda answer: replace(answer, states=answer.states[1:]),
+    "too short states": lambda answer: replace(answer, states=answer.states[:, 1:]),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG_SHAPES)
+def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
+    controller, _ = with_faults({3: WRONG_SHAPES[fault]})
     outputs = run(controller, inputs_of(range(4 * TICKS), one_a_step()))
     assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
     assert flown(outputs)[3] == (2, 1)

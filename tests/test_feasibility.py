@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, START, TAU_3, paper, paper_plant, paper_spec, room
 
 from uavctl.errors import DesignError
+from uavctl.smpc import feasibility
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import make_design
+from uavctl.smpc.design import Design, make_design
 from uavctl.smpc.feasibility import check_schedule, optimal_cost
 from uavctl.smpc.horizon import Horizon
 from uavctl.smpc.reduction import terminal_bound
@@ -24,18 +26,21 @@ def test_the_papers_schedule_leaves_a_margin() -> None:
     assert check_schedule(paper()) == pytest.approx(0.1995, abs=1e-4)
 
 
-def test_margin_is_reached_by_no_gain_beyond_it() -> None:
-    """No random gain of the schedule does better than s*."""
+def test_margin_is_reached_and_no_gain_goes_beyond_it() -> None:
+    """Duality of the spectral norm: min ‖Y_0 + Mθ‖ = max ⟨Z, Y_0⟩ over nuclear norms <= 1 with Mᵀ vec Z = 0."""
     design = paper()
     margin = check_schedule(design)
-    horizon = Horizon(decompose(design)[0], 12, 4, design.schedule)
-    bound = terminal_bound(horizon, move_constants=False)
-    rng = np.random.default_rng(7)
-    sizes = [
-        np.linalg.norm(bound.y.at(scale * rng.normal(size=horizon.n_theta)).reshape(bound.rows, bound.columns), 2)
-        for scale in np.geomspace(1e-3, 1.0, 200)
-    ]
-    assert 1.0 - np.min(sizes) ** 2 <= margin
+    bound = terminal_bound(Horizon(decompose(design)[0], 12, 4, design.schedule), move_constants=False)
+    matrix = bound.y.matrix.toarray()
+    z = cp.Variable((bound.rows, bound.columns))
+    constraints = [cp.normNuc(z) <= 1, matrix.T @ cp.vec(z, order="C") == 0]
+    cp.Problem(cp.Maximize(bound.y.offset @ cp.vec(z, order="C")), constraints).solve(solver=cp.CLARABEL)
+    # Whatever the solver left: exactly orthogonal to every gain, and of norm 1, so that the bound is one by itself.
+    exact = z.value.ravel() - matrix @ np.linalg.lstsq(matrix, z.value.ravel(), rcond=None)[0]
+    exact /= np.linalg.norm(exact.reshape(bound.rows, bound.columns), "nuc")
+    most = 1.0 - float(exact @ bound.y.offset) ** 2
+    assert margin <= most + 1e-8
+    assert margin == pytest.approx(most, abs=1e-6)
 
 
 def test_longer_delays_leave_less_margin() -> None:
@@ -96,6 +101,22 @@ def test_optimal_cost_is_the_papers_and_none_where_constraints_give_way() -> Non
     for outside in ([80.0, 60.0, 0.0, 0.0], [48.0, 7.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]):
         assert optimal_cost(design, np.array(outside)) is None
     assert optimal_cost(paper(delays=6), ORIGIN) is None
+
+
+def test_the_margin_of_a_design_is_found_once_for_all_its_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Design] = []
+
+    def counted(design: Design) -> float:
+        asked.append(design)
+        return check_schedule(design)
+
+    monkeypatch.setattr(feasibility, "check_schedule", counted)
+    good, slow = paper(), paper(delays=6)
+    for share in (1.0, 0.5, 0.1):
+        assert optimal_cost(good, share * START) is not None
+    for share in (1.0, 0.5):
+        assert optimal_cost(slow, share * START) is None
+    assert asked == [good, slow]
 
 
 def test_search_takes_the_cheapest_of_its_candidates() -> None:

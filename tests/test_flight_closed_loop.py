@@ -20,7 +20,7 @@ def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], N
     rng = np.random.default_rng(seed)
     a, b, e = plant.transition(controller.tick_ns * 1e-9)
     x = plant.equilibrium(config.sim.start_position_m)
-    state = initial_state(controller)
+    state = initial_state()
     waiting, inputs, outputs, truth = [], [], [], []
     w = np.zeros(plant.n_w)
     for tick in range(round(seconds * 1e9) // controller.tick_ns):

@@ -5,7 +5,12 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight, write_two_segments
 
+from logs.disk import check_room
 from logs.info import info
+from logs.reader import header
+from logs.recover import recover
+from logs.segment import MAGIC
+from uavctl.errors import RecordingError
 
 
 def test_figures_of_a_flight(tmp_path: Path) -> None:
@@ -58,6 +63,41 @@ def test_torn_file(tmp_path: Path) -> None:
     record_flight(path, 30)
     path.write_bytes(path.read_bytes()[:-200])
     assert not info(path).finished
-    path.write_bytes(b"")
+    path.write_bytes(path.read_bytes()[:5])
     found = info(path)
     assert (found.finished, found.messages, found.duration_s, found.origin, found.topics) == (False, 0, 0.0, None, ())
+    assert "torn in the first bytes" in found.damage[0]
+
+
+@pytest.mark.parametrize("held", [b"", MAGIC])
+def test_nothing_in_it(tmp_path: Path, held: bytes) -> None:
+    path = tmp_path / "flight.mcap"
+    path.write_bytes(held)
+    with pytest.raises(RecordingError, match=r"flight\.mcap: holds nothing"):
+        info(path)
+
+
+def test_lost_header_is_not_taken_for_an_early_end(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 60)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"started_utc")] ^= 1
+    path.write_bytes(data)
+    recover(path, tmp_path / "out.mcap")
+    with pytest.raises(RecordingError, match="or that chunk was lost"):
+        header(tmp_path / "out.mcap")
+
+
+def test_room_is_refused_where_a_recording_is_or_no_folder_can_be(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    later = tmp_path / "flight-2.mcap"
+    for taken in (later, path):
+        taken.touch()
+        with pytest.raises(RecordingError) as told:
+            check_room(path, 0)
+        assert str(told.value) == f"{taken} exists and a recording never overwrites; choose another folder"
+    with pytest.raises(RecordingError) as told:
+        check_room(path / "flight.mcap", 0)
+    assert str(told.value) == (
+        f"{path}: the folder cannot be made (File exists); choose another folder for the recording"
+    )

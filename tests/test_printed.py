@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from io import StringIO
+
+import cvxpy as cp
+import msgspec
 import numpy as np
 import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_COST_X, PAPER_COST_Y, START, paper, room
+from rich.console import Console
 
+from uavctl.cli.solve_cmd import solve_document, solve_picture
+from uavctl.config import load_config
 from uavctl.data import SolveStatus
 from uavctl.smpc.components import decompose, whole
 from uavctl.smpc.design import Design
@@ -40,6 +48,18 @@ def test_plan_of_both_axes(solver: PrintedSolver) -> None:
     assert np.all(answer.backoff_u[:5] == 0.0)
 
 
+def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: PrintedSolver) -> None:
+    answer = solver.solve(0, START, ORIGIN)
+    assert (answer.status, answer.cost_lower, answer.gap) == (SolveStatus.OPTIMAL, -np.inf, np.inf)
+    shown = json.loads(msgspec.json.encode(solve_document(answer, 1.0)))
+    assert shown["cost"] == pytest.approx(PAPER_COST, rel=1e-6)
+    assert (shown["cost_lower"], shown["gap"]) == (None, None)
+    console = Console(file=StringIO(), width=200)
+    console.print(solve_picture(answer, design, load_config("paper"), 1.0))
+    assert isinstance(console.file, StringIO)
+    assert "(no lower bound known), slack 0" in console.file.getvalue()
+
+
 def test_joint_problem_has_the_cost_of_its_axes(design: Design) -> None:
     part = PrintedProblem(design, whole(design)).solve(START, ORIGIN)
     assert part.status in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE)
@@ -54,6 +74,38 @@ def test_hard_constraints_make_far_states_infeasible(solver: PrintedSolver) -> N
 
 def test_numbers_that_are_not_finite_fail(solver: PrintedSolver) -> None:
     assert solver.solve(0, np.full(4, np.nan), ORIGIN).status is SolveStatus.FAILED
+
+
+@pytest.mark.parametrize("scale", [1e8, 1e20, 1e160, 1e300])
+def test_absurd_numbers_give_no_plan_and_no_exception(solver: PrintedSolver, scale: float) -> None:
+    answer = solver.solve(0, START * scale, ORIGIN)
+    assert answer.status in (SolveStatus.FAILED, SolveStatus.INFEASIBLE)
+    assert answer.inputs.size == 0
+    assert solver.solve(0, START, ORIGIN).status is SolveStatus.OPTIMAL
+
+
+class PanicException(BaseException):  # named as Clarabel's, whose class cannot be imported
+    pass
+
+
+@pytest.mark.parametrize("raised", [PanicException, cp.SolverError])
+def test_a_solver_that_breaks_down_is_a_failed_answer(
+    solver: PrintedSolver, monkeypatch: pytest.MonkeyPatch, raised: type[BaseException]
+) -> None:
+    def breaks(*_: object, **__: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(cp.Problem, "solve", breaks)
+    assert solver.solve(0, START, ORIGIN).status is SolveStatus.FAILED
+
+
+def test_an_interrupt_is_no_breakdown(solver: PrintedSolver, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cp.Problem, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        solver.solve(0, START, ORIGIN)
 
 
 def test_iteration_limit_is_told() -> None:

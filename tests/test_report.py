@@ -18,8 +18,10 @@ from logs.report import picture, report_html, write_report
 from logs.summary import summarise
 from logs.svg import PALETTE
 from uavctl.data import ControlMode, Decision, Estimate, Plan, Record, StepInput, Timing, Truth
+from uavctl.errors import RecordingError
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
+TICK_S = room().tick_s
 ROOM_PLOTS = (
     {"path-above", "path-side", "age-wide", "age-narrow", "plan-index", "plan-above", "time-decision", "time-late"}
     | {f"state-{i}" for i in (0, 1, 3, 4, 6, 7)}
@@ -195,6 +197,81 @@ def test_one_tick(scene: Scene) -> None:
     assert "flew 1 step of" in " ".join(seen.text)
 
 
+def ended_in(modes: dict[int, ControlMode], stop_tick: int | None = None) -> str:
+    """Text of the page of a 4 s flight (ticks of 50 ms) whose modes change at the given ticks."""
+
+    def change(record: Record) -> Record:
+        if isinstance(record, StepInput) and stop_tick is not None:
+            return msgspec.structs.replace(record, stop=record.tick >= stop_tick)
+        if isinstance(record, Decision) and record.tick >= min(modes):
+            mode = modes[max(tick for tick in modes if tick <= record.tick)]
+            return msgspec.structs.replace(record, mode=mode, reason="why not")
+        return record
+
+    items = [(t, at, change(r)) for t, at, r in fly(room(), 4.0)]
+    return " ".join(walk(html_of(FlightData.from_records(items))).text)
+
+
+HAND_OVER = {40: ControlMode.BRAKE, 50: ControlMode.HOLD, 51: ControlMode.LAND, 52: ControlMode.STOPPED}
+
+
+def test_the_operators_stop_is_no_fallback() -> None:
+    text = ended_in(HAND_OVER, stop_tick=40)
+    assert f"The operator ended the flight after {40 * TICK_S:g} s" in text
+    assert "the vehicle was handed over to its own landing" in text
+    assert "The fallback was never needed." in text
+    assert "handed over by the operator" in text
+
+
+def test_a_fallback_before_the_operators_stop_is_told() -> None:
+    text = ended_in({20: ControlMode.BRAKE, 24: ControlMode.TRACK, **HAND_OVER}, stop_tick=40)
+    assert f"took over once, for {4 * TICK_S:g} s in all; at {20 * TICK_S:g} s: why not" in text
+    assert "The operator ended the flight" in text
+
+
+def test_a_hand_over_that_was_cut_off_is_told() -> None:
+    assert "the recording ends before the vehicle was handed over" in ended_in({40: ControlMode.BRAKE}, stop_tick=40)
+    assert "; the vehicle was handed over." in ended_in({40: ControlMode.STOPPED}, stop_tick=40)
+
+
+def test_a_landing_is_told() -> None:
+    text = ended_in(HAND_OVER)
+    assert f"The fallback had the vehicle land after {51 * TICK_S:g} s." in text
+    assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s in all" in text
+    assert "landed by the fallback" in text
+    assert "operator" not in text
+
+
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        (ControlMode.WAIT, "At the end the controller was waiting: why not."),
+        (ControlMode.TRACK, "At the end a plan was being flown."),
+        (ControlMode.HOLD, "The recording ends while the fallback held zero acceleration."),
+    ],
+)
+def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
+    assert told in ended_in({40: mode})
+
+
+def test_a_simulated_flight_that_never_began_has_a_page() -> None:
+    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.WAIT})
+    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.STOPPED}, stop_tick=0)
+
+
+def test_virtual_time_has_no_plot_of_lateness() -> None:
+    def punctual(record: Record) -> Record:
+        return msgspec.structs.replace(record, lateness_ns=0) if isinstance(record, Timing) else record
+
+    items = [(t, at, punctual(r)) for t, at, r in fly(room(), 2.0)]
+    seen = walk(html_of(FlightData.from_records(items)))
+    assert "time-decision" in seen.plots
+    assert "time-late" not in seen.plots
+    text = " ".join(seen.text)
+    assert "in virtual time no tick is late" in text
+    assert "Tick lateness" not in text
+
+
 def test_a_flight_that_only_waited() -> None:
     def waiting(record: Record) -> Record:
         if isinstance(record, Decision):
@@ -240,6 +317,13 @@ def test_report_is_written_as_utf8(tmp_path: Path, room_flight: FlightData, room
     out = tmp_path / "flight.html"
     write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
     assert out.read_text(encoding="utf-8") == room_html
+
+
+def test_a_page_that_cannot_be_written_is_told(tmp_path: Path, room_flight: FlightData) -> None:
+    out = tmp_path / "missing" / "flight.html"
+    with pytest.raises(RecordingError) as told:
+        write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
+    assert str(told.value) == f"{out}: cannot be written (No such file or directory); choose another place"
 
 
 def test_picture_is_a_file_of_its_own(room_flight: FlightData) -> None:

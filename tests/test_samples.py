@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import pytest
-from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sample, small_plant
+from flight_rig import DT_NS, HORIZON, MS, START_NS, estimator_parameters, sample, small_plant
 
 from uavctl.data import PositionSample, StepInput
 from uavctl.flight.estimator import begin
 from uavctl.flight.kalman import make_kalman
-from uavctl.flight.samples import Intake, take
+from uavctl.flight.samples import STAMP_TOLERANCE_NS, Intake, take
 
 KALMAN = make_kalman(small_plant(), estimator_parameters(), DT_NS)
 
 
-def taken(ticks: list[tuple[int, list[PositionSample]]], fresh: int = 0) -> Intake:
+def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> Intake:
     """Intake after several ticks, each (time in ms, samples)."""
-    intake = Intake(history=begin(KALMAN, START_NS, START_NS), accepted=0, refused=(), fresh=fresh)
+    intake = Intake(history=begin(KALMAN, START_NS, START_NS), accepted=0, refused=(), fresh=0)
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
-        intake = take(KALMAN, intake.history, inp, TICK_NS, intake.fresh)
+        intake = take(KALMAN, intake.history, inp, horizon, intake.fresh)
     return intake
 
 
@@ -35,14 +35,19 @@ def test_several_in_one_tick_count_each() -> None:
     assert taken([(100, [captured(60), captured(20), captured(100)])]).fresh == 3
 
 
-@pytest.mark.parametrize(("gap_ms", "fresh"), [(300, 3), (301, 1)])
-def test_a_gap_of_more_than_one_and_a_half_steps_begins_the_row_anew(gap_ms: int, fresh: int) -> None:
-    assert taken([(0, [captured(0)]), (200, [captured(200)]), (600, [captured(200 + gap_ms)])]).fresh == fresh
+# H = 4: at the boundary of 1000 ms the sample of 200 ms is H steps old, unless there is one from up to then.
+@pytest.mark.parametrize(("captured_ms", "fresh"), [(850, 3), (1000, 3), (1001, 1)])
+def test_a_boundary_at_which_the_age_reaches_the_horizon_begins_the_row_anew(captured_ms: int, fresh: int) -> None:
+    assert taken([(0, [captured(0)]), (200, [captured(200)]), (1050, [captured(captured_ms)])]).fresh == fresh
 
 
-@pytest.mark.parametrize(("age_ms", "fresh"), [(199, 2), (200, 0)])
-def test_a_sample_as_old_as_a_step_breaks_the_row(age_ms: int, fresh: int) -> None:
-    assert taken([(200, [captured(150)]), (400, [captured(400 - age_ms)])]).fresh == fresh
+# A third of H = 4 steps of 200 ms is 266.7 ms, of H = 12 it is 800 ms; for H = 2 it is one step all the same.
+@pytest.mark.parametrize(
+    ("horizon", "age_ms", "fresh"), [(4, 266, 2), (4, 267, 0), (12, 800, 2), (12, 801, 0), (2, 200, 2), (2, 201, 0)]
+)
+def test_a_sample_older_than_a_third_of_the_horizon_breaks_the_row(horizon: int, age_ms: int, fresh: int) -> None:
+    before = captured(1000 - age_ms - 50)
+    assert taken([(1000 - age_ms, [before]), (1000, [captured(1000 - age_ms)])], horizon).fresh == fresh
 
 
 def test_an_overtaken_sample_changes_nothing() -> None:
@@ -56,12 +61,19 @@ def test_the_same_instant_from_a_second_source_counts_once() -> None:
 
 def test_refused_samples_do_not_count() -> None:
     again = captured(200)
-    future = captured(501, received_ms=450)
+    future = captured(471, received_ms=450)
     intake = taken([(200, [again]), (450, [again, future])])
     assert (intake.fresh, intake.accepted) == (1, 0)
     assert sorted(intake.refused) == ["sample-duplicate", "sample-future"]
 
 
-def test_a_stamp_within_the_tolerance_after_the_arrival_is_taken() -> None:
-    intake = taken([(450, [captured(500, received_ms=450)])])
-    assert (intake.accepted, intake.history.captured_ns) == (1, START_NS + 450 * MS)
+def test_a_stamp_within_the_tolerance_after_the_arrival_counts_as_captured_at_the_arrival() -> None:
+    arrival_ns = START_NS + 440 * MS
+    intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS, arrival_ns)])])
+    assert (intake.accepted, intake.history.captured_ns) == (1, arrival_ns)
+
+
+def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_tick() -> None:
+    arrival_ns = START_NS + 440 * MS
+    intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS + 1, arrival_ns)])])
+    assert (intake.accepted, intake.refused) == (0, ("sample-future",))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from flight_rig import (
@@ -19,6 +18,7 @@ from flight_rig import (
     boundary_ns,
     inputs_of,
     make_controller,
+    modes,
     one_a_step,
     run,
     sample,
@@ -27,33 +27,9 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, PositionSample, SetpointSource, SolveStatus, VehicleStatus
-from uavctl.flight.step import StepOutput
+from uavctl.data import ControlMode, SetpointSource, SolveStatus, VehicleStatus
 
-WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = (
-    ControlMode.WAIT,
-    ControlMode.TRACK,
-    ControlMode.BRAKE,
-    ControlMode.HOLD,
-    ControlMode.LAND,
-    ControlMode.STOPPED,
-)
-
-
-def modes(outputs: list[StepOutput]) -> list[ControlMode]:
-    return [output.decision.mode for output in outputs]
-
-
-def at_boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
-    return [output for output in outputs if output.decision.boundary]
-
-
-def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
-    """One sample at each boundary up to `step` that shows a steady motion, then none."""
-    return [
-        sample(boundary_ns(n), position_m=(speed_mps * 0.2 * n, 0, 0), velocity_mps=(speed_mps, 0, 0))
-        for n in range(step + 1)
-    ]
+WAIT, TRACK, BRAKE = ControlMode.WAIT, ControlMode.TRACK, ControlMode.BRAKE
 
 
 def test_plans_at_the_first_boundary_with_a_position_and_holds_the_input_until_the_next() -> None:
@@ -161,97 +137,6 @@ def test_the_estimator_knows_the_input_after_the_last_gate() -> None:
     plant = small_plant()
     want = plant.a @ np.array(begin.mean) + plant.b @ np.array([2.0])
     np.testing.assert_allclose(end.mean, want, rtol=0, atol=1e-9)
-
-
-def test_fallback_brakes_holds_and_lands_once_each_in_its_time() -> None:
-    outputs = run(make_controller(), inputs_of(range(220), moving(0)))
-    begins = {mode: modes(outputs).index(mode) for mode in (TRACK, BRAKE, HOLD, LAND, STOPPED)}
-    assert begins[TRACK] == 0
-    assert begins[BRAKE] == HORIZON * TICKS
-    assert begins[HOLD] <= begins[BRAKE] + 40  # brake_s = 2 s
-    assert begins[LAND] == begins[HOLD] + 60  # hold_s = 3 s
-    assert begins[STOPPED] == begins[LAND] + 1
-    assert modes(outputs) == sorted(modes(outputs), key=[TRACK, BRAKE, HOLD, LAND, STOPPED].index)
-    assert [tick for tick, output in enumerate(outputs) if output.land] == [begins[LAND]]
-    assert all((output.setpoint is None) == (tick >= begins[LAND]) for tick, output in enumerate(outputs))
-
-
-def test_braking_takes_the_predicted_velocity_to_zero() -> None:
-    outputs = run(make_controller(), inputs_of(range(220), moving(0)))
-    braking = [output for output in outputs if output.decision.mode is BRAKE]
-    for output in braking:
-        assert output.estimate is not None
-        assert output.setpoint is not None
-        assert output.setpoint.accel_mps2[0] == pytest.approx(-1.5 * output.estimate.mean[1])
-        assert output.setpoint.source is SetpointSource.BRAKE
-    first, last = braking[0].estimate, braking[-1].estimate
-    assert first is not None
-    assert last is not None
-    assert abs(last.mean[1]) < 0.2 * abs(first.mean[1])
-    holding = [output.setpoint for output in outputs if output.decision.mode is HOLD]
-    assert {None if one is None else one.accel_mps2 for one in holding} == {(0.0, 0.0, 0.0)}
-
-
-def test_without_landing_it_holds_on_and_recovers_however_late() -> None:
-    silent = range(1, 100)
-    outputs = run(make_controller(land=False), inputs_of(range(105 * TICKS), one_a_step(lost=silent)))
-    assert modes(at_boundaries(outputs))[60:] == [HOLD] * 42 + [TRACK] * 3
-
-
-def test_recovers_with_a_new_plan_at_the_third_fresh_sample_in_a_row() -> None:
-    lost = [*range(1, 6), 8, 10]
-    outputs = at_boundaries(run(make_controller(), inputs_of(range(15 * TICKS), one_a_step(lost))))
-    assert modes(outputs) == [TRACK] * 4 + [HOLD] * 9 + [TRACK] * 2  # at rest: nothing to brake
-    assert [output.decision.fresh for output in outputs[4:14]] == [0, 0, 1, 2, 2, 1, 1, 1, 2, 3]
-    recovered = outputs[13]
-    assert recovered.plan is not None
-    assert (recovered.decision.plan_seq, recovered.decision.plan_index) == (13, 0)
-    assert "track" in [event.code for event in recovered.events]
-
-
-def test_a_late_sample_is_not_a_fresh_one() -> None:
-    old = [sample(boundary_ns(n) - 50 * MS, boundary_ns(n) + 160 * MS) for n in range(6, 20)]
-    samples = [*one_a_step(steps=1), *old]
-    outputs = at_boundaries(run(make_controller(land=False), inputs_of(range(20 * TICKS), samples)))
-    assert TRACK not in modes(outputs)[4:]
-    assert {output.decision.fresh for output in outputs[4:]} == {0}
-
-
-def test_without_any_plan_the_fallback_takes_over_at_once() -> None:
-    solver = StubSolver(small_plant(), faults={0: lambda answer: replace(answer, status=SolveStatus.INFEASIBLE)})
-    outputs = run(make_controller(solver), inputs_of(range(1), moving(0)))
-    assert outputs[0].decision.mode is BRAKE
-    assert outputs[0].decision.reason == "no plan is left to fly"
-
-
-@pytest.mark.parametrize("land", [True, False])
-def test_operator_stop_brakes_then_hands_over_and_never_flies_a_plan_again(land: bool) -> None:
-    stop = 10
-    inputs = inputs_of(range(200), moving(49), stop_from=stop)
-    # The request may be a single tick: it is remembered.
-    inputs[stop + 1 :] = [msgspec.structs.replace(inp, stop=False) for inp in inputs[stop + 1 :]]
-    outputs = run(make_controller(land=land), inputs)
-    after = modes(outputs)[stop:]
-    ends = after.index(LAND if land else STOPPED)
-    assert modes(outputs)[:stop] == [TRACK] * stop
-    assert after[:ends] == [BRAKE] * ends
-    assert 0 < ends <= 40
-    assert set(after[ends + 1 :]) == {STOPPED}
-    assert [tick for tick, output in enumerate(outputs) if output.land] == ([stop + ends] if land else [])
-    assert all(output.setpoint is None for output in outputs[stop + ends :])
-
-
-def test_operator_stop_without_a_vehicle_to_hand_over_only_stops() -> None:
-    outputs = run(make_controller(), inputs_of(range(6), one_a_step(), stop_from=2, status=lambda tick: None))
-    assert modes(outputs) == [WAIT, WAIT, STOPPED, STOPPED, STOPPED, STOPPED]
-    assert not any(output.land for output in outputs)
-    assert [output.setpoint is None for output in outputs] == [False] * 2 + [True] * 4
-
-
-def test_operator_stop_before_the_first_position_hands_over_in_the_next_tick() -> None:
-    outputs = run(make_controller(), inputs_of(range(5), [], stop_from=2))
-    assert modes(outputs) == [WAIT, WAIT, BRAKE, LAND, STOPPED]
-    assert [output.land for output in outputs] == [False, False, False, True, False]
 
 
 def test_the_same_inputs_give_the_same_bits_from_a_rebuilt_controller_too() -> None:

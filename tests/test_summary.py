@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import msgspec
 import numpy as np
@@ -11,9 +12,9 @@ from rich.console import Console
 from synthetic_flight import Item, fly, header
 from synthetic_scene import paper, room
 
-from logs.flight_data import FlightData
+from logs.flight_data import FALLBACK, FlightData
 from logs.summary import FlightSummary, Spread, number, render, spread, summarise
-from uavctl.data import ControlMode, Decision, Estimate, Plan, Record, SolveStatus, Timing, Truth
+from uavctl.data import ControlMode, Decision, Estimate, Plan, Record, SolveStatus, StepInput, Timing, Truth
 from uavctl.errors import RecordingError
 
 DT_NS = 1_000_000_000
@@ -87,6 +88,7 @@ def test_keys_of_the_command_line_are_there() -> None:
         "wall_s",
         "decision_us",
         "tick_lateness_us",
+        "ended",
     }
     made = msgspec.json.decode(msgspec.json.encode(figures(decision(0), truth(0, (0.0,) * 4))))
     assert named <= set(made)
@@ -128,6 +130,40 @@ def test_fallback_is_counted_once_an_entry() -> None:
     s = figures(*(decision(k, ControlMode(mode)) for k, mode in enumerate(modes)), truth(0, (0.0,) * 4))
     assert s.fallbacks == 2
     assert figures(decision(0, ControlMode.BRAKE), truth(0, (0.0,) * 4)).fallbacks == 1
+
+
+def modes(*names: str, stop_at: int | None = None) -> FlightData:
+    """One decision a second in these modes; the operator asks for the hand-over from tick `stop_at` on."""
+    stops = [] if stop_at is None else [StepInput(tick=stop_at, at_ns=stop_at * DT_NS, stop=True)]
+    return flight(*stops, *(decision(k, ControlMode(name)) for k, name in enumerate(names)), truth(0, (0.0,) * 4))
+
+
+@pytest.mark.parametrize(
+    ("flown", "fallbacks", "spans", "ended"),
+    [
+        (modes("wait", "track"), 0, [], "flying"),
+        (modes("track", "brake"), 1, [(1.0, 2.0)], "flying"),
+        (modes("track", "wait"), 0, [], "waiting"),
+        (modes("wait", "stopped", stop_at=1), 0, [], "waiting"),
+        (modes("stopped", stop_at=0), 0, [], "waiting"),
+        (modes("track", "brake", "hold", "land", "stopped"), 1, [(1.0, 4.0)], "landed by the fallback"),
+        (modes("track", "brake", "land", "stopped", stop_at=3), 1, [(1.0, 3.0)], "landed by the fallback"),
+        (modes("track", "brake", "hold", "land", "stopped", stop_at=1), 0, [], "handed over by the operator"),
+        (modes("track", "brake", "brake", "hold", stop_at=2), 1, [(1.0, 2.0)], "handed over by the operator"),
+        (
+            modes("track", "brake", "track", "brake", "land", "stopped", stop_at=3),
+            1,
+            [(1.0, 2.0)],
+            "handed over by the operator",
+        ),
+    ],
+)
+def test_the_hand_over_after_the_operators_stop_is_no_fallback(
+    flown: FlightData, fallbacks: int, spans: list[tuple[float, float]], ended: str
+) -> None:
+    s = summarise(flown, wall_s=1.0)
+    assert (s.fallbacks, s.ended) == (fallbacks, ended)
+    assert flown.spans(FALLBACK) == spans
 
 
 def test_violations_at_and_beyond_a_limit() -> None:
@@ -240,6 +276,48 @@ def test_table_tells_estimates_from_truth() -> None:
         console.print(render(figures(decision(0))))
     assert shown.get().count("true state is unknown") == 2
     assert "1 step;" in shown.get()
+
+
+def shown(s: FlightSummary) -> str:
+    console = Console(width=120, force_terminal=False)
+    with console.capture() as text:
+        console.print(render(s))
+    return text.get()
+
+
+def test_paths_are_shown_as_they_are() -> None:
+    s = summarise(flight(decision(0)), wall_s=1.0, recording="out/[red]a[/red]/[/x].mcap", report="[link]b.html")
+    assert "out/[red]a[/red]/[/x].mcap" in shown(s)
+    assert "[link]b.html" in shown(s)
+
+
+def test_an_unknown_wall_time_is_left_out() -> None:
+    s = summarise(flight(decision(0), decision(1)), wall_s=None)
+    assert msgspec.json.decode(msgspec.json.encode(s))["wall_s"] is None
+    assert s.real_time_factor is None
+    assert "2 steps; 2 s\n" in re.sub(r" +\n", "\n", shown(s))
+    assert "2 s in 1 s (2 × real time)" in shown(msgspec.structs.replace(s, wall_s=1.0, real_time_factor=2.0))
+
+
+@pytest.mark.parametrize(("late_ns", "virtual"), [((0, 0), True), ((0, 1), False)])
+def test_virtual_time_has_no_lateness(late_ns: tuple[int, ...], virtual: bool) -> None:
+    timings = [Timing(tick=k, at_ns=k, lateness_ns=late, step_ns=5000, send_ns=0) for k, late in enumerate(late_ns)]
+    found = flight(decision(0), decision(1), *timings)
+    assert found.virtual_time is virtual
+    text = shown(summarise(found, wall_s=1.0))
+    assert ("virtual time" in text) is virtual
+    assert ("Tick lateness" in text) is not virtual
+
+
+def test_unmeasured_ticks_are_not_called_virtual() -> None:
+    assert not flight(decision(0)).virtual_time
+    assert "not measured" in shown(figures(decision(0)))
+
+
+def test_the_end_is_in_the_table() -> None:
+    text = shown(summarise(modes("track", "brake", "hold", "land", "stopped"), wall_s=1.0))
+    assert "landed by the fallback" in text
+    assert "m at the last flown step;" in text
 
 
 @pytest.mark.parametrize(("value", "text"), [(40.0, "40"), (0.2271, "0.227"), (1234.5, "1234.5"), (360000.0, "360000")])

@@ -101,8 +101,26 @@ def test_reduced_covariance_of_one_axis() -> None:
 
 def test_stationary_cost_of_two_gains() -> None:
     plant = one_axis(paper_plant())
-    assert stationary_cost(plant, 4, K_AXIS, Q_X, Q_U) == pytest.approx(258.6, abs=0.05)
-    assert stationary_cost(plant, 4, np.array([[-0.152, -0.787]]), Q_X, Q_U) == pytest.approx(162.0, abs=0.05)
+    better = make_terminal(plant, 4, np.array([[-0.152, -0.787]]), Q_X, Q_U)
+    assert stationary_cost(axis_terminal()) == pytest.approx(258.6, abs=0.05)
+    assert stationary_cost(better) == pytest.approx(162.0, abs=0.05)
+
+
+def test_the_room_s_gain_is_a_local_minimum_of_the_stationary_cost() -> None:
+    given = spec("room")
+
+    def cost(k: Array) -> float:
+        return stationary_cost(make_terminal(given.plant, given.tau, k, given.q_x, given.q_u))
+
+    least = cost(given.k_tau)
+    entries = np.argwhere(given.k_tau != 0.0)
+    assert len(entries) == 9
+    for row, column in entries:
+        for share in (0.99, 1.01):
+            moved = given.k_tau.copy()
+            moved[row, column] *= share
+            # 1 % of an entry costs some 1e-5 to 1e-4: its printed digits are within that of the minimum.
+            assert cost(moved) > least
 
 
 def test_stationary_cost_is_that_of_a_long_simulation() -> None:
@@ -115,7 +133,8 @@ def test_stationary_cost_is_that_of_a_long_simulation() -> None:
         states.append(plant.a @ states[-1] + plant.b @ u + plant.e @ rng.normal(0.0, np.sqrt(0.6), (1, runs)))
     costs = np.einsum("ir,ij,jr->r", states[-1], Q_X, states[-1]) + Q_U[0, 0] * (k @ states[-5])[0] ** 2
     error = np.std(costs) / np.sqrt(runs)
-    assert abs(np.mean(costs) - stationary_cost(plant, 4, k, Q_X, Q_U)) < 4.0 * error
+    terminal = make_terminal(plant, 4, k, Q_X, Q_U)
+    assert abs(np.mean(costs) - stationary_cost(terminal)) < 4.0 * error
 
 
 def test_reduction_of_the_terminal_inequality_is_an_identity() -> None:

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from uavctl.config.types import Config
+from uavctl.config.types import Config, LinkConfig
+from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
@@ -48,22 +49,47 @@ def build_plant(config: Config) -> Plant:
 
 
 def link_probability(config: Config) -> float:
-    """p(k): probability that at least one sample captured within a Δt is there at its end.
+    """p(k): probability that at least one position captured within a Δt is there at its end.
 
-    Packets are lost one by one with `link.loss`. Of the samples of a Δt, those count that even the longest delay
-    lets arrive in time; one is taken as given, which is what the paper's link sends.
+    Positions are lost one by one with the mean loss of the link. Of a Δt's positions, those count that even the
+    longest delay lets arrive in time; without `source.rate_hz` it is one, which is what the paper's link sends.
+
+    Raises:
+        DesignError: No position can be counted on: the delay is Δt or more, or the rate too low.
     """
-    camera, link, dt_s = config.sim.camera, config.link, config.plant.dt_s
-    longest_s = camera.latency_s + link.delay_s + link.jitter_s
-    in_time = math.floor(camera.rate_hz * (dt_s - longest_s) + 1e-9)
-    return 1.0 - link.loss ** max(1, in_time)
+    link, rate_hz, dt_s = config.link, config.source.rate_hz, config.plant.dt_s
+    longest_s = link.delay_s + link.jitter_s
+    if longest_s >= dt_s:
+        raise DesignError(
+            "link.delay_s",
+            f"a position is on its way for up to {link.delay_s:g} + {link.jitter_s:g} s (delay and jitter), and is of "
+            f"use within the step of {dt_s:g} s only",
+            f"keep link.delay_s + link.jitter_s below plant.dt_s = {dt_s:g}, or take a longer step",
+        )
+    in_time = math.floor(rate_hz * (dt_s - longest_s) + 1e-9) if rate_hz else 1
+    if in_time < 1:
+        raise DesignError(
+            "source.rate_hz",
+            f"{rate_hz:g} positions a second are none that is sure to be captured in the {dt_s - longest_s:g} s of a "
+            "step that leave time for the delay",
+            f"give at least {1.0 / (dt_s - longest_s):.4g}, or 0 to count on one position a step",
+        )
+    return 1.0 - mean_loss(link) ** in_time
+
+
+def mean_loss(link: LinkConfig) -> float:
+    """Share of packets lost in the long run; of Gilbert-Elliott's chain, in its stationary distribution."""
+    if link.model == "bernoulli":
+        return link.loss
+    bad = link.burst_enter / (link.burst_enter + link.burst_leave)  # burst_leave is positive by its type
+    return (1.0 - bad) * link.loss + bad * link.burst_loss
 
 
 def build_spec(config: Config) -> DesignSpec:
     """What the configuration asks of a design.
 
     Raises:
-        DesignError: See `build_plant`.
+        DesignError: See `build_plant` and `link_probability`.
     """
     smpc, schedule, sets = config.smpc, config.schedule, config.sets
     return DesignSpec(

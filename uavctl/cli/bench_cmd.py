@@ -40,7 +40,7 @@ def bench_picture(result: BenchResult, name: str) -> RenderableType:
     """The medians as a table."""
     table = Table()
     table.add_column("one decision")
-    table.add_column("median [ms]", justify="right")
+    table.add_column("median (ms)", justify="right")
     table.add_column("against exact", justify="right")
     table.add_column("what came of it")
     joint = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import msgspec
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 from rich.console import Console, RenderableType
 
 from uavctl.config import Loaded, explain, load
@@ -60,6 +60,7 @@ class Common:
 
 
 DEFAULTS = Common()
+POSITIVE = validators.Number(gt=0)
 
 
 def messages() -> Console:

@@ -10,6 +10,7 @@ from rich.table import Table
 from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, Common, located
 from uavctl.smpc.design import Design, design_record
+from uavctl.smpc.terminal import stationary_cost
 
 
 def design(*, common: Common = DEFAULTS) -> int:
@@ -43,5 +44,8 @@ def design_picture(made: Design, name: str) -> RenderableType:
     rows = zip(made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True)
     for t, (delay, alpha, gamma_x, gamma_u) in enumerate(rows):
         schedule.add_row(str(t), str(delay), f"{alpha:.5f}", f"{gamma_x:.5f}", f"{gamma_u:.5f}")
-    terminal = f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}.\n"
+    terminal = (
+        f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
+        f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
+    )
     return Group(checks, terminal, "Schedule: stage t counts on information that is d_t steps old.", schedule)

@@ -12,7 +12,7 @@ from logs.disk import check_room
 from logs.recorder import Recorder
 from logs.summary import render
 from uavctl.build import build_controller, build_design
-from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
 from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -30,7 +30,9 @@ def fly(
     mocap: Annotated[
         str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
     ] = None,
-    duration: Annotated[float | None, Parameter(help="hand over after this time [s]; else fly on")] = None,
+    duration: Annotated[
+        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=POSITIVE)
+    ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
 ) -> int:
     """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C hands it back.
@@ -45,9 +47,9 @@ def fly(
     with located(loaded):
         design = build_design(config)
         controller = build_controller(config, design)
+    connections = _connect(config)
     path = recording_path(out, config.name)
     check_room(path, config.log.free_bytes)
-    connections = _connect(config)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     begun = time.perf_counter()
     with stop_on_signals() as stopped:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
+from rich.markup import escape
 from rich.table import Table
 
 from logs.flight_data import FlightData
@@ -48,7 +49,7 @@ def info(flight: Flight, /, *, json: Json = False) -> int:
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
     """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
     result = restore(flight, out)
-    Common(json=json).show(result, lambda: _recover_table(result))
+    Common(json=json).show(result, lambda: _recover_table(result, out))
     return 0 if result.lossless else RECOVERED_WITH_LOSS
 
 
@@ -75,8 +76,15 @@ def replay(
     recorded = header(flight)
     _warn_of_differences(recorded)
     config = parse(recorded.config_toml, f"{flight} (configuration)").config
-    finished = recording_info(flight).finished
-    result = replay_recording(read(flight), _loop_maker(config), tolerance, finished=finished)
+    whole = recording_info(flight)
+    result = replay_recording(read(flight), _loop_maker(config), tolerance, finished=whole.finished)
+    if whole.missing or whole.dropped:
+        text = (
+            f"{whole.missing + whole.dropped} records are missing in the recording: what came after cannot be compared"
+        )
+        messages().print(text, style="yellow", markup=False)
+    if not whole.finished:
+        messages().print("the recording is torn: compared up to its end", style="yellow", markup=False)
     common.show(result, lambda: _replay_table(result))
     return 0 if result.identical else 1
 
@@ -93,7 +101,7 @@ def report(
     """Write the page of a recording: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     data = FlightData.from_records(read(flight))
-    summary = summarise(data, wall_s=0.0, recording=str(flight), report=str(page))
+    summary = summarise(data, wall_s=None, recording=str(flight), report=str(page))
     write_report(data, summary, page)
     if svg is not None:
         svg.write_text(picture(data), encoding="utf-8")
@@ -113,7 +121,7 @@ def _replay_foreign(flight: Path, common: Common) -> int:
     result = replay_tlog(packets, _loop_maker(config), link=VEHICLE, tick_ns=tick_ns)
     if not result.positions:
         raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
-    common.show(result, lambda: _foreign_table(result))
+    common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
     return 0
 
 
@@ -124,15 +132,32 @@ def _warn_of_differences(recorded: Header) -> None:
     for name in sorted(here.keys() | there.keys()):
         if here.get(name) != there.get(name):
             messages().print(
-                f"[yellow]recorded with {name} {there.get(name)}, here is {here.get(name)}: the last bits may differ"
+                f"recorded with {name} {there.get(name)}, here is {here.get(name)}: the last bits may differ",
+                style="yellow",
+                markup=False,
             )
 
 
 def _two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in rows:
-        table.add_row(name, str(value))
+        table.add_row(escape(name), escape(str(value)))
     return table
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """Counts in words, as in "126 track, 20 hold"."""
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
+
+
+def _ages(ages: Mapping[str, int], horizon: int) -> str:
+    """Ages at decisions, in a few classes."""
+    classes: dict[str, int] = {}
+    for age, count in ages.items():
+        steps = int(age)
+        name = age if steps < 2 else f"2 to {horizon - 1}" if steps < horizon else f"{horizon} and more"
+        classes[name] = classes.get(name, 0) + count
+    return ", ".join(f"{name}: {count}" for name, count in classes.items())
 
 
 def _replay_table(result: ReplayResult) -> Table:
@@ -151,12 +176,16 @@ def _replay_table(result: ReplayResult) -> Table:
     return _two_columns("Replay", rows)
 
 
-def _recover_table(result: RecoverResult) -> Table:
+def _recover_table(result: RecoverResult, out: Path) -> Table:
+    lost = str(result.messages_lost)
+    if not result.finished:
+        lost += " known; those after the last restored one cannot be counted"
     return _two_columns(
         "Recovered",
         [
+            ("written to", out),
             ("messages", result.messages),
-            ("messages lost", result.messages_lost),
+            ("messages lost", lost),
             ("bytes lost", result.lost_bytes),
             *(("damage", text) for text in result.damage),
         ],
@@ -164,23 +193,23 @@ def _recover_table(result: RecoverResult) -> Table:
 
 
 def _info_table(found: RecordingInfo) -> Table:
-    table = Table(
-        title=f"{', '.join(found.files)}: {found.duration_s:.1f} s, {found.bytes} bytes", title_justify="left"
-    )
+    title = f"{', '.join(found.files)}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
+    table = Table(title=escape(title), title_justify="left", caption_justify="left")
     for column in ("topic", "messages", "rate", "longest gap"):
         table.add_column(column, justify="left" if column == "topic" else "right")
     for topic in found.topics:
-        rate, gap = f"{topic.rate_hz:.1f}/s", f"{topic.longest_gap_s:.3f} s"
+        several = topic.messages > 1
+        rate, gap = (f"{topic.rate_hz:.1f}/s", f"{topic.longest_gap_s:.3f} s") if several else ("", "")
         table.add_row(topic.topic, str(topic.messages), rate, gap)
     state = "closed in order" if found.finished else "not closed: `uavctl log recover` makes a clean file"
     caption = [state, f"{found.dropped} dropped, {found.missing} missing", *found.damage]
     if found.origin is not None:
         caption.append(f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})")
-    table.caption = "\n".join(caption)
+    table.caption = escape("\n".join(caption))
     return table
 
 
-def _foreign_table(result: ForeignReplay) -> Table:
+def _foreign_table(result: ForeignReplay, horizon: int) -> Table:
     ages = result.age_ms
     rows: list[tuple[str, object]] = [
         ("datagrams", result.datagrams),
@@ -188,11 +217,11 @@ def _foreign_table(result: ForeignReplay) -> Table:
         ("out of order", result.out_of_order),
         ("accepted / refused", f"{result.accepted} / {result.rejected}"),
         ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
-        ("solves", result.solves),
-        ("modes (ticks)", result.modes),
-        ("age at decisions (steps: times)", result.age_steps),
+        ("solves", _counts(result.solves)),
+        ("ticks by mode", _counts(result.modes)),
+        ("decisions by age in steps", _ages(result.age_steps, horizon)),
     ]
     if ages is not None:
         spread = f"{ages.min:.0f}, {ages.p05:.0f}, {ages.p50:.0f}, {ages.p95:.0f}, {ages.max:.0f}"
-        rows.append(("capture to arrival [ms]: min, 5 %, median, 95 %, max", spread))
+        rows.append(("capture to arrival, ms: min, 5 %, median, 95 %, max", spread))
     return _two_columns("Foreign recording through our controller", rows)

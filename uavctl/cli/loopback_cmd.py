@@ -28,7 +28,7 @@ from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon import fly
 from uavctl.data import Outgoing, Sink, Truth
-from uavctl.errors import UavctlError
+from uavctl.errors import UavctlError, UsageError
 from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design import Design
@@ -54,6 +54,8 @@ def loopback(
     overrides = [f"{key}={value}" for key, value in given.items() if value is not None]
     loaded = common.with_overrides(overrides).load()
     config = _on_loopback(loaded.config) if udp else loaded.config
+    if config.duration_s < config.daemon.tick_s:
+        raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
     with located(loaded):
         design = build_design(config)
         controller = build_controller(config, design)

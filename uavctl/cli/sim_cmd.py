@@ -9,7 +9,7 @@ import msgspec
 from cyclopts import Parameter
 
 from sim.server import Ready, serve
-from uavctl.cli.common import DEFAULTS, Common
+from uavctl.cli.common import DEFAULTS, POSITIVE, Common
 from uavctl.cli.flying import stop_on_signals
 from uavctl.data import Truth
 
@@ -27,7 +27,9 @@ def sim(
         Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot")
     ] = None,
     airborne: Annotated[bool, Parameter(negative=(), help="start flying in OFFBOARD or GUIDED")] = False,
-    duration: Annotated[float | None, Parameter(help="end after this time [s]; else on Ctrl-C")] = None,
+    duration: Annotated[
+        float | None, Parameter(help="end after this time [s]; else on Ctrl-C", validator=POSITIVE)
+    ] = None,
 ) -> int:
     """Serve the simulated vehicle in real time; one line says when the ports are open."""
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)

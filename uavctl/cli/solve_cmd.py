@@ -27,7 +27,12 @@ def solve(
     state: Annotated[
         str, Parameter(allow_leading_hyphen=True, help="state now, axis by axis, as in 35,-2,-20,-4", metavar="X,V,...")
     ],
-    method: Annotated[Literal["printed", "exact"] | None, Parameter(help="overrides solver.method")] = None,
+    method: Annotated[
+        Literal["printed", "exact"] | None,
+        Parameter(
+            help="overrides solver.method; `printed` knows no lower bound: cost_lower and gap are null in --json"
+        ),
+    ] = None,
     common: Common = DEFAULTS,
 ) -> int:
     """Solve one decision problem, towards the configured target."""
@@ -59,7 +64,7 @@ def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
 
 
 def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
-    """The answer, for --json; what is infinite (no plan) is null."""
+    """The answer, for --json; what is infinite (no plan, no lower bound) is null."""
     return {
         "status": answer.status.value,
         "cost": answer.cost,
@@ -84,10 +89,10 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
         return f"{head}; no plan"
-    facts = (
-        f"cost {answer.cost:.2f} (at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}), "
-        f"slack {answer.slack:.3g}, offset {answer.offset:.3g}"
-    )
+    bound = "no lower bound known"
+    if math.isfinite(answer.gap):
+        bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
+    facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
     plan = Table(
         title="Plan: predicted means and inputs; largest back-off of a limit in the stage", title_justify="left"
     )

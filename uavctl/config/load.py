@@ -54,7 +54,7 @@ class Source:
     def where(self, key: str) -> str:
         """The override that set `key`, else `file:line` of the key or of the nearest table around it."""
         for path, text in reversed(self.overrides):
-            if key == path or key.startswith((f"{path}.", f"{path}[")):
+            if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
                 return f"--set {text}"
         around = key
         while around and around not in self.lines:

@@ -14,10 +14,6 @@ from msgspec import Meta
 Rows = tuple[tuple[float, ...], ...]
 Floats = tuple[float, ...]
 Position = tuple[float, float, float]
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
-Probability = Annotated[float, Meta(ge=0, le=1)]
-OpenProbability = Annotated[float, Meta(gt=0, lt=1)]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -160,14 +156,25 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=0,
             lt=1,
-            description="probability that a packet is lost; the design uses p = 1 − lossⁿ, n samples in time each Δt",
+            description="probability that a packet is lost; the design uses p = 1 − (mean loss)ⁿ, n positions in time "
+            "each Δt (source.rate_hz)",
         ),
     ] = 0.0
     model: Annotated[
-        Literal["bernoulli", "gilbert-elliott"], Meta(description="loss model of the simulated channel")
+        Literal["bernoulli", "gilbert-elliott"],
+        Meta(
+            description="loss model of the channel; with `gilbert-elliott` the design counts on the mean loss: bursts "
+            "are not in its p(k)"
+        ),
     ] = "bernoulli"
     burst_enter: Annotated[
-        float, Meta(ge=0, le=1, description="Gilbert–Elliott: probability of entering the bad state, each packet")
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="Gilbert–Elliott: probability of entering the bad state, each packet; the design takes the bad "
+            "state's share as enter / (enter + leave)",
+        ),
     ] = 0.0
     burst_leave: Annotated[
         float, Meta(gt=0, le=1, description="Gilbert–Elliott: probability of leaving the bad state, each packet")
@@ -274,6 +281,10 @@ class SourceConfig(Section, frozen=True, kw_only=True):
     system_id: Annotated[
         int, Meta(ge=0, le=255, description="MAVLink system id that positions must come from; 0 takes any")
     ] = 0
+    rate_hz: Annotated[
+        float,
+        Meta(ge=0, description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]"),
+    ] = 0.0
 
 
 class ClockConfig(Section, frozen=True, kw_only=True):
@@ -307,7 +318,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     phase_s: Annotated[float, Meta(ge=0, description="time of the first sample; then every 1/rate_hz [s]")] = 0.0
     noise_std_m: Annotated[float, Meta(ge=0, description="noise of a position, each axis [m]")] = 0.0
     latency_s: Annotated[float, Meta(ge=0, description="processing time in the cameras, before the link [s]")] = 0.0
-    clock_offset_s: Annotated[float, Meta(description="offset of the cameras' clock [s]")] = 0.0
+    clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
     message: Annotated[
         Literal["vision", "vicon", "mocap", "odometry"],
         Meta(description="MAVLink message; `odometry` carries the velocity too"),

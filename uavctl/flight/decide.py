@@ -9,7 +9,7 @@ import numpy as np
 from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3, VehicleStatus
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.estimator import History, estimate
+from uavctl.flight.estimator import History, estimate, newest_capture_ns
 from uavctl.flight.fallback import Fallback
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.planning import ask
@@ -41,17 +41,21 @@ class Choice:
 
 
 def place(state: ControlState, inp: StepInput, history: History, controller: Controller) -> Tick:
-    """The tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt)."""
+    """The tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt).
+
+    The age counts what had been captured by the boundary, also in a tick after it: a boundary that was missed is
+    decided as it would have been then.
+    """
     number, into = divmod(inp.tick, controller.ticks_per_step)
     boundary_ns = inp.at_ns - into * controller.tick_ns
-    captured_ns = history.captured_ns
+    captured_ns = newest_capture_ns(history, boundary_ns)
     return Tick(
         number=number,
         boundary_ns=boundary_ns,
         boundary=state.decided_step is None or number > state.decided_step,
         history=history,
         estimate=estimate(controller.kalman, history, inp.at_ns),
-        age_steps=None if captured_ns is None else max(0, (boundary_ns - captured_ns) // controller.dt_ns),
+        age_steps=None if captured_ns is None else (boundary_ns - captured_ns) // controller.dt_ns,
     )
 
 
@@ -64,6 +68,8 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     if why_not and stopping:
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns)
         return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
+    if inp.vehicle is None and state.fallback is not None:
+        return _wait_out(state, state.fallback, tick, inp.at_ns, controller)
     if why_not:
         return Choice(replace(state, plan=None, fallback=None), why_not)
     if stopping:
@@ -80,7 +86,8 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
 def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller) -> Choice:
     """The decision of a Δt boundary, with a vehicle that takes setpoints."""
     if tick.age_steps is None:
-        return Choice(state, "no position yet")
+        never = tick.estimate is None
+        return Choice(state, "no position yet" if never else "no position from before this boundary yet")
     if tick.age_steps >= controller.horizon:
         reason = f"age of information {tick.age_steps} has reached H = {controller.horizon}"
         return _fall(state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, reason)
@@ -91,19 +98,17 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
-    if plan is None and state.fallback is None and not choice.news:
-        return replace(choice, reason="no position from before this boundary yet")
     fallen = _fall(choice.state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, "no plan is left to fly")
     return replace(choice, state=fallen.state, reason=fallen.reason)
 
 
 def _replan(state: ControlState, tick: Tick, controller: Controller) -> Choice:
     """Ask for a plan if there is news; else, or if that fails, the old one plays out."""
-    # A boundary that was missed is decided as it would have been then: from what had been captured by then.
     base = estimate(controller.kalman, tick.history, tick.boundary_ns)
     if base is None or (state.plan is not None and base.captured_ns <= state.plan.captured_ns):
         return Choice(state, "no news: the plan plays out")
-    asked = ask(controller.solver, tick.number, base, controller.target, controller.horizon, controller.design_id)
+    shape = (controller.horizon, controller.plant.n_u)
+    asked = ask(controller.solver, tick.number, base, controller.target, shape, controller.design_id)
     if asked.plan is None:
         return Choice(state, "no new plan: the old one plays out", True, asked.status, None, asked.text)
     return Choice(replace(state, plan=asked.plan, fallback=None), "news: a new plan", True, asked.status, asked.plan)
@@ -113,10 +118,24 @@ def _fall(
     state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller, reason: str
 ) -> Choice:
     """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
-    speed_mps = float(np.linalg.norm(velocity(tick.estimate, controller.plant)))
-    fallback = fb.advance(fallback, at_ns, speed_mps, controller.fallback)
+    fallback = _advanced(fallback, tick, at_ns, controller)
     fresh = 0 if state.fallback is None else state.fresh
     return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
+
+
+def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Choice:
+    """Let the fallback's time run on while the vehicle is silent.
+
+    Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime.
+    """
+    later = _advanced(fallback, tick, at_ns, controller)
+    reason = "no vehicle is heard; the fallback's time runs on"
+    return Choice(replace(state, fallback=fallback if later.ended else later), reason)
+
+
+def _advanced(fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Fallback:
+    speed_mps = float(np.linalg.norm(velocity(tick.estimate, controller.plant)))
+    return fb.advance(fallback, at_ns, speed_mps, controller.fallback)
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:

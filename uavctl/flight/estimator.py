@@ -130,8 +130,7 @@ def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
 
     A time before the newest entry leaves out what came after it; a time before the window has no estimate.
     """
-    place = bisect_right(history.entries, at_ns, key=lambda entry: entry.key[0])
-    node = history.entries[place - 1].after if place else history.anchor
+    node = _known(history, at_ns)
     if node.belief is None or node.belief.at_ns > at_ns:
         return None
     belief = predicted(kalman, history.origin_ns, node.belief, node.input, at_ns)
@@ -142,6 +141,18 @@ def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
         mean=tuple(belief.mean[:n_x].tolist()),
         cov=tuple(map(tuple, belief.cov[:n_x, :n_x].tolist())),
     )
+
+
+def newest_capture_ns(history: History, at_ns: int) -> int | None:
+    """Capture time of the newest sample from up to `at_ns`; None where there is no estimate."""
+    belief = _known(history, at_ns).belief
+    return None if belief is None or belief.at_ns > at_ns else belief.captured_ns
+
+
+def _known(history: History, at_ns: int) -> Node:
+    """What was known after all that had happened by `at_ns`."""
+    place = bisect_right(history.entries, at_ns, key=lambda entry: entry.key[0])
+    return history.entries[place - 1].after if place else history.anchor
 
 
 def _horizon_ns(kalman: Kalman, at_ns: int) -> int:
@@ -165,7 +176,7 @@ def _inserted(kalman: Kalman, history: History, new: list[Entry]) -> History:
 def _trimmed(history: History, horizon_ns: int) -> History:
     """Move the anchor up to the horizon."""
     place = bisect_right(history.entries, horizon_ns, key=lambda entry: entry.key[0])
-    anchor = history.entries[place - 1].after if place else history.anchor
+    anchor = _known(history, horizon_ns)
     return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[place:])
 
 

@@ -23,7 +23,7 @@ class Asked:
     text: str
 
 
-def ask(solver: Solver, seq: int, base: Estimate, target: Array, horizon: int, design_id: str) -> Asked:
+def ask(solver: Solver, seq: int, base: Estimate, target: Array, shape: tuple[int, int], design_id: str) -> Asked:
     """Plan from the estimate at a boundary; never raises on numbers.
 
     Args:
@@ -31,7 +31,7 @@ def ask(solver: Solver, seq: int, base: Estimate, target: Array, horizon: int, d
         seq: Number of the step that asks.
         base: The estimate at the boundary.
         target: Equilibrium to go to (n_x,).
-        horizon: H, the number of inputs that an answer must have.
+        shape: (H, n_u) of the inputs that an answer must have.
         design_id: Goes into the plan.
     """
     try:
@@ -42,15 +42,15 @@ def ask(solver: Solver, seq: int, base: Estimate, target: Array, horizon: int, d
         return Asked(SolveStatus.LATE, None, f"the answer is to step {answer.seq}, asked was step {seq}")
     if answer.status is not SolveStatus.OPTIMAL:
         return Asked(answer.status, None, f"the solve ended as {answer.status.value}")
-    if not _complete(answer, horizon, len(base.mean)):
+    if not _complete(answer, shape, len(base.mean)):
         return Asked(SolveStatus.FAILED, None, "the answer is not finite, or has the wrong shape")
     return Asked(SolveStatus.OPTIMAL, _plan(answer, base, design_id), "")
 
 
-def _complete(answer: Answer, horizon: int, n_x: int) -> bool:
+def _complete(answer: Answer, shape: tuple[int, int], n_x: int) -> bool:
     return (
-        len(answer.inputs) == horizon
-        and answer.states.shape == (horizon + 1, n_x)
+        answer.inputs.shape == shape
+        and answer.states.shape == (shape[0] + 1, n_x)
         and all(np.isfinite(values).all() for values in (answer.inputs, answer.states, answer.reference))
     )
 

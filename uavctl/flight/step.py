@@ -33,9 +33,6 @@ from uavctl.flight.samples import take
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
-# A row of fresh samples is broken when none was captured for this many steps.
-_ROW_BROKEN_STEPS = 2
-
 _SOURCES = {
     ControlMode.WAIT: SetpointSource.HOLD,
     ControlMode.TRACK: SetpointSource.PLAN,
@@ -65,9 +62,8 @@ class StepOutput:
     land: bool
 
 
-def initial_state(controller: Controller) -> ControlState:
+def initial_state() -> ControlState:
     """The state before the first tick."""
-    del controller
     return ControlState()
 
 
@@ -84,9 +80,9 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     """
     origin_ns = inp.at_ns - inp.tick * controller.tick_ns
     history = state.history or begin(controller.kalman, origin_ns, inp.at_ns)
-    intake = take(controller.kalman, history, inp, controller.tick_ns, state.fresh)
+    intake = take(controller.kalman, history, inp, controller.horizon, state.fresh)
     tick = place(state, inp, intake.history, controller)
-    stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= _ROW_BROKEN_STEPS
+    stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
     begun = replace(state, history=intake.history, decided_step=tick.number, fresh=0 if stale else intake.fresh)
     choice = choose(begun, tick, inp, controller)
     setpoint, applied = _setpoint(choice.state, tick, inp.at_ns, controller)

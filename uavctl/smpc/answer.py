@@ -30,8 +30,9 @@ class Answer:
         offset: l1 distance of the reference from the target, in equilibrium coordinates.
         terminal_miss: l1 violation of the terminal equality.
         cost: Objective: cost (18) and all penalties.
-        cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance.
-        gap: (cost - cost_lower) / max(1, |cost|).
+        cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method
+            knows none.
+        gap: (cost - cost_lower) / max(1, |cost|); inf if no lower bound is known.
         iterations: Interior-point iterations, summed over all programs that were run.
     """
 

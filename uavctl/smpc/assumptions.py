@@ -84,7 +84,7 @@ def check_assumptions(
     for check in checks:
         if not check.ok:
             key, hint = _BLAME[check.item]
-            reason = f"Assumption {check.item} fails: {check.text}: {check.value:.4g}, limit {check.limit:.4g}"
+            reason = f"Assumption {check.item} fails: {check.text}: {check.value:.6g}, limit {check.limit:.9g}"
             raise DesignError(key, reason, hint)
     return checks
 

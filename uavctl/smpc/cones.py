@@ -5,7 +5,9 @@ minimise ½ zᵀPz + q(p)ᵀz + c(p)  subject to  E z + F p + g in a product of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import clarabel
 import numpy as np
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 Array = NDArray[np.float64]
+Result = TypeVar("Result")
 
 # The optimum is to be right to 1e-7. With a smaller gap the linear algebra may run out of digits before the end.
 GAP_TOLERANCE = 1e-8
@@ -149,6 +152,17 @@ class Solution:
     iterations: int
 
 
+def unless_panic(call: Callable[[], Result]) -> Result | None:
+    """What `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
+    try:
+        return call()
+    except BaseException as error:
+        # A panic of the solver's own code is no Exception, and its class cannot be imported.
+        if type(error).__name__ != "PanicException":
+            raise
+        return None
+
+
 class ConicProgram:
     """A program that is set up once and solved for many parameters."""
 
@@ -182,13 +196,13 @@ class ConicProgram:
             b = self._b_const + self._b_par @ parameters
         if not (np.isfinite(constant) and np.all(np.isfinite(q)) and np.all(np.isfinite(b))):
             return self._breakdown()
-        try:
+
+        def run() -> clarabel.DefaultSolution:
             self._solver.update(q=q, b=b)
-            result = self._solver.solve()
-        except BaseException as error:
-            # A panic of the solver's own code is no Exception, and its class cannot be imported.
-            if type(error).__name__ != "PanicException":
-                raise
+            return self._solver.solve()
+
+        result = unless_panic(run)
+        if result is None:
             self._solver = self._set_up()
             return self._breakdown()
         return Solution(

@@ -19,7 +19,7 @@ from uavctl.smpc.plant import Plant, steps_to_reach
 from uavctl.smpc.risk import Allocation, kappa
 from uavctl.smpc.schedule import Demand, Schedule, fixed, greedy, nested
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.terminal import Terminal, make_terminal
+from uavctl.smpc.terminal import Terminal, make_terminal, stationary_cost
 
 Array = NDArray[np.float64]
 Rule = Literal["fixed", "search", "greedy"]
@@ -254,6 +254,7 @@ def design_record(design: Design) -> dict[str, object]:
         "kappa_x_terminal": design.kappa_x_terminal,
         "kappa_u_terminal": design.kappa_u_terminal,
         "spectral_radius": terminal.spectral_radius,
+        "stationary_cost": stationary_cost(terminal),
         "assumptions": [
             {
                 "item": check.item,

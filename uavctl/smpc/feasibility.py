@@ -87,18 +87,24 @@ def _expression(affine: Affine) -> Expression:
 
 
 @lru_cache(maxsize=1)
-def _solver(design: Design) -> ConicSolver:
-    """The last design's solver: a search asks for the cost of many states of one design in a row."""
+def _solver(design: Design) -> ConicSolver | None:
+    """The last design's solver, None where its schedule will not do.
+
+    A search asks for the cost of many states of one design in a row; margin and programs are the design's alone.
+    """
+    try:
+        check_schedule(design)
+    except DesignError:
+        return None
     return ConicSolver(design)
 
 
 def optimal_cost(design: Design, x: Array) -> float | None:
     """Optimal cost (19a) from a state (n_x,) to the design's target, None where (19) is infeasible."""
-    try:
-        check_schedule(design)
-    except DesignError:
+    solver = _solver(design)
+    if solver is None:
         return None
-    answer = _solver(design).solve(0, x, design.target)
+    answer = solver.solve(0, x, design.target)
     if answer.status is not SolveStatus.OPTIMAL:
         return None
     return None if max(answer.slack, answer.offset, answer.terminal_miss) > KEPT else answer.cost

@@ -21,6 +21,7 @@ from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.assemble import PartAnswer, assemble, inside
 from uavctl.smpc.components import Component, decompose, whole
+from uavctl.smpc.cones import unless_panic
 from uavctl.smpc.design import Design
 
 Array = NDArray[np.float64]
@@ -123,30 +124,36 @@ class PrintedProblem:
             offset=0.0,
             terminal_miss=0.0,
             cost=cost,
-            cost_lower=cost,
+            cost_lower=-np.inf,
         )
 
     def _run(self) -> tuple[SolveStatus, float, int]:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")  # the status says so
             try:
-                self._problem.solve(
-                    solver=cp.CLARABEL,
-                    max_iter=self._design.max_iterations,
-                    max_threads=1,
-                    static_regularization_constant=self._regularization,
-                )
+                value = unless_panic(self._solve)
             except cp.SolverError:
-                return SolveStatus.FAILED, np.inf, 0
+                value = None
+        if value is None:
+            return SolveStatus.FAILED, np.inf, 0
         status = _STATUS.get(self._problem.status, SolveStatus.FAILED)
         iterations = self._problem.solver_stats.num_iters or 0
-        return status, float(self._problem.value), int(iterations)
+        return status, value, int(iterations)
+
+    def _solve(self) -> float:
+        value = self._problem.solve(
+            solver=cp.CLARABEL,
+            max_iter=self._design.max_iterations,
+            max_threads=1,
+            static_regularization_constant=self._regularization,
+        )
+        return float(value)
 
 
 class PrintedSolver:
     """Solves (19) as printed: hard constraints, the mean ends in the target.
 
-    CVXPY returns no dual objective, so `cost_lower` repeats the cost: the gap is unknown, not zero.
+    CVXPY returns no dual objective, so nothing is certified: `cost_lower` is -inf and `gap` inf.
     """
 
     def __init__(self, design: Design, *, joint: bool = False, regularization: float = REGULARIZATION) -> None:

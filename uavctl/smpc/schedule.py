@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.age import at_most
+from uavctl.smpc.age import information_probability
 
 Array = NDArray[np.float64]
 # The product's and the likelihoods' bounds are strict: equality makes γ = 1 and the back-off infinite.
@@ -68,8 +68,8 @@ class Demand:
         return (self.tau + 1,) * self.tau
 
     def alpha(self, t: int, delay: int) -> float:
-        """α_t of a delay."""
-        return 1.0 if t < delay else at_most(self.mu, t, delay - 1)
+        """α_t of a delay: p_{t,t-d}, of the newest disturbance that the stage feeds back."""
+        return 1.0 if t < delay else information_probability(self.mu, t, t - delay)
 
     def admits(self, t: int, newest: int, product: float, gamma_max: float) -> bool:
         """Whether stage t may feed back the disturbances up to r̂ = `newest` (-1: none), after a ∏ α of `product`.
@@ -165,13 +165,13 @@ def _likelihoods(demand: Demand, delays: tuple[int, ...]) -> Schedule:
     if alpha[worst] <= most + _STRICT:
         raise DesignError(
             "smpc.delta_x" if most == demand.delta_x else "smpc.delta_u",
-            f"{most:g} is out of reach: the feedback of stage {worst} is usable with probability {alpha[worst]:.4f}",
+            f"{most} is out of reach: the feedback of stage {worst} is usable with probability {alpha[worst]:.4f}",
             "lower it, take longer schedule.delays, or improve link.loss",
         )
     if product[-1] <= demand.delta_x + _STRICT:
         raise DesignError(
             "smpc.delta_x",
-            f"{demand.delta_x:g} is out of reach: the feedback of all stages is usable with probability "
+            f"{demand.delta_x} is out of reach: the feedback of all stages is usable with probability "
             f"{product[-1]:.4f} only",
             "lower it, take longer schedule.delays, or improve link.loss",
         )

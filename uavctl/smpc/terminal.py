@@ -100,9 +100,8 @@ def _sigma_z(plant: Plant, tau: int, k: Array) -> Array:
     return _symmetric(solve_discrete_lyapunov(f, g @ plant.w @ g.T))
 
 
-def stationary_cost(plant: Plant, tau: int, k: Array, q_x: Array, q_u: Array) -> float:
+def stationary_cost(terminal: Terminal) -> float:
     """Mean stage cost (3) of the delayed law in the long run."""
-    terminal = make_terminal(plant, tau, k, q_x, q_u)
     return float(np.trace(terminal.q_xi @ terminal.sigma_xi))
 
 
@@ -116,7 +115,8 @@ def invariance_residual(terminal: Terminal, w: Array) -> float:
     """Residual of Def. 2, relative to Σ_ξ."""
     sigma = terminal.sigma_xi
     noise = terminal.e_xi @ w @ terminal.e_xi.T
-    return float(np.abs(terminal.a_cl @ sigma @ terminal.a_cl.T + noise - sigma).max() / np.abs(sigma).max())
+    size = float(np.abs(sigma).max())
+    return float(np.abs(terminal.a_cl @ sigma @ terminal.a_cl.T + noise - sigma).max()) / size if size > 0.0 else 0.0
 
 
 def _symmetric(matrix: NDArray[np.floating]) -> Array:

@@ -1,0 +1,114 @@
+"""`uavctl loopback`, `sim` and `log` as people type them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from logs.reader import read, records
+from uavctl.cli.app import run
+from uavctl.data import Header, Truth
+
+KEYS = {
+    "steps", "duration_s", "received", "lost", "max_age", "fallbacks", "state_violations", "input_violations",
+    "slack_used", "cost", "recording", "report", "wall_s", "decision_us", "tick_lateness_us",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("flights") / "one"
+    assert run(["loopback", "--config", "paper", "--duration", "12", "--seed", "3", "--out", str(out), "--json"]) == 0
+    return out / "flight.mcap"
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> dict[str, Any]:
+    assert run([*arguments, "--json"]) == code
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
+    assert found.keys() >= KEYS
+    assert (found["steps"], found["slack_used"], found["input_violations"]) == (8, 0, 0)
+    assert found["received"] + found["lost"] == 8
+    assert Path(found["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "loopback", "--udp", "--config", "room", "--duration", "4", "--out", str(tmp_path / "f"))
+    assert found["steps"] >= 15
+    assert found["state_violations"] == found["input_violations"] == found["recorder_dropped"] == 0
+    assert len(list(records(tmp_path / "f" / "flight.mcap", Truth))) >= 19
+    assert document(capsys, "log", "replay", str(tmp_path / "f" / "flight.mcap"))["identical"]
+
+
+def test_the_recording_says_how_it_was_made(flown: Path) -> None:
+    header = next(records(flown, Header))
+    assert header.seed == 3 and header.design["design_id"] == header.design_id
+    assert {"uavctl", "python", "numpy", "clarabel"} <= header.versions.keys()
+    assert 'name = "paper"' in header.config_toml and header.cpu
+
+
+def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    replayed = document(capsys, "log", "replay", str(flown))
+    assert replayed["identical"] and replayed["decisions"] == 120 and replayed["first_difference"] is None
+    topics = {one["topic"]: one["messages"] for one in document(capsys, "log", "info", str(flown))["topics"]}
+    assert topics["/uavctl/decision"] == topics["/uavctl/step_input"] == 120
+    assert topics["/sim/truth"] == 12 and topics["/raw/vehicle/out"] > 120
+
+
+def test_replay_takes_the_recording_s_own_configuration_only(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["log", "replay", str(flown), "--set", "cost.input=[1.0, 1.0]"]) == 2
+    assert "own configuration" in capsys.readouterr().err
+
+
+def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
+    cut.write_bytes(flown.read_bytes()[:-40_000])
+    found = document(capsys, "log", "recover", str(cut), str(whole), code=3)
+    # the clean file has one message more: the recorder's note of where it comes from
+    assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(1 for _ in read(whole)) > 100
+    assert document(capsys, "log", "recover", str(flown), str(tmp_path / "same.mcap"))["lost_bytes"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["log", "info", "nowhere.mcap"], 1, "no such recording"),
+        (["log", "replay", "nowhere.tlog"], 1, "No such file"),
+        (["log", "recover", "nowhere.mcap", "x.mcap"], 1, "no such recording"),
+        (["loopback", "--duration", "0.001"], 2, "shorter than a tick"),
+        (["loopback", "--seed", "-1"], 2, "sim.seed"),
+        (["fly", "--duration", "0"], 2, "duration"),
+        (["fly", "--vehicle", "carrier-pigeon"], 2, "carrier-pigeon"),
+        (["sim", "--vehicle", "udpout://127.0.0.1"], 2, "udpout://127.0.0.1"),
+    ],
+)
+def test_bad_input_is_told_without_a_traceback(
+    arguments: list[str], code: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments) == code
+    told = capsys.readouterr()
+    assert words in (told.err + told.out).replace("\n", " ")
+
+
+def test_names_with_brackets_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "x[/b]"
+    assert run(["loopback", "--config", "paper", "--set", 'name="a[/b]"', "--duration", "3", "--out", str(out)]) == 0
+    assert run(["log", "info", str(out / "flight.mcap")]) == 0
+    assert "x[/b]" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_records_of_a_flight_have_the_types_of_their_topics(flown: Path) -> None:
+    for topic, at_ns, record in read(flown):
+        assert isinstance(record, msgspec.Struct) and topic.startswith("/") and at_ns >= 0
