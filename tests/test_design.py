@@ -161,7 +161,7 @@ def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPat
         ("paper", {"tau": 11}, "smpc.tau", r"N = 1 free steps"),
         ("room", {"tau": 10}, "smpc.tau", r"N = 2 free steps .* takes 3"),
         ("paper", {"tau": 3, "delays": 5, "delta_tau": 0.995}, "smpc.delta_tau", r"Assumption 4\.1 fails.*0\.9919"),
-        ("paper", {"target_m": (0.0, 4.0, 0.0)}, "target.position_m", r"Assumption 4\.3 fails.*16\.41, limit 16"),
+        ("paper", {"target_m": (0.0, 4.0, 0.0)}, "target.position_m", r"Assumption 4\.3 fails.*16\.4076, limit 16"),
         ("room", {"target_m": (1.5, 1.0, -0.1)}, "target.position_m", r"Assumption 4\.3 fails.*limit 0\.1"),
         ("paper", {"k_tau": -np.eye(2, 4)}, "smpc.k_tau", r"Assumption 4\.2"),
         ("paper", {"delta_x": 0.99}, "smpc.delta_x", r"0\.99 is out of reach.*0\.9831"),

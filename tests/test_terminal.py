@@ -226,7 +226,7 @@ def test_the_limits_are_met_from_both_sides() -> None:
     half = 3.0 * float(np.sqrt(axis_terminal().sigma_x[0, 0]))
     roomy = Polytope.from_box([-half - 1e-6, -99.0], [99.0, 99.0])
     assert assumptions(state_set=roomy)[2].ok
-    with pytest.raises(DesignError, match=r"Assumption 4\.3 fails.*lower limit of state 0.*15\.24, limit 15\.24"):
+    with pytest.raises(DesignError, match=r"Assumption 4\.3 fails.*lower limit of state 0.*15\.2365, limit 15\.2365"):
         assumptions(state_set=Polytope.from_box([-half + 1e-6, -99.0], [99.0, 99.0]))
 
 
@@ -262,7 +262,7 @@ def test_covariance_that_is_not_invariant_is_refused() -> None:
     ("position_m", "delta_tau", "u_max", "message"),
     [
         (0.0, 0.999, 7.5, r"smpc\.delta_tau: Assumption 4\.1 fails: .* 0\.9976, limit 0\.999; take a larger smpc\.tau"),
-        (40.0, 0.99, 7.5, r"target\.position_m: Assumption 4\.3 fails: .*upper limit of state 0.*15\.24, limit 10"),
+        (40.0, 0.99, 7.5, r"target\.position_m: Assumption 4\.3 fails: .*upper limit of state 0.*15\.2365, limit 10"),
         (60.0, 0.99, 7.5, r"target\.position_m: Assumption 4\.3 fails: .*limit -10"),
         (0.0, 0.99, 3.0, r"smpc\.k_tau: Assumption 4\.4 fails: .*upper limit of input 0.*3\.958, limit 3"),
     ],

@@ -104,7 +104,10 @@ def report(
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page))
     write_report(data, summary, page)
     if svg is not None:
-        svg.write_text(picture(data), encoding="utf-8")
+        try:
+            svg.write_text(picture(data), encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"{svg}: cannot be written ({error.strerror}); choose another place") from error
     Common(json=json).show(summary, lambda: render(summary))
     return 0
 
