@@ -88,14 +88,15 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
     """The plan as a table, stage by stage, with its largest back-offs."""
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
-        return f"{head}; no plan"
+        hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
+        if config.solver.method == "printed":
+            hint = "the printed problem has hard limits; `--method exact` softens those of the state"
+        return f"{head}; no plan: {hint}"
     bound = "no lower bound known"
     if math.isfinite(answer.gap):
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
-    plan = Table(
-        title="Plan: predicted means and inputs; largest back-off of a limit in the stage", title_justify="left"
-    )
+    plan = Table()
     names = state_names(design.plant.n_x, design.plant.axes)
     for heading in ("t", *names, *(f"u_{axis[0]}" for axis in design.plant.axes), "back-off x", "back-off u"):
         plan.add_column(heading, justify="right")

@@ -119,6 +119,8 @@ def _fall(
 ) -> Choice:
     """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
     fallback = _advanced(fallback, tick, at_ns, controller)
+    if fallback.mode is ControlMode.LAND and not fallback.stopping:
+        reason = f"held for {controller.fallback.hold_s:g} s, and positions did not come back: landing"
     fresh = 0 if state.fallback is None else state.fresh
     return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
 
