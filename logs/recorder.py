@@ -21,19 +21,8 @@ BATCH = 64
 BACKLOG_SHARE = 8
 
 
-class SyncRecorder:
-    """Recorder that writes in `put`: for virtual time, where the disk may hold up the caller.
-
-    Args:
-        path: file of the recording; it and its later segments must not exist yet.
-        chunk_bytes: largest chunk [bytes].
-        queue: records that may wait for a failing disk.
-        open_file: opens a new file.
-        clock: wall time [s].
-
-    Raises:
-        RecordingError: the name is taken, or the folder cannot be made.
-    """
+class _Base:
+    """A journal and how it is begun; arguments and errors are those of `Journal`."""
 
     def __init__(
         self,
@@ -46,6 +35,15 @@ class SyncRecorder:
     ) -> None:
         self._journal = Journal(path, chunk_bytes, queue, open_file, clock)
         self._queue = queue
+        self._begin()
+
+    def _begin(self) -> None:
+        """What has to run beside the journal."""
+        return
+
+
+class SyncRecorder(_Base):
+    """Recorder that writes in `put`: for virtual time, where the disk may hold up the caller."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Record one value under a topic; whatever goes wrong is in `status()`."""
@@ -63,30 +61,10 @@ class SyncRecorder:
         return self._journal.status()
 
 
-class Recorder:
-    """Recorder with a thread of its own, which encodes and writes; `put` only queues.
+class Recorder(_Base):
+    """Recorder with a thread of its own, which encodes and writes; `put` only queues."""
 
-    Args:
-        path: file of the recording; it and its later segments must not exist yet.
-        chunk_bytes: largest chunk [bytes].
-        queue: records that may wait for the disk.
-        open_file: opens a new file.
-        clock: wall time [s].
-
-    Raises:
-        RecordingError: the name is taken, or the folder cannot be made.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        chunk_bytes: int = 16384,
-        queue: int = 8192,
-        *,
-        open_file: Callable[[Path], OutputFile] = DiskFile,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._journal = Journal(path, chunk_bytes, queue, open_file, clock)
+    def _begin(self) -> None:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
