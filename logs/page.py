@@ -57,7 +57,7 @@ figure:last-child:nth-child(odd):not(.wide){width:100%%}
 .facts td{border-top:0;padding-top:0}
 }
 @media print{body{font-size:10.5pt}main{max-width:none;padding:0}
-h2{break-after:avoid}figure,.card,details{border-color:#ccc}}
+h2,.note,.legend{break-after:avoid}.note{break-inside:avoid}figure,.card,details{border-color:#ccc}}
 """
 
 
