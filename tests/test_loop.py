@@ -144,3 +144,15 @@ def test_without_landing_the_stop_ends_with_zero_and_asks_for_nothing() -> None:
     sent = rig.run(100, stop=True)
     assert LAND not in sent and rig.loop.finished
     assert rig.memory.of(Setpoint)[-1].accel_mps2 == (0.0, 0.0, 0.0)
+
+
+def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
+    after = Rig()  # nothing of a killed daemon is left for the next one
+    sent: list[str] = []
+    for _ in range(100):
+        if after.tick % 10 == 0:
+            after.heartbeat(OFFBOARD, armed=False)
+        sent += after.run(1, deaf=True)
+    assert after.loop.decision is not None and after.loop.decision.mode is ControlMode.WAIT
+    assert set(sent) == {"HEARTBEAT", "TIMESYNC", SETPOINT}  # no command: neither arming nor a mode
+    assert {s.accel_mps2 for s in after.memory.of(Setpoint)} == {(0.0, 0.0, 0.0)}
