@@ -78,6 +78,15 @@ class Estimate(Record, frozen=True, kw_only=True):
         return (self.at_ns - self.captured_ns) * 1e-9
 
 
+class GaveWay(Record, frozen=True, kw_only=True):
+    """A constraint that a plan could not keep, and by how much."""
+
+    constraint: str  # "state": a tightened row; "terminal": a row of the terminal set; "equilibrium": x̄_N = x_s
+    stage: int  # t of the plan; that of the reference for "terminal"
+    index: int  # row of the state set; state for "equilibrium"
+    amount: float  # in the row's, or the state's, unit
+
+
 class Plan(Record, frozen=True, kw_only=True):
     """An answer of the predictive controller, from `base_ns` on (one row a step Δt)."""
 
@@ -99,6 +108,7 @@ class Plan(Record, frozen=True, kw_only=True):
     gap: float
     iterations: int
     design_id: str
+    gave_way: tuple[GaveWay, ...] = ()
 
 
 class Setpoint(Record, frozen=True, kw_only=True):

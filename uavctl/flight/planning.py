@@ -75,6 +75,7 @@ def _plan(answer: Answer, base: Estimate, design_id: str) -> Plan:
         gap=float(answer.gap),
         iterations=int(answer.iterations),
         design_id=design_id,
+        gave_way=answer.gave_way,
     )
 
 

@@ -8,9 +8,56 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.data import SolveStatus
+from uavctl.data import GaveWay, SolveStatus
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A trajectory to follow, as deviations from the equilibrium that it is followed by.
+
+    Attributes:
+        states: (H, n_x): desired state of stage t minus the target.
+        inputs: (H, n_u): desired input of stage t minus the target's.
+    """
+
+    states: Array
+    inputs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What is known ahead about the steps of one plan.
+
+    Attributes:
+        limits: Right sides of the state rows in each stage (H+1, m_x); None: those of the design. What holds in the
+            last τ + 1 stages holds for the reference.
+        path: Trajectory to follow; None: stay at the target.
+        late: Age of the position that the state was predicted from [steps].
+    """
+
+    limits: Array | None = None
+    path: Path | None = None
+    late: int = 0
+
+    @property
+    def nominal(self) -> bool:
+        """Whether nothing but the design is known."""
+        return self.limits is None and self.path is None and not self.late
+
+
+NOMINAL = Outlook()
+
+
+def finite(x: Array, target: Array, outlook: Outlook) -> bool:
+    """Whether a question is made of finite numbers."""
+    given = [x, target]
+    if outlook.limits is not None:
+        given.append(outlook.limits)
+    if outlook.path is not None:
+        given += [outlook.path.states, outlook.path.inputs]
+    return all(bool(np.isfinite(values).all()) for values in given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +74,9 @@ class Answer:
         backoff_u: Back-off of each row of the input set (H, m_u), in the row's unit.
         reference: Equilibrium x_s (n_x,) that the plan ends in.
         slack: Sum of all slacks of the state constraints.
+        gave_way: Which constraints gave way, and by how much.
         offset: l1 distance of the reference from the target, in equilibrium coordinates.
-        terminal_miss: l1 violation of the terminal equality.
+        terminal_miss: l1 violation of the terminal equality and of the terminal limits.
         cost: Objective: cost (18) and all penalties.
         cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method
             knows none.
@@ -51,6 +99,7 @@ class Answer:
     cost_lower: float
     gap: float
     iterations: int
+    gave_way: tuple[GaveWay, ...] = ()
 
     @classmethod
     def failed(cls, seq: int, status: SolveStatus, method: str, iterations: int = 0) -> Answer:
@@ -90,6 +139,9 @@ def relative_gap(cost: float, cost_lower: float) -> float:
 class Solver(Protocol):
     """Answers the decision problem of one step."""
 
-    def solve(self, seq: int, x: Array, target: Array) -> Answer:
-        """Plan from state `x` (n_x,) towards `target` (n_x,), an equilibrium; never raises on numbers."""
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        """Plan from state `x` (n_x,) towards `target` (n_x,), an equilibrium; never raises on numbers.
+
+        With an `outlook.late` of j, `x` is the prediction for now from a position j steps old.
+        """
         ...

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.data import SolveStatus
-from uavctl.smpc.answer import Answer, relative_gap
+from uavctl.data import GaveWay, SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook, relative_gap
 from uavctl.smpc.components import Component
 from uavctl.smpc.design import Design
+from uavctl.smpc.program import terminal_backoff_x
 
 Array = NDArray[np.float64]
 
 # A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
 INPUT_TOLERANCE = 1e-6
+
+# What still counts as a constraint kept (each in its own unit, or summed over a plan).
+KEPT = 1e-6
 
 # The worst of several components' endings is the plan's: the later in this list, the worse.
 _ORDER = (
@@ -45,7 +49,14 @@ class PartAnswer:
     cost_lower: float
 
 
-def assemble(design: Design, seq: int, method: str, x: Array, parts: Sequence[tuple[Component, PartAnswer]]) -> Answer:
+def assemble(
+    design: Design,
+    seq: int,
+    method: str,
+    x: Array,
+    parts: Sequence[tuple[Component, PartAnswer]],
+    outlook: Outlook = NOMINAL,
+) -> Answer:
     """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
     status = max((part.status for _, part in parts), key=_ORDER.index)
     iterations = sum(part.iterations for _, part in parts)
@@ -61,7 +72,7 @@ def assemble(design: Design, seq: int, method: str, x: Array, parts: Sequence[tu
         backoff_u[:, where.rows_u] = part.backoff_u
         reference[where.states] = part.reference
     cost, cost_lower = sum(part.cost for _, part in parts), sum(part.cost_lower for _, part in parts)
-    return Answer(
+    answer = Answer(
         seq=seq,
         status=status,
         method=method,
@@ -78,6 +89,33 @@ def assemble(design: Design, seq: int, method: str, x: Array, parts: Sequence[tu
         gap=relative_gap(cost, cost_lower),
         iterations=iterations,
     )
+    if max(answer.slack, answer.terminal_miss) <= KEPT:
+        return answer
+    return replace(answer, gave_way=gave_way(design, answer, [component for component, _ in parts], outlook))
+
+
+def gave_way(design: Design, answer: Answer, components: Sequence[Component], outlook: Outlook) -> tuple[GaveWay, ...]:
+    """Constraints that an answer does not keep: tightened state rows, terminal rows, the terminal equality."""
+    limits = outlook.limits
+    if limits is None:
+        limits = np.tile(design.state_set.b, (design.horizon + 1, 1))
+    free = design.horizon - design.terminal.tau
+    given: list[GaveWay] = []
+
+    def add(constraint: str, stage: int, excess: Array) -> None:
+        for i in np.flatnonzero(excess > KEPT):
+            given.append(GaveWay(constraint=constraint, stage=stage, index=int(i), amount=float(excess[i])))
+
+    excess = answer.states @ design.state_set.c.T + answer.backoff_x - limits
+    for t in range(1, design.horizon + 1):
+        add("state", t, excess[t])
+    backoff = np.zeros(design.state_set.b.size)
+    for part in components:
+        backoff[part.rows_x] = terminal_backoff_x(design, part)
+    placed = design.state_set.c @ answer.reference
+    add("terminal", free, placed + backoff - limits[free:].min(axis=0))
+    add("equilibrium", free, np.abs(answer.states[free] - answer.reference))
+    return tuple(given)
 
 
 def inside(inputs: Array, c: Array, b: Array) -> tuple[Array, bool]:

@@ -29,7 +29,7 @@ class Component:
         states: Indices of its states in the plant's.
         inputs: Indices of its inputs.
         disturbances: Indices of its disturbances.
-        positions: Indices *within the component* of the states that are positions.
+        coordinates: (n_y, n_x): y of the equilibrium that a state belongs to, its positions.
         rows_x: Indices of its rows in the state set.
         rows_u: Indices of its rows in the input set.
         a: A (n_x, n_x); b: B (n_x, n_u); e: E (n_x, n_w); w: W (n_w, n_w).
@@ -41,6 +41,7 @@ class Component:
         b_u: Right sides (m_u,).
         k: Terminal gain K_τ (n_u, n_x).
         sigma_x: Stationary covariance of a state under the terminal law (n_x, n_x).
+        estimate_cov: Covariance of the estimate's error in every stage (n_x, n_x).
         sigma_xi: The same of ξ = (x_{H-τ} … x_H).
         sigma_z: The same of z = (x_{H-τ}, u_{H-τ} … u_{H-1}).
         p_xi: Terminal weight of ξ.
@@ -51,7 +52,7 @@ class Component:
     states: Index
     inputs: Index
     disturbances: Index
-    positions: Index
+    coordinates: Array
     rows_x: Index
     rows_u: Index
     a: Array
@@ -66,6 +67,7 @@ class Component:
     b_u: Array
     k: Array
     sigma_x: Array
+    estimate_cov: Array
     sigma_xi: Array
     sigma_z: Array
     p_xi: Array
@@ -90,6 +92,7 @@ def decompose(design: Design) -> tuple[Component, ...]:
         (x, w, plant.e),
         (w, w, plant.w),
         (x, x, design.q_x),
+        (x, x, design.estimate_cov),
         (u, u, design.q_u),
         (u, x, design.terminal.k),
         (x, x, _shared_row(design.state_set.c)),
@@ -136,7 +139,7 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
         states=states,
         inputs=inputs,
         disturbances=disturbances,
-        positions=positions,
+        coordinates=np.eye(len(states))[positions],
         rows_x=rows_x,
         rows_u=rows_u,
         a=a,
@@ -151,6 +154,7 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
         b_u=design.input_set.b[rows_u],
         k=terminal.k[np.ix_(inputs, states)],
         sigma_x=terminal.sigma_x[np.ix_(states, states)],
+        estimate_cov=design.estimate_cov[np.ix_(states, states)],
         sigma_xi=terminal.sigma_xi[np.ix_(stack, stack)],
         sigma_z=terminal.sigma_z[np.ix_(z, z)],
         p_xi=terminal.p_xi[np.ix_(stack, stack)],

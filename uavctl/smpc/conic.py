@@ -7,16 +7,18 @@ reach of N steps, a second program lets the terminal equality give way, and the 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.data import SolveStatus
-from uavctl.smpc.answer import Answer
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import PartAnswer, assemble, inside
 from uavctl.smpc.components import Component, decompose
 from uavctl.smpc.cones import BREAKDOWN, Solution
 from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import Affine, Horizon
+from uavctl.smpc.horizon import Affine, horizon_of
 from uavctl.smpc.program import Program
 
 Array = NDArray[np.float64]
@@ -55,17 +57,25 @@ class ConicSolver:
         """
         self._design = design
         self._parts = tuple(_PartSolver(design, component) for component in decompose(design))
+        self._late: dict[int, ConicSolver] = {}
 
-    def solve(self, seq: int, x: Array, target: Array) -> Answer:
-        """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,).
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
 
         Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
         """
-        design = self._design
-        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(target))):
+        if not finite(x, target, outlook) or outlook.late > len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        parts = [(part.component, part.solve(x, target)) for part in self._parts]
-        return assemble(design, seq, METHOD, x, parts)
+        if outlook.late:
+            return self._of_late(outlook.late).solve(seq, x, target, replace(outlook, late=0))
+        parts = [(part.component, part.solve(x, target, outlook)) for part in self._parts]
+        return assemble(self._design, seq, METHOD, x, parts, outlook)
+
+    def _of_late(self, late: int) -> ConicSolver:
+        """The solver of the design for positions `late` steps old; built when it is first asked for."""
+        if late not in self._late:
+            self._late[late] = ConicSolver(self._design.late[late - 1])
+        return self._late[late]
 
 
 class _PartSolver:
@@ -74,21 +84,22 @@ class _PartSolver:
     def __init__(self, design: Design, component: Component) -> None:
         self.component = component
         self._design = design
-        self._horizon = Horizon(component, design.horizon, design.terminal.tau, design.schedule)
+        self._horizon = horizon_of(design, component)
         self._exact = Program(design, self._horizon, soft_terminal=False)
         self._missing = Program(design, self._horizon, soft_terminal=True)
+        self._unseen = np.einsum("ij,jk,ik->i", component.c_x, component.estimate_cov, component.c_x)
         self._noise_x = [self._horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)]
         self._noise_u = [self._horizon.input_noise(t, component.c_u) for t in range(design.horizon)]
 
-    def solve(self, x: Array, target: Array) -> PartAnswer:
-        """Solve for the whole plant's state and target."""
+    def solve(self, x: Array, target: Array, outlook: Outlook = NOMINAL) -> PartAnswer:
+        """Solve for the whole plant's state, target and outlook."""
         x, target = x[self.component.states], target[self.component.states]
         program = self._exact
-        solution = program.conic.solve(program.parameters(x, target))
+        solution = program.conic.solve(program.parameters(x, target, outlook))
         status, iterations = _STATUS[solution.status], solution.iterations
         if status not in (SolveStatus.OPTIMAL, SolveStatus.ITERATION_LIMIT):
             program = self._missing
-            solution = program.conic.solve(program.parameters(x, target))
+            solution = program.conic.solve(program.parameters(x, target, outlook))
             status = _STATUS[solution.status]
             iterations += solution.iterations
         if not (np.all(np.isfinite(solution.variables)) and np.isfinite(solution.cost)):
@@ -99,7 +110,7 @@ class _PartSolver:
         self, program: Program, solution: Solution, status: SolveStatus, iterations: int, x: Array, target: Array
     ) -> PartAnswer:
         part, horizon, layout, values = self.component, self._horizon, program.layout, solution.variables
-        here = x[part.positions]
+        here = part.coordinates @ x
         y = here + values[layout.y]
         wanted = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
         wanted[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ here
@@ -111,12 +122,12 @@ class _PartSolver:
             status=status,
             iterations=iterations,
             inputs=inputs,
-            backoff_x=_backoff(self._noise_x, theta, self._design.kappa_x, part.b_x.size, horizon.width),
-            backoff_u=_backoff(self._noise_u, theta, self._design.kappa_u, part.b_u.size, horizon.width),
+            backoff_x=_backoff(self._noise_x, theta, self._design.kappa_x, self._unseen, horizon.width),
+            backoff_u=_backoff(self._noise_u, theta, self._design.kappa_u, np.zeros(part.b_u.size), horizon.width),
             reference=part.x_eq @ y,
             slack=_total(values[layout.slack]),
-            offset=float(np.sum(np.abs(y - target[part.positions]))),
-            terminal_miss=_total(values[layout.miss]),
+            offset=float(np.sum(np.abs(y - part.coordinates @ target))),
+            terminal_miss=_total(values[layout.miss]) + _total(values[layout.outside]),
             cost=solution.cost,
             cost_lower=solution.cost_lower,
         )
@@ -126,8 +137,8 @@ def _total(values: Array) -> float:
     return float(np.sum(np.maximum(values, 0.0)))
 
 
-def _backoff(noise: list[Affine], theta: Array, kappa: Array, rows: int, width: int) -> Array:
-    """κ_t ‖·‖ of every row and stage (stages, rows)."""
-    norms = [np.linalg.norm(stage.at(theta).reshape(rows, width), axis=1) for stage in noise]
-    backoff: Array = kappa[:, None] * np.array(norms)
+def _backoff(noise: list[Affine], theta: Array, kappa: Array, unseen: Array, width: int) -> Array:
+    """κ_t (‖·‖² + unseen)^½ of every row and stage (stages, rows)."""
+    squares = [np.sum(stage.at(theta).reshape(unseen.size, width) ** 2, axis=1) for stage in noise]
+    backoff: Array = kappa[:, None] * np.sqrt(np.array(squares) + unseen)
     return backoff

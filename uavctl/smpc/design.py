@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from uavctl.data import Vec3
 from uavctl.errors import DesignError
-from uavctl.smpc.age import age_distribution, at_most
+from uavctl.smpc.age import at_most
 from uavctl.smpc.assumptions import AssumptionCheck, check_assumptions
 from uavctl.smpc.digest import digest
+from uavctl.smpc.link import LinkModel
 from uavctl.smpc.plant import Plant, steps_to_reach
 from uavctl.smpc.risk import Allocation, kappa
 from uavctl.smpc.schedule import Demand, Schedule, fixed, greedy, nested
@@ -32,8 +33,9 @@ class DesignSpec:
     """What a design is asked for; the fields are those of the configuration of the same name.
 
     Attributes:
-        link_p: Link probabilities of the steps 1 … T (T,), T >= max(H, τ).
+        link: Model of the link.
         target_m: Where the terminal set has to fit the limits, local NED [m].
+        joint: Likelihoods by the exact probability that all stages' feedback is usable, not by the product (6).
     """
 
     plant: Plant
@@ -47,7 +49,7 @@ class DesignSpec:
     delta_u: float
     delta_tau: float
     k_tau: Array
-    link_p: Array
+    link: LinkModel
     target_m: Vec3
     rule: Rule
     delays: int | Sequence[int]
@@ -59,6 +61,7 @@ class DesignSpec:
     offset_weight: float
     terminal_weight: float
     max_iterations: int
+    joint: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,9 @@ class Design:
         offset_weight: l1 weight of the reference's distance from the target.
         terminal_weight: l1 weight of a missed terminal equality.
         max_iterations: Bound of the interior-point method.
+        estimate_cov: Covariance of the state estimate's error (n_x, n_x), part of every state's back-off.
+        past: Age of the position that a plan is based on [steps]: disturbances since then are unknown to it.
+        late: The same design for plans that are based on positions 1, 2 … steps old.
         assumptions: Assumption 4, item by item.
         design_id: Hash of all the above.
     """
@@ -106,6 +112,9 @@ class Design:
     offset_weight: float
     terminal_weight: float
     max_iterations: int
+    estimate_cov: Array
+    past: int
+    late: tuple[Design, ...]
     assumptions: tuple[AssumptionCheck, ...]
     design_id: str
 
@@ -121,8 +130,7 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
         DesignError: No such design, naming the key, the item of Assumption 4 if one fails, and the figures.
     """
     _check_horizon(spec)
-    mu = age_distribution(spec.link_p)
-    demand = Demand(mu, spec.horizon, spec.tau, spec.delta_x, spec.delta_u)
+    demand = Demand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint)
     terminal = make_terminal(spec.plant, spec.tau, spec.k_tau, spec.q_x, spec.q_u)
     if spec.rule == "fixed":
         return _assemble(spec, fixed(demand, spec.delays), terminal)
@@ -195,7 +203,7 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
     kappa_x_terminal = max(factor(spec.delta_x, n_x, m_x), float(kappa_x[-1]))
     kappa_u_terminal = max(factor(spec.delta_u, n_u, m_u), float(kappa_u[-spec.tau :].max()))
     target = spec.plant.equilibrium(spec.target_m)
-    mu = age_distribution(spec.link_p)
+    mu = spec.link.age(max(spec.horizon, spec.tau))
     checks = check_assumptions(
         plant=spec.plant,
         terminal=terminal,
@@ -204,7 +212,8 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
         target=target,
         kappa_x=kappa_x_terminal,
         kappa_u=kappa_u_terminal,
-        age_within_tau=min(at_most(mu, t, spec.tau) for t in range(len(mu))),
+        # (17) is asked of all times: those of the horizon, and the long run.
+        age_within_tau=min(1.0 - spec.link.outage(spec.tau + 1), *(at_most(mu, t, spec.tau) for t in range(len(mu)))),
         delta_tau=spec.delta_tau,
     )
     design = Design(
@@ -226,6 +235,9 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
         offset_weight=spec.offset_weight,
         terminal_weight=spec.terminal_weight,
         max_iterations=spec.max_iterations,
+        estimate_cov=np.zeros((n_x, n_x)),
+        past=0,
+        late=(),
         assumptions=checks,
         design_id="",
     )

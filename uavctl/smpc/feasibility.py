@@ -9,20 +9,18 @@ from numpy.typing import NDArray
 
 from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
+from uavctl.smpc.assemble import KEPT
 from uavctl.smpc.components import decompose
 from uavctl.smpc.cones import Expression, ProgramBuilder
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import Affine, Horizon
+from uavctl.smpc.horizon import Affine, Horizon, horizon_of
 from uavctl.smpc.reduction import TerminalBound, terminal_bound
 
 Array = NDArray[np.float64]
 
 # Below this margin the terminal condition has no usable interior as it stands, and is reduced once more.
 LEAST_MARGIN = 1e-6
-
-# What still counts as a constraint kept, a target reached (sums over the whole plan, in the rows' own units).
-KEPT = 1e-6
 
 
 def check_schedule(design: Design) -> float:
@@ -37,10 +35,7 @@ def check_schedule(design: Design) -> float:
     Raises:
         DesignError: s* < 0: the schedule feeds back later than the terminal law does.
     """
-    return min(
-        _component_margin(Horizon(component, design.horizon, design.terminal.tau, design.schedule))
-        for component in decompose(design)
-    )
+    return min(_component_margin(horizon_of(design, component)) for component in decompose(design))
 
 
 def _component_margin(horizon: Horizon) -> float:

@@ -3,6 +3,9 @@
 x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ and
 rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the entries
 of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
+
+A plan that is based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean
+starts at the prediction x̂(k) under the inputs that were flown, and what acted on it meanwhile is not known yet.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from scipy import sparse
 
 from uavctl.errors import DesignError
 from uavctl.smpc.components import Component
+from uavctl.smpc.design import Design
 from uavctl.smpc.schedule import Schedule
 
 Array = NDArray[np.float64]
@@ -41,6 +45,7 @@ class Horizon:
         steps: H.
         tau: Delay τ of the terminal law.
         free: N = H - τ, the number of stages with a free mean input.
+        past: Disturbances before k that are not known at k [steps].
         gains: (t, r, input, disturbance) of each entry of θ.
         phi: Φ_t (H+1, n_x, n_x).
         gamma: Γ_t (H+1, n_x, N n_u).
@@ -50,8 +55,8 @@ class Horizon:
         c_0: Its constant: open-loop disturbances, terminal weight included.
     """
 
-    def __init__(self, component: Component, steps: int, tau: int, schedule: Schedule) -> None:
-        """Predict `component` over `steps` steps.
+    def __init__(self, component: Component, steps: int, tau: int, schedule: Schedule, past: int = 0) -> None:
+        """Predict `component` over `steps` steps from a position that is `past` steps old.
 
         Raises:
             DesignError: The schedule feeds back a disturbance r >= N, for which the reduced terminal condition does
@@ -61,18 +66,19 @@ class Horizon:
         self.steps = steps
         self.tau = tau
         self.free = steps - tau
+        self.past = past
         n_u, self._n_w = component.b.shape[1], component.e.shape[1]
         self.gains = tuple(
             (t, r, i, j)
             for t in range(steps)
-            for r in _fed_back(t, int(schedule.delays[t]), self.free)
+            for r in _fed_back(t, int(schedule.delays[t]), self.free, past)
             for i in range(n_u)
             for j in np.flatnonzero(np.diagonal(component.w)).tolist()  # nothing to feed back otherwise
         )
         powers = [np.eye(component.a.shape[0])]
-        for _ in range(steps):
+        for _ in range(steps + past):
             powers.append(component.a @ powers[-1])
-        self.phi = np.array(powers)
+        self.phi = np.array(powers[: steps + 1])
         self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
         self._spread = component.e @ _root(component.w)
         self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i E W^½
@@ -83,8 +89,8 @@ class Horizon:
 
     @property
     def width(self) -> int:
-        """H n_w, the number of disturbance entries over the horizon."""
-        return self.steps * int(self._n_w)
+        """(past + H) n_w, the number of disturbance entries over the horizon."""
+        return (self.past + self.steps) * int(self._n_w)
 
     @property
     def n_theta(self) -> int:
@@ -92,26 +98,27 @@ class Horizon:
         return len(self.gains)
 
     def state_noise(self, t: int, c: Array) -> Affine:
-        """c x_t without its mean, c (m, n_x), as coefficients of ω: (m H n_w,), row by row."""
+        """c x_t without its mean, c (m, n_x), as coefficients of ω: (m · width,), row by row."""
         m = c.shape[0]
-        offset = np.zeros((m, self.steps, self._n_w))
-        for r in range(t):
-            offset[:, r] = c @ self._open[t - 1 - r]
+        offset = np.zeros((m, self.past + self.steps, self._n_w))
+        for r in range(-self.past, t):
+            offset[:, self.past + r] = c @ self._open[t - 1 - r]
         effect = {s: c @ self._response[t - 1 - s] for s in range(t)}
         return self._affine(offset, effect)
 
     def input_noise(self, t: int, c: Array) -> Affine:
-        """c u_t without its mean, c (m, n_u), as coefficients of ω: (m H n_w,), row by row."""
-        return self._affine(np.zeros((c.shape[0], self.steps, self._n_w)), {t: c})
+        """c u_t without its mean, c (m, n_u), as coefficients of ω: (m · width,), row by row."""
+        return self._affine(np.zeros((c.shape[0], self.past + self.steps, self._n_w)), {t: c})
 
     def terminal_noise(self) -> Affine:
-        """z = (x_N, u_N … u_{H-1}) as coefficients of the N older disturbances: (n_z N n_w,), row by row."""
+        """z = (x_N, u_N … u_{H-1}) as coefficients of the past + N older disturbances, row by row."""
         n_x, n_u = self.component.b.shape
         parts = [self.state_noise(self.free, np.eye(n_x))]
         parts += [self.input_noise(t, np.eye(n_u)) for t in range(self.free, self.steps)]
         stacked = _stack(parts)
         columns = np.arange(stacked.offset.size) % self.width
-        old = np.flatnonzero(columns < self.free * self._n_w)  # no gain acts on the others, nor do they reach z
+        # No gain acts on the newer ones, nor do they reach z.
+        old = np.flatnonzero(columns < (self.past + self.free) * self._n_w)
         return Affine(stacked.offset[old], stacked.matrix[old])
 
     def _affine(self, offset: Array, effect: dict[int, Array]) -> Affine:
@@ -125,7 +132,7 @@ class Horizon:
                 continue
             for row in range(m):
                 for k_w in np.flatnonzero(self._root_w[j]):
-                    rows.append(row * width + r * self._n_w + int(k_w))
+                    rows.append(row * width + (self.past + r) * self._n_w + int(k_w))
                     columns.append(k)
                     values.append(float(effect[s][row, i] * self._root_w[j, k_w]))
         matrix = sparse.csr_array((values, (rows, columns)), shape=(m * width, self.n_theta))
@@ -162,7 +169,7 @@ class Horizon:
         return 2.0 * gram, 2.0 * linear, float(everything.offset @ everything.offset)
 
 
-def _fed_back(t: int, delay: int, free: int) -> range:
+def _fed_back(t: int, delay: int, free: int, past: int) -> range:
     """Disturbances r that M_{t,r} feeds back."""
     if t >= free and t - delay >= free:
         raise DesignError(
@@ -170,7 +177,7 @@ def _fed_back(t: int, delay: int, free: int) -> range:
             f"delay {delay} in stage {t} feeds back a disturbance that the terminal law does not know yet",
             f"use at least {t - free + 1} there",
         )
-    return range(max(0, min(t - delay + 1, free)))
+    return range(-past, max(-past, min(t - delay + 1, free)))
 
 
 def _root(matrix: Array) -> Array:
@@ -187,3 +194,8 @@ def _stack(parts: list[Affine]) -> Affine:
         np.concatenate([part.offset for part in parts]),
         sparse.csr_array(sparse.vstack([part.matrix for part in parts])),
     )
+
+
+def horizon_of(design: Design, component: Component) -> Horizon:
+    """The prediction of a design's component."""
+    return Horizon(component, design.horizon, design.terminal.tau, design.schedule, design.past)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.data import SolveStatus
-from uavctl.smpc.answer import Answer
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import PartAnswer, assemble, inside
 from uavctl.smpc.components import Component, decompose, whole
 from uavctl.smpc.cones import unless_panic
@@ -103,7 +103,7 @@ class PrintedProblem:
         """Solve for the whole plant's state (n_x,) and target (n_x,)."""
         part, design = self.component, self._design
         self._x.value, self._x_s.value = x[part.states], target[part.states]
-        self._u_s.value = part.u_eq @ self._x_s.value[part.positions]
+        self._u_s.value = part.u_eq @ (part.coordinates @ self._x_s.value)
         status, cost, iterations = self._run()
         if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
             empty = np.zeros((0, 0))
@@ -166,9 +166,12 @@ class PrintedSolver:
         components = (whole(design),) if joint else decompose(design)
         self._problems = tuple(PrintedProblem(design, component, regularization) for component in components)
 
-    def solve(self, seq: int, x: Array, target: Array) -> Answer:
-        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers."""
-        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(target))):
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers.
+
+        The printed problem knows no outlook: with limits of their own, a path or a late position the answer is FAILED.
+        """
+        if not finite(x, target, outlook) or not outlook.nominal:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         parts = [(problem.component, problem.solve(x, target)) for problem in self._problems]
         return assemble(self._design, seq, METHOD, x, parts)

@@ -13,6 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.smpc.answer import NOMINAL, Outlook
+from uavctl.smpc.components import Component
 from uavctl.smpc.cones import ConicProgram, Expression, ProgramBuilder, join
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import Affine, Horizon
@@ -20,21 +22,24 @@ from uavctl.smpc.reduction import terminal_bound
 
 Array = NDArray[np.float64]
 
+# A reference outside its limits is the last thing to give way: it costs this many times a missed reference.
+_OUTSIDE = 1000.0
+
 
 @dataclass(frozen=True)
 class Pair:
     """Rows of one set with the same direction up to sign: c z <= upper, -c z <= lower."""
 
     c: tuple[float, ...]
-    sides: tuple[tuple[float, float], ...]  # (sign, right side)
+    sides: tuple[tuple[float, int], ...]  # (sign, row)
 
 
-def pairs_of(c: Array, b: Array) -> tuple[Pair, ...]:
+def pairs_of(c: Array) -> tuple[Pair, ...]:
     """Group rows by direction; a pair shares its back-off and its slack."""
-    groups: dict[tuple[float, ...], list[tuple[float, float]]] = {}
-    for row, side in zip(c, b, strict=True):
+    groups: dict[tuple[float, ...], list[tuple[float, int]]] = {}
+    for i, row in enumerate(c):
         sign = 1.0 if row[np.flatnonzero(row)[0]] > 0 else -1.0
-        groups.setdefault(tuple((sign * row).tolist()), []).append((sign, float(side)))
+        groups.setdefault(tuple((sign * row).tolist()), []).append((sign, i))
     return tuple(Pair(direction, tuple(sides)) for direction, sides in groups.items())
 
 
@@ -48,6 +53,7 @@ class Layout:
     offset: slice
     slack: slice
     miss: slice
+    outside: slice
     backoff: slice
 
     @property
@@ -56,9 +62,9 @@ class Layout:
         return int(self.backoff.stop)
 
     @classmethod
-    def of(cls, v: int, theta: int, y: int, slack: int, miss: int, backoff: int) -> Layout:
+    def of(cls, v: int, theta: int, y: int, slack: int, miss: int, outside: int, backoff: int) -> Layout:
         """Lay the given numbers of variables out one after another."""
-        ends = np.cumsum([0, v, theta, y, y, slack, miss, backoff]).tolist()
+        ends = np.cumsum([0, v, theta, y, y, slack, miss, outside, backoff]).tolist()
         return cls(*(slice(i, j) for i, j in pairwise(ends)))
 
 
@@ -68,7 +74,7 @@ class Program:
     Args:
         design: The design.
         horizon: The component's prediction.
-        soft_terminal: Allow x̄_N to miss x_s at `terminal_weight`.
+        soft_terminal: Allow x̄_N to miss x_s, and x_s to be outside its limits, at `terminal_weight`.
 
     In the hard form the rows of stages t >= N are not written out: their means are x_s and u_s, and Cov(x_t) <= Σ_x,
     Cov(u_t) <= K Σ_x Kᵀ by the terminal condition, so the terminal rows with the largest κ imply them.
@@ -77,21 +83,25 @@ class Program:
     def __init__(self, design: Design, horizon: Horizon, *, soft_terminal: bool) -> None:
         self.design, self.horizon, self.part = design, horizon, horizon.component
         self._last = horizon.steps if soft_terminal else horizon.free - 1  # last stage with state rows
-        self._pairs_x = pairs_of(self.part.c_x, self.part.b_x)
-        self._pairs_u = pairs_of(self.part.c_u, self.part.b_u)
+        self._pairs_x = pairs_of(self.part.c_x)
+        self._pairs_u = pairs_of(self.part.c_u)
         n_x, n_y = self.part.x_eq.shape
+        self._placed = np.any(self.part.c_x @ self.part.x_eq != 0, axis=1)  # rows of x_s that y moves
         self.layout = Layout.of(
             v=horizon.gamma.shape[2],
             theta=horizon.n_theta,
             y=n_y,
             slack=len(self._pairs_x) * self._last,
             miss=n_x if soft_terminal else 0,
+            outside=int(self._placed.sum()) if soft_terminal else 0,
             backoff=self._count_backoffs(),
         )
-        self._builder = ProgramBuilder(self.layout.size, n_x + 2 * n_y)
-        self._x = self._builder.parameter(slice(0, n_x))
-        self._to_target = self._builder.parameter(slice(n_x, n_x + n_y))
-        self._here = self._builder.parameter(slice(n_x + n_y, n_x + 2 * n_y))
+        m_x, n_u, free = self.part.b_x.size, self.part.b.shape[1], horizon.free
+        sizes = [n_x, n_y, n_y, (self._last + 1) * m_x, free * n_x, free * n_u]
+        self._builder = ProgramBuilder(self.layout.size, sum(sizes))
+        ends = np.cumsum([0, *sizes]).tolist()
+        given = [self._builder.parameter(slice(i, j)) for i, j in pairwise(ends)]
+        self._x, self._to_target, self._here, self._limits, self._path_x, self._path_u = given
         self._v = self._builder.variable(self.layout.v)
         self._y = self._builder.variable(self.layout.y)
         self._next_backoff = self.layout.backoff.start
@@ -102,10 +112,19 @@ class Program:
         self._add_input_rows()
         self.conic: ConicProgram = self._builder.build(design.max_iterations)
 
-    def parameters(self, x: Array, target: Array) -> Array:
-        """Parameters for a state (n_x,) and a target (n_x,) of this component."""
-        here, there = x[self.part.positions], target[self.part.positions]
-        return np.concatenate([x - self.part.x_eq @ here, there - here, here])
+    def parameters(self, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Array:
+        """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's outlook."""
+        part, free = self.part, self.horizon.free
+        here, there = part.coordinates @ x, part.coordinates @ target
+        limits = np.tile(part.b_x, self._last + 1)
+        if outlook.limits is not None:
+            b = outlook.limits[:, part.rows_x]
+            limits = np.concatenate([b[1 : self._last + 1], b[free:].min(axis=0)[None]]).ravel()
+        path = np.zeros(free * (part.x_eq.shape[0] + part.b.shape[1]))
+        if outlook.path is not None:
+            states, inputs = outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs]
+            path = np.concatenate([states.ravel(), inputs.ravel()])
+        return np.concatenate([x - part.x_eq @ here, there - here, here, limits, path])
 
     def _mean(self, t: int) -> Expression:
         """x̄_t relative to the present equilibrium."""
@@ -129,10 +148,11 @@ class Program:
         state, control = _factor(part.q_x), _factor(part.q_u)
         x_s, u_s = part.x_eq @ self._y, part.u_eq @ self._y
         n_u = part.b.shape[1]
+        n_x = part.a.shape[0]
         for t in range(horizon.free):
-            self._builder.square(state @ (self._mean(t) - x_s))
+            self._builder.square(state @ (self._mean(t) - x_s - _part(self._path_x, t, n_x)))
             v_t = self._builder.variable(slice(t * n_u, (t + 1) * n_u))
-            self._builder.square(control @ (v_t - u_s))
+            self._builder.square(control @ (v_t - u_s - _part(self._path_u, t, n_u)))
         if layout.miss.stop > layout.miss.start:
             for t in range(horizon.free, horizon.steps):
                 self._builder.square(state @ (self._mean(t) - x_s))
@@ -143,6 +163,7 @@ class Program:
             (layout.offset, design.offset_weight, 0.0),
             (layout.slack, design.slack_linear, design.slack_quadratic),
             (layout.miss, design.terminal_weight, 0.0),
+            (layout.outside, _OUTSIDE * design.terminal_weight, 0.0),
         ):
             size = where.stop - where.start
             self._builder.quadratic(where, 2.0 * square * np.eye(size), np.full(size, linear))
@@ -153,15 +174,19 @@ class Program:
         distance, difference = self._builder.variable(self.layout.offset), self._y - self._to_target
         self._builder.nonnegative(join(distance - difference, distance + difference))
         absolute = self._y + self._here
-        sigma_u = part.k @ part.sigma_x @ part.k.T
-        for c, b, eq, sigma, kappa in (
-            (part.c_x, part.b_x, part.x_eq, part.sigma_x, design.kappa_x_terminal),
-            (part.c_u, part.b_u, part.u_eq, sigma_u, design.kappa_u_terminal),
-        ):
-            room = b - kappa * np.sqrt(np.einsum("ij,jk,ik->i", c, sigma, c))
-            used = np.any(c @ eq != 0, axis=1)
-            # A row that no reference moves is the designer's to check (Assumptions 4.3 and 4.4), not the optimiser's.
-            self._builder.nonnegative((-1.0 * ((c[used] @ eq) @ absolute)).plus(room[used]))
+        # A row that no reference moves is the designer's to check (Assumptions 4.3 and 4.4), not the optimiser's.
+        used = self._placed
+        limits = _part(self._limits, self._last, part.b_x.size)
+        inside = np.eye(part.b_x.size)[used] @ (limits - (part.c_x @ part.x_eq) @ absolute)
+        inside = inside.plus(-terminal_backoff_x(design, part)[used])
+        if self.layout.outside.stop > self.layout.outside.start:
+            give = self._builder.variable(self.layout.outside)
+            self._builder.nonnegative(give)
+            inside = inside + give
+        self._builder.nonnegative(inside)
+        moved = np.any(part.c_u @ part.u_eq != 0, axis=1)
+        room = part.b_u - terminal_backoff_u(design, part)
+        self._builder.nonnegative((-1.0 * ((part.c_u[moved] @ part.u_eq) @ absolute)).plus(room[moved]))
 
     def _add_terminal(self, *, soft_terminal: bool) -> None:
         miss = self._mean(self.horizon.free) - self.part.x_eq @ self._y
@@ -185,8 +210,9 @@ class Program:
             for i, pair in enumerate(self._pairs_x):
                 k = self.layout.slack.start + (t - 1) * len(self._pairs_x) + i
                 give = self._builder.variable(slice(k, k + 1))
-                backoff = self._backoff(self._noise_x(t, pair), float(self.design.kappa_x[t]))
-                self._add_pair(pair, mean, give - backoff)
+                unseen = float(np.array(pair.c) @ self.part.estimate_cov @ np.array(pair.c))
+                backoff = self._backoff(self._noise_x(t, pair), float(self.design.kappa_x[t]), unseen)
+                self._add_pair(pair, mean, give - backoff, _part(self._limits, t - 1, self.part.b_x.size))
 
     def _add_input_rows(self) -> None:
         n_u = self.part.b.shape[1]
@@ -195,17 +221,17 @@ class Program:
             mean = self._builder.variable(slice(t * n_u, (t + 1) * n_u)) + here
             for pair in self._pairs_u:
                 backoff = self._backoff(self._noise_u(t, pair), float(self.design.kappa_u[t]))
-                self._add_pair(pair, mean, -1.0 * backoff)
+                self._add_pair(pair, mean, -1.0 * backoff, self._constant(self.part.b_u))
 
-    def _add_pair(self, pair: Pair, mean: Expression, room: Expression) -> None:
+    def _add_pair(self, pair: Pair, mean: Expression, room: Expression, limits: Expression) -> None:
         value = np.array([pair.c]) @ mean
-        for sign, side in pair.sides:
-            self._builder.nonnegative((room - sign * value).plus(side))
+        for sign, row in pair.sides:
+            self._builder.nonnegative(room - sign * value + np.eye(limits.const.size)[row : row + 1] @ limits)
 
-    def _backoff(self, noise: Affine, kappa: float) -> Expression:
-        """κ ‖noise(θ)‖ (1,): a constant, or a variable with its second-order cone."""
+    def _backoff(self, noise: Affine, kappa: float, unseen: float = 0.0) -> Expression:
+        """κ (‖noise(θ)‖² + unseen)^½ (1,): a constant, or a variable with its second-order cone."""
         moved = np.diff(noise.matrix.indptr) > 0
-        constant = float(np.linalg.norm(noise.offset[~moved]))
+        constant = float(np.sqrt(np.sum(noise.offset[~moved] ** 2) + unseen))
         if not moved.any():
             return self._constant(np.array([kappa * constant]))
         scaled = self._builder.variable(slice(self._next_backoff, self._next_backoff + 1))
@@ -225,6 +251,26 @@ class Program:
         expression = self._constant(affine.offset)
         expression.var[:, self.layout.theta] = affine.matrix.toarray()
         return expression
+
+
+def terminal_backoff_x(design: Design, part: Component) -> Array:
+    """Back-off (m_x,) of each state row in the terminal stages."""
+    covariance = part.sigma_x + part.estimate_cov
+    backoff: Array = design.kappa_x_terminal * np.sqrt(np.einsum("ij,jk,ik->i", part.c_x, covariance, part.c_x))
+    return backoff
+
+
+def terminal_backoff_u(design: Design, part: Component) -> Array:
+    """Back-off (m_u,) of each input row in the terminal stages."""
+    gain = part.c_u @ part.k
+    backoff: Array = design.kappa_u_terminal * np.sqrt(np.einsum("ij,jk,ik->i", gain, part.sigma_x, gain))
+    return backoff
+
+
+def _part(stacked: Expression, i: int, size: int) -> Expression:
+    """Entries i·size … (i+1)·size - 1."""
+    rows = slice(i * size, (i + 1) * size)
+    return Expression(stacked.var[rows], stacked.par[rows], stacked.const[rows])
 
 
 def _factor(matrix: Array) -> Array:
