@@ -23,7 +23,7 @@ INPUT_TOLERANCE = 1e-6
 KEPT = 1e-6
 
 # The worst of several components' endings is the plan's: the later in this list, the worse.
-_ORDER = (
+WORSE = (
     SolveStatus.OPTIMAL,
     SolveStatus.INACCURATE,
     SolveStatus.ITERATION_LIMIT,
@@ -48,6 +48,12 @@ class PartAnswer:
     cost: float
     cost_lower: float
 
+    @classmethod
+    def failed(cls, status: SolveStatus, iterations: int = 0) -> PartAnswer:
+        """A share without a plan."""
+        empty = np.zeros((0, 0))
+        return cls(status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf)
+
 
 def assemble(
     design: Design,
@@ -58,7 +64,7 @@ def assemble(
     outlook: Outlook = NOMINAL,
 ) -> Answer:
     """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
-    status = max((part.status for _, part in parts), key=_ORDER.index)
+    status = max((part.status for _, part in parts), key=WORSE.index)
     iterations = sum(part.iterations for _, part in parts)
     if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
         return Answer.failed(seq, status, method, iterations)
@@ -89,7 +95,7 @@ def assemble(
         gap=relative_gap(cost, cost_lower),
         iterations=iterations,
     )
-    if max(answer.slack, answer.terminal_miss) <= KEPT:
+    if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
         return answer
     return replace(answer, gave_way=gave_way(design, answer, [component for component, _ in parts], outlook))
 

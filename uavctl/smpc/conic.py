@@ -56,7 +56,7 @@ class ConicSolver:
             DesignError: The design cannot be decomposed, or its schedule does not fit its terminal law.
         """
         self._design = design
-        self._parts = tuple(_PartSolver(design, component) for component in decompose(design))
+        self._parts = tuple(PartSolver(design, component) for component in decompose(design))
         self._late: dict[int, ConicSolver] = {}
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
@@ -78,7 +78,7 @@ class ConicSolver:
         return self._late[late]
 
 
-class _PartSolver:
+class PartSolver:
     """The two programs of one component, and how their solutions are read."""
 
     def __init__(self, design: Design, component: Component) -> None:

@@ -1,0 +1,183 @@
+"""The fastest decision: every component's mean under one frozen policy, where that is the joint optimum.
+
+The frozen policy minimises the covariance cost alone, with back-offs of at most half the room between two opposite
+limits. Rows whose room it takes whole are pinned to the middle. If the pinned mean QP is feasible, the multipliers of
+the pinned rows stay within those of the policy, and no other row that depends on the gains has one, the KKT conditions
+of the joint problem hold (theory notes, D). All components are prepared and judged in common, since Python's time goes
+by calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from uavctl.smpc.meanqp import Kind
+from uavctl.smpc.mixture import Mixture
+from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
+
+Array = NDArray[np.float64]
+
+# A multiplier below this share of a typical cost counts as zero.
+_ZERO = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """One question in the numbers of all components' QPs, one after another.
+
+    Attributes:
+        f: Linear terms (Σ n_q,).
+        constant: Constants of the costs (components,).
+        offset: What the question adds to the rows (Σ m,).
+        upper: Right sides without back-offs (Σ m,), OPEN where there is none.
+        lower: Left sides without back-offs.
+    """
+
+    f: Array
+    constant: Array
+    offset: Array
+    upper: Array
+    lower: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenAnswer:
+    """What the frozen policies say, before it is certified.
+
+    Attributes:
+        q: Means (Σ n_q,).
+        multipliers: Of the rows (Σ m,), positive at an upper side.
+        above: Right sides with back-offs, the middle for pinned rows (Σ m,).
+        below: Left sides with back-offs.
+        accepted: Which components meet the KKT conditions.
+    """
+
+    q: Array
+    multipliers: Array
+    above: Array
+    below: Array
+    accepted: list[bool]
+
+
+class Frozen:
+    """Frozen policies of all components.
+
+    Args:
+        mixtures: The components' libraries.
+    """
+
+    def __init__(self, mixtures: Sequence[Mixture]) -> None:
+        problems = [mixture.problem for mixture in mixtures]
+        self.rows = slices([len(problem.rows) for problem in problems])
+        self.means = slices([problem.h.shape[0] for problem in problems])
+        self._row_starts = np.array([s.start for s in self.rows])
+        soft = np.concatenate([np.isfinite(problem.price) for problem in problems])
+        price = np.concatenate([np.where(np.isfinite(p.price), p.price, 0.0) for p in problems])
+        curve = np.concatenate([problem.curve for problem in problems])
+        links = np.concatenate([s.start + problem.links for s, problem in zip(self.rows, problems, strict=True)])
+        slope = np.zeros(soft.size)
+        slope[links] = np.concatenate([mixture.slope[0] for mixture in mixtures])
+        self._pins = np.flatnonzero(slope > 0.0)
+        self._backoff = np.concatenate([problem.backoff for problem in problems])
+        self._backoff[links] = np.concatenate([mixture.backoff[0] for mixture in mixtures])
+        scale = np.repeat([mixture.cost[0] for mixture in mixtures], [len(problem.rows) for problem in problems])
+        # A multiplier at a state row's price means slack, and slack is for the mixture to tell.
+        state = np.concatenate([[row.kind is Kind.STATE for row in problem.rows] for problem in problems])
+        allowed = np.where(soft, price * np.where(state, 1.0 - 1e-9, 1.0 + 1e-9), np.inf)
+        allowed[links] = _ZERO * scale[links]
+        # A soft row that is pinned would not be left at its price: such a policy answers nothing.
+        allowed[self._pins] = np.where(soft[self._pins], -1.0, slope[self._pins])
+        self._allowed = allowed
+        sense = np.where(soft, SOFT, 0).astype(np.int32)
+        sense[self._pins] = EQUAL
+        self._programs = [
+            QuadraticProgram(problem.h, problem.a, sense[s], price[s], curve[s])
+            for s, problem in zip(self.rows, problems, strict=True)
+        ]
+        self._parts = [_Certifier([mixture]) for mixture in mixtures]
+        self._whole = _Certifier(mixtures)
+
+    def solve(self, numbers: Numbers) -> FrozenAnswer | None:
+        """Solve all components; None where a QP has no optimum."""
+        upper, lower = numbers.upper - numbers.offset, numbers.lower - numbers.offset
+        above, below, pins = upper - self._backoff, lower + self._backoff, self._pins
+        if pins.size:
+            above[pins] = below[pins] = 0.5 * (above[pins] + below[pins])
+        means, multipliers = [], []
+        for program, mean, rows in zip(self._programs, self.means, self.rows, strict=True):
+            solved = program.solve(numbers.f[mean], above[rows], below[rows])
+            if solved is None:
+                return None
+            means.append(solved[0])
+            multipliers.append(solved[1])
+        q, net = np.concatenate(means), np.concatenate(multipliers)
+        fits = np.logical_and.reduceat(np.abs(net) <= self._allowed, self._row_starts).tolist()
+        return FrozenAnswer(q, net, above, below, fits)
+
+    def certify(self, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:
+        """Cost and lower bound of all components together."""
+        constant = float(numbers.constant.sum())
+        return self._whole(
+            constant, numbers.f, numbers.offset, answer.q, answer.multipliers, answer.above, answer.below
+        )
+
+    def certify_part(self, i: int, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:
+        """Cost and lower bound of one component."""
+        rows, means = self.rows[i], self.means[i]
+        return self._parts[i](
+            float(numbers.constant[i]),
+            numbers.f[means],
+            numbers.offset[rows],
+            answer.q[means],
+            answer.multipliers[rows],
+            answer.above[rows],
+            answer.below[rows],
+        )
+
+
+class _Certifier:
+    """Cost of a frozen mean that keeps every state row, and the Lagrangian's value (see `Mixture.bound`).
+
+    Of a pinned row both sides have a multiplier: their difference is the QP's, their sum the policy's.
+    """
+
+    def __init__(self, mixtures: Sequence[Mixture]) -> None:
+        problems = [mixture.problem for mixture in mixtures]
+        self._a = block_diag(*(problem.a for problem in problems))
+        self._h = 0.5 * block_diag(*(problem.h for problem in problems))
+        self._h_inverse = 0.5 * block_diag(*(np.linalg.inv(problem.h) for problem in problems))
+        self._covariance = float(sum(mixture.cost[0] for mixture in mixtures))
+        self._level = float(sum(mixture.level[0] - mixture.slope[0] @ _room(mixture) for mixture in mixtures))
+        kinds = np.concatenate([[row.kind for row in problem.rows] for problem in problems])
+        self._off = np.flatnonzero(kinds == Kind.OFFSET)
+        self._a_off = self._a[self._off]
+        self._price = np.concatenate([problem.price for problem in problems])[self._off]
+
+    def __call__(
+        self, constant: float, f: Array, offset: Array, q: Array, net: Array, above: Array, below: Array
+    ) -> tuple[float, float]:
+        plus = np.maximum(net, 0.0)
+        g = f + net @ self._a
+        lower = constant + self._level - float(g @ (self._h_inverse @ g) + plus @ above + (net - plus) @ below)
+        off_target = np.abs(self._a_off @ q + offset[self._off])
+        cost = constant + self._covariance + float(q @ (self._h @ q + f) + self._price @ off_target)
+        return cost, lower
+
+
+def _room(mixture: Mixture) -> Array:
+    """Half the room between the two sides of the rows that the first policy has multipliers for (n_l,), else 0."""
+    problem, links = mixture.problem, mixture.problem.links
+    room = 0.5 * (problem.upper - problem.lower)[links]
+    return np.where(mixture.slope[0] > 0.0, np.where(np.isfinite(room), room, 0.0), 0.0)
+
+
+def slices(sizes: Sequence[int]) -> list[slice]:
+    """Slices of the given sizes, one after another."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [slice(i, j) for i, j in pairwise(ends)]

@@ -1,0 +1,272 @@
+"""From the numbers of the library's QPs to an answer for the whole plant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import SolveStatus
+from uavctl.smpc.answer import Answer, Outlook, relative_gap
+from uavctl.smpc.assemble import KEPT, WORSE, PartAnswer, gave_way, inside
+from uavctl.smpc.components import Component
+from uavctl.smpc.design import Design
+from uavctl.smpc.horizon import Affine
+from uavctl.smpc.mixture import Mixture
+
+Array = NDArray[np.float64]
+
+# The gap up to which an answer of the library is taken; beyond, the exact program is asked if it may be.
+TOLERANCE = 1e-3
+
+FROZEN, MIXTURE, EXACT = "frozen", "mixture", "exact"  # methods of an answer, from the cheapest on
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """One component's share of an answer from its library.
+
+    Attributes:
+        q: Mean (n_q,).
+        policies: Which policies are mixed.
+        weights: Their weights.
+        cost: Cost of the plan.
+        lower: Lower bound of the optimum.
+        slack: Sum of the state rows' slacks.
+    """
+
+    q: Array
+    policies: NDArray[np.intp]
+    weights: Array
+    cost: float
+    lower: float
+    slack: float
+
+    @property
+    def certified(self) -> bool:
+        """Whether the gap is within the library's tolerance."""
+        return relative_gap(self.cost, self.lower) <= TOLERANCE
+
+
+class PlanMap:
+    """Linear maps of a design's plans.
+
+    Args:
+        design: The design.
+        components: Its components.
+        mixtures: Their libraries.
+    """
+
+    def __init__(self, design: Design, components: Sequence[Component], mixtures: Sequence[Mixture]) -> None:
+        self._design, self._components, self._mixtures = design, components, mixtures
+        plant, steps = design.plant, design.horizon
+        self._shape_u, self._shape_x = (steps, plant.n_u), (steps + 1, plant.n_x)
+        self._of_x, self._of_u = _prediction(plant.a, plant.b, steps)
+        self._tables = [_backoffs(design, mixture) for mixture in mixtures]
+        self._low, self._high, self._oblique = _box(design)
+        self._plan = self._plan_matrix()
+        self._backoff_x, self._backoff_u = self._collect([table[0] for table in self._tables])
+        self._backoff_x.flags.writeable = self._backoff_u.flags.writeable = False  # every frozen answer has these
+
+    def frozen(self, seq: int, x: Array, p: Array, q: Array, cost: float, lower: float) -> Answer:
+        """Answer under every component's first policy, with no state row left; p (Σ n_p,) as the QPs have it."""
+        return self._answer(
+            seq, FROZEN, x, np.concatenate([q, p]), (self._backoff_x, self._backoff_u), cost, lower, 0.0
+        )
+
+    def mixed(self, seq: int, x: Array, p: Array, shares: Sequence[Share], outlook: Outlook) -> Answer:
+        """Answer of which every component's share is from its library."""
+        tables = zip(self._tables, shares, strict=True)
+        backoffs = self._collect([share.weights @ table[share.policies] for table, share in tables])
+        cost, lower = sum(share.cost for share in shares), sum(share.lower for share in shares)
+        qp = np.concatenate([*(share.q for share in shares), p])
+        answer = self._answer(seq, MIXTURE, x, qp, backoffs, cost, lower, sum(share.slack for share in shares))
+        return self._told(answer, outlook)
+
+    def _answer(
+        self,
+        seq: int,
+        method: str,
+        x: Array,
+        qp: Array,
+        backoffs: tuple[Array, Array],
+        cost: float,
+        lower: float,
+        slack: float,
+    ) -> Answer:
+        plan = self._plan @ qp
+        n_u, n_x = self._shape_u[0] * self._shape_u[1], self._shape_x[1]
+        inputs = self._clipped(plan[:n_u].reshape(self._shape_u))
+        return Answer(
+            seq=seq,
+            status=SolveStatus.OPTIMAL,
+            method=method,
+            inputs=inputs,
+            states=(self._of_x @ x + self._of_u @ inputs.ravel()).reshape(self._shape_x),
+            backoff_x=backoffs[0],
+            backoff_u=backoffs[1],
+            reference=plan[n_u : n_u + n_x],
+            slack=slack,
+            offset=float(np.abs(plan[n_u + n_x :]).sum()),
+            terminal_miss=0.0,
+            cost=cost,
+            cost_lower=lower,
+            gap=relative_gap(cost, lower),
+            iterations=0,
+        )
+
+    def part(self, i: int, p: Array, share: Share) -> PartAnswer:
+        """One component's share, to be put beside others of the exact program; p (n_p,) of the component."""
+        part, problem, steps = self._components[i], self._mixtures[i].problem, self._shape_u[0]
+        w = problem.z @ share.q + problem.w @ p
+        here = p[problem.n_p - problem.n_y :]
+        table = share.weights @ self._tables[i][share.policies]
+        split = (steps + 1) * part.rows_x.size
+        off_target = (problem.a @ share.q + problem.r @ p)[-problem.n_y :]  # the offset rows are the last
+        return PartAnswer(
+            status=SolveStatus.OPTIMAL,
+            iterations=0,
+            inputs=problem.inputs(w, here),
+            backoff_x=table[:split].reshape(steps + 1, part.rows_x.size),
+            backoff_u=table[split:].reshape(steps, part.rows_u.size),
+            reference=part.x_eq @ (w[problem.n_v :] + here),
+            slack=share.slack,
+            offset=float(np.abs(off_target).sum()),
+            terminal_miss=0.0,
+            cost=share.cost,
+            cost_lower=share.lower,
+        )
+
+    def assemble(
+        self, seq: int, method: str, x: Array, parts: Sequence[tuple[Component, PartAnswer]], outlook: Outlook
+    ) -> Answer:
+        """Answer for the whole plant; without a plan if a component has none."""
+        status = max((part.status for _, part in parts), key=WORSE.index)
+        iterations = sum(part.iterations for _, part in parts)
+        if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
+            return Answer.failed(seq, status, method, iterations)
+        design = self._design
+        inputs, reference = np.zeros(self._shape_u), np.zeros(self._shape_x[1])
+        for where, part in parts:
+            inputs[:, where.inputs] = part.inputs
+            reference[where.states] = part.reference
+        inputs = self._clipped(inputs)
+        backoff_x = np.zeros((self._shape_x[0], design.state_set.b.size))
+        backoff_u = np.zeros((self._shape_u[0], design.input_set.b.size))
+        for where, part in parts:
+            backoff_x[:, where.rows_x], backoff_u[:, where.rows_u] = part.backoff_x, part.backoff_u
+        cost, lower = sum(part.cost for _, part in parts), sum(part.cost_lower for _, part in parts)
+        answer = Answer(
+            seq=seq,
+            status=status,
+            method=method,
+            inputs=inputs,
+            states=(self._of_x @ x + self._of_u @ inputs.ravel()).reshape(self._shape_x),
+            backoff_x=backoff_x,
+            backoff_u=backoff_u,
+            reference=reference,
+            slack=sum(part.slack for _, part in parts),
+            offset=sum(part.offset for _, part in parts),
+            terminal_miss=sum(part.terminal_miss for _, part in parts),
+            cost=cost,
+            cost_lower=lower,
+            gap=relative_gap(cost, lower),
+            iterations=iterations,
+        )
+        return self._told(answer, outlook)
+
+    def _told(self, answer: Answer, outlook: Outlook) -> Answer:
+        """The answer with the names of what gave way."""
+        if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
+            return answer
+        return replace(answer, gave_way=gave_way(self._design, answer, self._components, outlook))
+
+    def _clipped(self, inputs: Array) -> Array:
+        """Inputs cut back to their limits; the QPs' tolerance is all that is cut."""
+        if self._oblique:
+            return inside(inputs, self._design.input_set.c, self._design.input_set.b)[0]
+        return np.minimum(np.maximum(inputs, self._low), self._high)
+
+    def _plan_matrix(self) -> Array:
+        """(q, p) of all components -> inputs, reference, offsets."""
+        problems = [mixture.problem for mixture in self._mixtures]
+        n_q, n_p = sum(p.h.shape[0] for p in problems), sum(p.n_p for p in problems)
+        columns = np.zeros((self._shape_u[0] * self._shape_u[1] + self._shape_x[1], n_q + n_p))
+        offsets = []
+        at_q, at_p = 0, n_q
+        for part, problem in zip(self._components, problems, strict=True):
+            size_q = problem.h.shape[0]
+            of_w = np.hstack([problem.z, problem.w])
+            here = np.hstack([np.zeros((problem.n_y, size_q)), np.eye(problem.n_p)[problem.n_p - problem.n_y :]])
+            where = np.concatenate([np.arange(at_q, at_q + size_q), np.arange(at_p, at_p + problem.n_p)])
+            for j, column in enumerate(where):
+                inputs = np.zeros(self._shape_u)
+                inputs[:, part.inputs] = problem.inputs(of_w[:, j], here[:, j])
+                reference = np.zeros(self._shape_x[1])
+                reference[part.states] = part.x_eq @ (of_w[problem.n_v :, j] + here[:, j])
+                columns[:, column] = np.concatenate([inputs.ravel(), reference])
+            rows = np.zeros((problem.n_y, n_q + n_p))
+            rows[:, where] = np.hstack([problem.a, problem.r])[-problem.n_y :]  # the offset rows are the last
+            offsets.append(rows)
+            at_q, at_p = at_q + size_q, at_p + problem.n_p
+        return np.vstack([columns, *offsets])
+
+    def _collect(self, rows: Sequence[Array]) -> tuple[Array, Array]:
+        """Tables of back-offs of the whole plant from those of its components; not to be written to."""
+        design, steps = self._design, self._shape_u[0]
+        backoff_x, backoff_u = (
+            np.zeros((steps + 1, design.state_set.b.size)),
+            np.zeros((steps, design.input_set.b.size)),
+        )
+        for part, row in zip(self._components, rows, strict=True):
+            split = (steps + 1) * part.rows_x.size
+            backoff_x[:, part.rows_x] = row[:split].reshape(steps + 1, -1)
+            backoff_u[:, part.rows_u] = row[split:].reshape(steps, -1)
+        return backoff_x, backoff_u
+
+
+def _prediction(a: Array, b: Array, steps: int) -> tuple[Array, Array]:
+    """States x_0 … x_H (stacked) from x_0 and from the inputs."""
+    n_x, n_u = b.shape
+    of_x, of_u = np.zeros(((steps + 1) * n_x, n_x)), np.zeros(((steps + 1) * n_x, steps * n_u))
+    of_x[:n_x] = np.eye(n_x)
+    for t in range(steps):
+        now, then = slice(t * n_x, (t + 1) * n_x), slice((t + 1) * n_x, (t + 2) * n_x)
+        of_x[then] = a @ of_x[now]
+        of_u[then] = a @ of_u[now]
+        of_u[then, t * n_u : (t + 1) * n_u] += b
+    return of_x, of_u
+
+
+def _box(design: Design) -> tuple[Array, Array, bool]:
+    """Bounds of each input, and whether there are rows of more than one input."""
+    n_u = design.plant.n_u
+    low, high, oblique = np.full(n_u, -np.inf), np.full(n_u, np.inf), False
+    for row, side in zip(design.input_set.c, design.input_set.b, strict=True):
+        (used,) = np.nonzero(row)
+        if used.size != 1:
+            oblique = True
+        elif row[used[0]] > 0:
+            high[used[0]] = min(high[used[0]], side / row[used[0]])
+        else:
+            low[used[0]] = max(low[used[0]], side / row[used[0]])
+    return low, high, oblique
+
+
+def _backoffs(design: Design, mixture: Mixture) -> Array:
+    """Back-offs of every policy: (K, (H+1) m_x + H m_u), states before inputs, stage by stage."""
+    horizon = mixture.problem.horizon
+    part, theta = horizon.component, mixture.theta.T
+    unseen = np.einsum("ij,jk,ik->i", part.c_x, part.estimate_cov, part.c_x)
+
+    def stage(noise: Affine, kappa: float, variance: Array) -> Array:
+        values = (noise.offset[:, None] + noise.matrix @ theta).reshape(variance.size, horizon.width, theta.shape[1])
+        norms: Array = kappa * np.sqrt((values**2).sum(axis=1) + variance[:, None])
+        return norms
+
+    parts = [stage(horizon.state_noise(t, part.c_x), design.kappa_x[t], unseen) for t in range(horizon.steps + 1)]
+    none = np.zeros(part.b_u.size)
+    parts += [stage(horizon.input_noise(t, part.c_u), design.kappa_u[t], none) for t in range(horizon.steps)]
+    return np.vstack(parts).T

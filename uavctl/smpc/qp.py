@@ -1,0 +1,74 @@
+"""Quadratic programs in DAQP: min ½ zᵀHz + fᵀz, lower <= A z <= upper, soft rows at a linear and a quadratic price.
+
+DAQP starts from the state of its rows, and an update that does not name them keeps those of the last solve: here they
+are named every time, so that the same question gives the same bits whatever was asked before.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Sense = NDArray[np.int32]
+
+OPEN = 1e30  # DAQP's infinity
+SOFT, EQUAL = 8, 5
+TOLERANCE = 1e-10
+_MOST_ITERATIONS = 2000
+_OPTIMAL = (1, 2)  # 2: soft rows were left
+
+
+class QuadraticProgram:
+    """A program whose matrices are given once; f and the sides follow each question. Not for concurrent use.
+
+    Args:
+        h: H (n, n), positive definite.
+        a: A (m, n).
+        sense: DAQP's state of each row (m,): 0, SOFT, EQUAL.
+        price: Linear price of a soft row (m,).
+        curve: Quadratic price (m,): leaving by s costs price·s + curve·s².
+        tolerance: Of feasibility, primal and dual.
+    """
+
+    def __init__(
+        self, h: Array, a: Array, sense: Sense, price: Array, curve: Array, tolerance: float = TOLERANCE
+    ) -> None:
+        self._sense = sense
+        model = daqp.Model()
+        sides = np.full(a.shape[0], OPEN)
+        model.setup(h, np.zeros(h.shape[0]), a, sides, -sides, sense)  # the soft rows fix the workspace
+        model.settings = {
+            "primal_tol": tolerance,
+            "dual_tol": tolerance,
+            "eps_prox": 0.0,
+            "iter_limit": _MOST_ITERATIONS,
+        }
+        rho = np.where(curve > 0.0, 0.5 / np.where(curve > 0.0, curve, 1.0), OPEN)
+        model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
+        self._update, self._solve = model.update, model.solve
+
+    def solve(self, f: Array, upper: Array, lower: Array) -> tuple[Array, Array] | None:
+        """Minimiser (n,) and multipliers (m,), positive at an upper side; None without a finite optimum.
+
+        The sides may be infinite; f and the sides that are not must be finite.
+        """
+        if self._update(f=f, bupper=upper, blower=lower, sense=self._sense) < 0:
+            return None
+        return self._read()
+
+    def solve_anew(self, h: Array, f: Array, a: Array, upper: Array, lower: Array) -> tuple[Array, Array] | None:
+        """The same with new matrices of the same sizes."""
+        if self._update(H=h, f=f, A=a, bupper=upper, blower=lower, sense=self._sense) < 0:
+            return None
+        return self._read()
+
+    def _read(self) -> tuple[Array, Array] | None:
+        z, value, flag, info = self._solve()
+        # NaN comes back as solved; the square's overflow counts as no number either.
+        if flag not in _OPTIMAL or not isfinite(value) or not isfinite(z @ z):
+            return None
+        return z, info["lam"]
