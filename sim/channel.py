@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uavctl.config.types import LinkConfig
+from uavctl.config.link import LinkConfig
+
+_TO_DRAW = -1  # no run of losses is under way: the next packet begins one (of 0 or more)
 
 
 @dataclass
@@ -28,18 +30,34 @@ class Counters:
 class Channel:
     """One direction of a radio link.
 
-    Loss is Bernoulli or Gilbert-Elliott (the chain starts in the good state and steps before
-    each packet), and total within a blackout. What gets through is delayed by `delay_s` plus a uniform
-    draw up to `jitter_s`, so packets may overtake each other. A duplicate has its own delay. A
-    bit flip and a cut act on a packet before it is doubled.
+    Loss is Bernoulli, Gilbert-Elliott (the chain starts in the good state and steps before each packet) or
+    empirical (a run of losses is drawn after each arrival, and before the first packet), and total within a
+    blackout. What gets through is delayed by `delay_s` plus a uniform draw up to `jitter_s`, so packets may
+    overtake each other. A duplicate has its own delay. A bit flip and a cut act on a packet before it is doubled.
+
+    Args:
+        link: The section `[link]`.
+        seed: Of all draws.
+        start_ns: Where spans and steps count from [ns].
+        step_ns: Δt, the step of `link.probability` [ns].
+
+    Raises:
+        ValueError: `link.probability` is given without `step_ns`.
     """
 
-    def __init__(self, link: LinkConfig, seed: np.random.SeedSequence, start_ns: int) -> None:
+    def __init__(
+        self, link: LinkConfig, seed: np.random.SeedSequence, start_ns: int, step_ns: int | None = None
+    ) -> None:
+        if link.probability and step_ns is None:
+            raise ValueError("link.probability goes by steps, so their length is needed")
         self._link = link
         self._start_ns = start_ns
+        self._step_ns = step_ns or 0
         children = [np.random.default_rng(child) for child in seed.spawn(5)]
         self._loss, self._delay, self._duplicate, self._corrupt, self._truncate = children
         self._bad = False
+        self._runs = np.cumsum(link.gaps)
+        self._to_lose = _TO_DRAW
         self._pending: list[tuple[int, int, bytes]] = []
         self._order = 0
         self.counters = Counters()
@@ -80,13 +98,25 @@ class Channel:
     def _loses(self, at_ns: int) -> bool:
         link = self._link
         step, draw = self._loss.random(2)
-        probability = link.loss
-        if link.model == "gilbert-elliott":
-            self._bad = bool(step >= link.burst_leave if self._bad else step < link.burst_enter)
-            probability = link.burst_loss if self._bad else link.loss
         since_ns = at_ns - self._start_ns
         dark = any(begin * 1e9 <= since_ns <= end * 1e9 for begin, end in link.blackout)
-        return bool(draw < probability) or dark
+        return bool(draw < self._probability(since_ns, step)) or dark
+
+    def _probability(self, since_ns: int, step: float) -> float:
+        """Probability that the next packet is lost; the channel's own state moves on by the draw `step`."""
+        link = self._link
+        if link.model == "gilbert-elliott":
+            self._bad = bool(step >= link.burst_leave if self._bad else step < link.burst_enter)
+            return link.burst_loss if self._bad else link.loss
+        if link.model == "empirical":
+            if self._to_lose == _TO_DRAW:
+                self._to_lose = int(np.searchsorted(self._runs, step * self._runs[-1], side="right"))
+            self._to_lose -= 1
+            return 0.0 if self._to_lose == _TO_DRAW else 1.0
+        if link.probability:
+            number = -(-since_ns // self._step_ns)  # step k ends at k Δt, that instant included
+            return 1.0 - link.probability[min(max(number, 0), len(link.probability) - 1)]
+        return link.loss
 
     def _flip(self, data: bytes) -> tuple[bytes, bool]:
         whether, where = self._corrupt.random(2)

@@ -43,7 +43,7 @@ class Peers:
         for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
         self.vehicle = VEHICLES[config.sim.plant](config, for_vehicle, start_ns)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
-        self.channel = Channel(config.link, for_channel, start_ns)
+        self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
         self._airborne = airborne
         self._mocap_link = VEHICLE if shared_link else MOCAP

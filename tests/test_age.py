@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.age import age_distribution, at_most, information_probability
+from uavctl.smpc.age import at_most, information_probability
+from uavctl.smpc.link import bernoulli
 
 Array = NDArray[np.float64]
 LINKS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8).map(np.array)
@@ -32,7 +33,7 @@ def printed_chain(p: Array) -> Array:
 @pytest.mark.parametrize("p", [0.7, 0.3, 1.0, 0.0])
 def test_constant_link_has_the_geometric_distribution(p: float) -> None:
     q = 1.0 - p
-    mu = age_distribution(np.full(12, p))
+    mu = bernoulli(np.array([p])).age(12)
     for t in range(13):
         expected = [p * q**j for j in range(t)] + [q**t] + [0.0] * (12 - t)
         np.testing.assert_allclose(mu[t], expected, atol=1e-15)
@@ -40,13 +41,13 @@ def test_constant_link_has_the_geometric_distribution(p: float) -> None:
 
 @given(LINKS)
 def test_varying_link_is_the_printed_chain(p: Array) -> None:
-    mu = age_distribution(p)
+    mu = bernoulli(p).age(len(p))
     np.testing.assert_allclose(mu, printed_chain(p), atol=1e-15)
     np.testing.assert_allclose(mu.sum(axis=1), 1.0)
 
 
 def test_varying_link_by_hand() -> None:
-    mu = age_distribution(np.array([0.5, 0.8, 0.25]))
+    mu = bernoulli(np.array([0.5, 0.8, 0.25])).age(3)
     np.testing.assert_allclose(mu[3], [0.25, 0.75 * 0.8, 0.75 * 0.2 * 0.5, 0.75 * 0.2 * 0.5])
 
 
@@ -55,7 +56,7 @@ def test_counted_ages_follow_the_distribution() -> None:
     runs = 40_000
     p = np.array([0.7, 0.4, 0.9, 0.7, 0.2, 0.6])
     age = np.zeros(runs, dtype=int)
-    mu = age_distribution(p)
+    mu = bernoulli(p).age(len(p))
     for t, arrives in enumerate(p, start=1):
         age = np.where(rng.random(runs) < arrives, 0, age + 1)
         share = np.bincount(age, minlength=len(p) + 1) / runs
@@ -64,7 +65,7 @@ def test_counted_ages_follow_the_distribution() -> None:
 
 
 def test_threshold_of_the_paper() -> None:
-    mu = age_distribution(np.full(12, 0.7))
+    mu = bernoulli(np.array([0.7])).age(12)
     # 99.19 % as printed is P(a <= 3); P(a <= 4) is 99.76 %.
     assert at_most(mu, 12, 3) == pytest.approx(0.9919)
     assert at_most(mu, 12, 4) == pytest.approx(0.99757)
@@ -72,7 +73,7 @@ def test_threshold_of_the_paper() -> None:
 
 
 def test_information_probability() -> None:
-    mu = age_distribution(np.full(12, 0.7))
+    mu = bernoulli(np.array([0.7])).age(12)
     # w(k+r) is known at t if x(k+r+1) is: P(a <= t - r - 1) = 1 - q^(t-r)
     for t in range(1, 12):
         for r in range(t):
@@ -83,4 +84,4 @@ def test_information_probability() -> None:
 @pytest.mark.parametrize("p", [[0.7, 1.1], [-0.1], [float("nan")]])
 def test_a_number_that_is_no_probability_is_refused(p: list[float]) -> None:
     with pytest.raises(DesignError, match=r"link\.loss"):
-        age_distribution(np.array(p))
+        bernoulli(np.array(p))

@@ -6,16 +6,25 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from hypothesis import given as hypothesis_given
+from hypothesis import strategies as st
 
 from uavctl.errors import DesignError
-from uavctl.smpc.age import age_distribution
+from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.schedule import Demand, fixed, greedy, nested
 
 H = 12
 
 
-def demand(tau: int = 4, horizon: int = H, p: float = 0.7, delta_x: float = 0.95, delta_u: float = 0.9) -> Demand:
-    return Demand(age_distribution(np.full(horizon, p)), horizon, tau, delta_x, delta_u)
+def demand(
+    tau: int = 4,
+    horizon: int = H,
+    p: float = 0.7,
+    delta_x: float = 0.95,
+    delta_u: float = 0.9,
+    joint: bool = False,
+) -> Demand:
+    return Demand(bernoulli(np.array([p])), horizon, tau, delta_x, delta_u, joint)
 
 
 def test_fixed_delay_of_the_paper() -> None:
@@ -37,7 +46,7 @@ def test_likelihoods_multiply_back_to_the_deltas() -> None:
 
 def test_varying_link_enters_stage_by_stage() -> None:
     p = np.array([0.7, 0.9, 0.8, 0.95, 0.7, 0.9, 0.99, 0.9])
-    schedule = fixed(Demand(age_distribution(p), 8, 2, 0.9, 0.9), 3)
+    schedule = fixed(Demand(bernoulli(p), 8, 2, 0.9, 0.9), 3)
     # a(k+t) > 2 if the packets of t, t-1 and t-2 are all lost
     expected = [1.0] * 3 + [1.0 - float(np.prod(1.0 - p[t - 3 : t])) for t in range(3, 8)]
     np.testing.assert_allclose(schedule.alpha, expected)
@@ -123,3 +132,80 @@ def test_greedy_on_a_link_that_is_too_bad_is_refused(p: float) -> None:
     with pytest.raises(DesignError, match=r"smpc\.delta_x: 0\.95 is out of reach"):
         greedy(demand(p=p, tau=3), 0.985)
     assert list(nested(demand(p=p, tau=3), 0.985)) == []
+
+
+def all_usable(delays: tuple[int, ...], q: float) -> float:
+    """P(every stage's feedback is usable), summed over all patterns of losses of the steps 1 … H-1."""
+    total = 0.0
+    for lost in product((False, True), repeat=len(delays) - 1):
+        age, usable = 0, True
+        for t, gone in enumerate(lost, start=1):
+            age = age + 1 if gone else 0
+            usable = usable and (t < delays[t] or age < delays[t])
+        total += usable * q ** sum(lost) * (1.0 - q) ** (len(lost) - sum(lost))
+    return total
+
+
+def test_joint_likelihood_lets_the_terminal_delay_through() -> None:
+    # By the product, tau = 3 with d = 4 leaves 0.9370 and is refused; exactly it leaves 0.9524: γ_H = 0.9974.
+    with pytest.raises(DesignError, match=r"smpc\.delta_x: 0\.95 is out of reach: .* 0\.9370"):
+        fixed(demand(tau=3), 4)
+    schedule = fixed(demand(tau=3, joint=True), 4)
+    assert schedule.gamma_x[H] == pytest.approx(0.9974, abs=5e-5)
+    assert schedule.gamma_x[H] == pytest.approx(0.95 / all_usable((4,) * H, 0.3), rel=1e-12)
+    np.testing.assert_allclose(schedule.gamma_u, fixed(demand(tau=3, delta_x=0.9), 4).gamma_u)
+
+
+@pytest.mark.parametrize(
+    "delays", [(5,) * H, (1, 2, 3, 4, 4, 4, 5, 5, 5, 5, 5, 5), (1, 2, 2, 3, 4, 5, 6, 6, 5, 5, 5, 5)]
+)
+def test_joint_likelihood_is_the_sum_over_all_patterns_of_losses(delays: tuple[int, ...]) -> None:
+    usable = demand(joint=True).usable(delays)
+    for t in range(H):
+        assert usable[t] == pytest.approx(all_usable(delays[: t + 1], 0.3), rel=1e-12)
+
+
+def test_joint_nested_schedules_are_those_of_a_blind_enumeration() -> None:
+    horizon, tau, q = 10, 3, 0.3
+    free = horizon - tau
+    expected = set()
+    for newest in product(*[range(-1, t) for t in range(free)]):
+        newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]
+        if any(later < earlier for earlier, later in pairwise(newest_all)):
+            continue
+        alpha = [1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)]
+        delays = tuple(t - r for t, r in enumerate(newest_all))
+        if min(alpha) > 0.95 and 0.95 / all_usable(delays, q) <= 0.985:
+            expected.add(delays)
+    found = {schedule.delays for schedule in nested(demand(tau, horizon, joint=True), 0.985)}
+    assert found == expected
+    assert {schedule.delays for schedule in nested(demand(tau, horizon), 0.985)} < found
+
+
+@hypothesis_given(
+    delays=st.lists(st.integers(1, 9), min_size=H, max_size=H), p=st.floats(0.3, 1.0), step=st.integers(1, H - 1)
+)
+def test_the_product_never_exceeds_the_joint_probability_of_independent_losses(
+    delays: list[int], p: float, step: int
+) -> None:
+    product_form, joint = demand(p=p).usable(delays), demand(p=p, joint=True).usable(delays)
+    assert np.all(product_form <= joint + 1e-12)
+    assert joint[step] <= joint[step - 1] + 1e-12
+
+
+@hypothesis_given(st.floats(0.75, 1.0), st.floats(0.75, 1.0), st.booleans())
+def test_a_better_link_never_asks_for_more(p: float, other: float, joint: bool) -> None:
+    worse, better = (fixed(demand(p=one, joint=joint), 5) for one in sorted((p, other)))
+    assert np.all(better.alpha >= worse.alpha)
+    assert np.all(better.gamma_x <= worse.gamma_x + 1e-12)
+    assert np.all(better.gamma_u <= worse.gamma_u)
+
+
+def test_bursts_of_the_same_mean_loss_ask_for_more() -> None:
+    # 10 % lost both ways; in bursts of four packets on average, the tails of the age are far longer.
+    bursts = gilbert_elliott(enter=0.25 / 9, leave=0.25, good_loss=0.0, bad_loss=1.0)
+    assert bursts.outage(1) == pytest.approx(0.1)
+    even, uneven = (fixed(Demand(link, H, 4, 0.85, 0.85), 5) for link in (bernoulli(np.array([0.9])), bursts))
+    assert even.alpha.min() > 0.9999
+    assert uneven.alpha.min() < 0.98
+    assert np.all(uneven.gamma_x >= even.gamma_x)

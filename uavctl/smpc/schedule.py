@@ -6,18 +6,21 @@ The delay d_t says that stage t feeds back w(k+r) for r <= t - d_t only. It is u
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
 from uavctl.smpc.age import information_probability
+from uavctl.smpc.link import LinkModel
 
 Array = NDArray[np.float64]
-# The product's and the likelihoods' bounds are strict: equality makes γ = 1 and the back-off infinite.
+# The bounds of α and of their product are strict: equality makes γ = 1 and the back-off infinite.
 _STRICT = 1e-9
 LONGEST_DELAY = 8
 
@@ -29,7 +32,7 @@ class Schedule:
     Attributes:
         delays: d_0 … d_{H-1} (H,) [steps].
         alpha: α_t (H,), probability that stage t's feedback is usable.
-        gamma_x: γ^x_t (H+1,) by (6); gamma_x[0] = 1 is not used.
+        gamma_x: γ^x_t (H+1,) by (6), or its exact form; gamma_x[0] = 1 is not used.
         gamma_u: γ^u_t (H,) by (6).
     """
 
@@ -44,18 +47,26 @@ class Demand:
     """What a schedule has to meet.
 
     Attributes:
-        mu: Age distribution (T+1, T+1), from an age of 0, with T >= H - 1.
+        link: Model of the link.
         horizon: H.
         tau: τ.
         delta_x: δ_x.
         delta_u: δ_u.
+        joint: Likelihoods γ^x by the probability that all stages before t are usable; else by the product of theirs,
+            as printed in (6).
     """
 
-    mu: Array
+    link: LinkModel
     horizon: int
     tau: int
     delta_x: float
     delta_u: float
+    joint: bool = False
+
+    @cached_property
+    def mu(self) -> Array:
+        """Age distribution (T+1, T+1), from an age of 0, with T = max(H, τ)."""
+        return self.link.age(max(self.horizon, self.tau))
 
     @property
     def free(self) -> int:
@@ -71,17 +82,25 @@ class Demand:
         """α_t of a delay: p_{t,t-d}, of the newest disturbance that the stage feeds back."""
         return 1.0 if t < delay else information_probability(self.mu, t, t - delay)
 
-    def admits(self, t: int, newest: int, product: float, gamma_max: float) -> bool:
-        """Whether stage t may feed back the disturbances up to r̂ = `newest` (-1: none), after a ∏ α of `product`.
+    def usable(self, delays: Sequence[int]) -> Array:
+        """P(the feedback of all stages 0 … t is usable), or what (6) takes for it (n,)."""
+        if self.joint:
+            return self.link.jointly(delays)
+        return np.array(
+            list(accumulate((self.alpha(t, delay) for t, delay in enumerate(delays)), mul)), dtype=np.float64
+        )
 
-        Its α is above the likelihoods, and if the stages after it used nothing newer (the largest α they can have
-        in a nested schedule), the product of all would be at least δ_x / `gamma_max`.
+    def admits(self, chosen: tuple[int, ...], newest: int, gamma_max: float) -> bool:
+        """Whether the stage after those `chosen` may feed back the disturbances up to r̂ = `newest` (-1: none).
+
+        Its α is above the likelihoods, and if the stages after it used nothing newer (the most likely that they can
+        be in a nested schedule), all would be usable with at least δ_x / `gamma_max`.
         """
+        t = len(chosen)
         if newest > max(-1, self.free - self.tau - 1) or self.alpha(t, t - newest) <= max(self.delta_x, self.delta_u):
             return False
-        free = (self.alpha(s, s - newest) for s in range(t, self.free))
-        last = (self.alpha(s, self.tau + 1) for s in range(self.free, self.horizon))
-        return product * math.prod((*free, *last)) >= self.delta_x / gamma_max
+        nothing_newer = (s - newest for s in range(t, self.free))
+        return bool(self.usable((*chosen, *nothing_newer, *self.last))[-1] >= self.delta_x / gamma_max)
 
 
 def fixed(demand: Demand, delays: int | Sequence[int]) -> Schedule:
@@ -113,17 +132,16 @@ def greedy(demand: Demand, gamma_max: float) -> Schedule:
     """Stage by stage, earliest first, the newest information that (7) admits.
 
     The later stages must still be able to do with what this one has: r̂_t never falls, the last τ stages have
-    d_t = τ + 1, and the product of all α stays at or above δ_x / `gamma_max` (δ_x itself would make γ = 1).
+    d_t = τ + 1, and all are usable with at least δ_x / `gamma_max` (δ_x itself would make γ = 1).
 
     Raises:
         DesignError: (7) admits none.
     """
-    newest, product = -1, 1.0
-    chosen: list[int] = []
+    newest = -1
+    chosen: tuple[int, ...] = ()
     for t in range(demand.free):
-        newest = next((r for r in range(t - 1, newest, -1) if demand.admits(t, r, product, gamma_max)), newest)
-        product *= demand.alpha(t, t - newest)
-        chosen.append(t - newest)
+        newest = next((r for r in range(t - 1, newest, -1) if demand.admits(chosen, r, gamma_max)), newest)
+        chosen = (*chosen, t - newest)
     return fixed(demand, (*chosen, *demand.last))
 
 
@@ -133,7 +151,7 @@ def nested(demand: Demand, gamma_max: float) -> Iterator[Schedule]:
     Schedules that feed back the same disturbances come once; delays beyond LONGEST_DELAY gain next to nothing in
     likelihood and are left out.
     """
-    for delays in _nested_delays(demand, gamma_max, (), -1, 1.0):
+    for delays in _nested_delays(demand, gamma_max, (), -1):
         try:
             schedule = fixed(demand, delays)
         except DesignError:
@@ -142,25 +160,22 @@ def nested(demand: Demand, gamma_max: float) -> Iterator[Schedule]:
             yield schedule
 
 
-def _nested_delays(
-    demand: Demand, gamma_max: float, chosen: tuple[int, ...], newest: int, product: float
-) -> Iterator[tuple[int, ...]]:
-    """Continuations of the delays `chosen`, whose last stage has r̂ = `newest` (-1: nothing) and whose ∏ α is known."""
+def _nested_delays(demand: Demand, gamma_max: float, chosen: tuple[int, ...], newest: int) -> Iterator[tuple[int, ...]]:
+    """Continuations of the delays `chosen`, whose last stage has r̂ = `newest` (-1: nothing)."""
     t = len(chosen)
     if t == demand.free:
         yield (*chosen, *demand.last)
         return
     for r in range(newest, t):
         delay = t - r
-        if (r < 0 or delay <= LONGEST_DELAY) and demand.admits(t, r, product, gamma_max):
-            alpha = demand.alpha(t, delay)
-            yield from _nested_delays(demand, gamma_max, (*chosen, delay), r, product * alpha)
+        if (r < 0 or delay <= LONGEST_DELAY) and demand.admits(chosen, r, gamma_max):
+            yield from _nested_delays(demand, gamma_max, (*chosen, delay), r)
 
 
 def _likelihoods(demand: Demand, delays: tuple[int, ...]) -> Schedule:
     alpha = np.array([demand.alpha(t, delay) for t, delay in enumerate(delays)])
-    product = np.concatenate([[1.0, 1.0], np.cumprod(alpha[1:])])  # ∏_{r=1}^{t-1}
-    worst = int(np.argmin(alpha))
+    usable = np.concatenate([[1.0], demand.usable(delays)])  # (6): of the stages before t
+    worst = int(np.argmax(alpha <= alpha.min() + _STRICT))  # the first of equals
     most = max(demand.delta_x, demand.delta_u)
     if alpha[worst] <= most + _STRICT:
         raise DesignError(
@@ -168,12 +183,12 @@ def _likelihoods(demand: Demand, delays: tuple[int, ...]) -> Schedule:
             f"{most} is out of reach: the feedback of stage {worst} is usable with probability {alpha[worst]:.4f}",
             "lower it, take longer schedule.delays, or improve link.loss",
         )
-    if product[-1] <= demand.delta_x + _STRICT:
+    if usable[-1] <= demand.delta_x + _STRICT:
         raise DesignError(
             "smpc.delta_x",
             f"{demand.delta_x} is out of reach: the feedback of all stages is usable with probability "
-            f"{product[-1]:.4f} only",
+            f"{usable[-1]:.4f} only",
             "lower it, take longer schedule.delays, or improve link.loss",
         )
-    gamma_x = np.where(np.arange(demand.horizon + 1) == 0, 1.0, demand.delta_x / product)
+    gamma_x = np.where(np.arange(demand.horizon + 1) == 0, 1.0, demand.delta_x / usable)
     return Schedule(delays=delays, alpha=alpha, gamma_x=gamma_x, gamma_u=demand.delta_u / alpha)

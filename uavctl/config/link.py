@@ -1,0 +1,73 @@
+"""The section `[link]`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from uavctl.config.section import Section
+
+Probability = Annotated[float, Meta(ge=0, le=1)]
+# Each run length is a state of the design's chain.
+LONGEST_RUN = 100
+
+
+class LinkConfig(Section, frozen=True, kw_only=True):
+    """The radio link that carries positions: the design's assumption, and the simulator's channel."""
+
+    loss: Annotated[
+        float,
+        Meta(
+            ge=0,
+            lt=1,
+            description="probability that a packet is lost; p(k) of the design is the probability that at least one of "
+            "the positions of a Δt comes in time (source.rate_hz): 1 − lossⁿ with model `bernoulli`",
+        ),
+    ] = 0.0
+    model: Annotated[
+        Literal["bernoulli", "gilbert-elliott", "empirical"],
+        Meta(
+            description="how packets are lost, in the design and in the simulator. `bernoulli`: each by itself, with "
+            "`loss`, or with `probability` where that is given; `gilbert-elliott`: in bursts, by a channel that is "
+            "good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`)"
+        ),
+    ] = "bernoulli"
+    probability: Annotated[
+        tuple[Probability, ...],
+        Meta(
+            description="with `bernoulli`: known ahead, in place of `loss`: probability that a packet of step k "
+            "arrives, k = 0, 1, …, the last one repeated; step k's packets are those of the Δt that ends at k Δt. The "
+            "design, which is one for the whole flight, counts for t steps ahead on the least of those from t on"
+        ),
+    ] = ()
+    gaps: Annotated[
+        tuple[Probability, ...],
+        Meta(
+            max_length=LONGEST_RUN + 1,
+            description="with `empirical`: probability that exactly i packets in a row are lost after one that "
+            "arrived, i = 0, 1, …; they add up to 1",
+        ),
+    ] = ()
+    burst_enter: Annotated[
+        float,
+        Meta(ge=0, le=1, description="with `gilbert-elliott`: probability of entering the bad state, each packet"),
+    ] = 0.0
+    burst_leave: Annotated[
+        float, Meta(gt=0, le=1, description="with `gilbert-elliott`: probability of leaving the bad state, each packet")
+    ] = 1.0
+    burst_loss: Annotated[
+        float,
+        Meta(ge=0, le=1, description="with `gilbert-elliott`: loss in the bad state (`loss` applies in the good one)"),
+    ] = 1.0
+    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet [s]")] = 0.0
+    jitter_s: Annotated[
+        float, Meta(ge=0, description="uniform extra delay from 0 to this [s]; packets may overtake each other")
+    ] = 0.0
+    duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
+    corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
+    truncate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet is cut short")] = 0.0
+    blackout: Annotated[
+        tuple[tuple[float, float], ...],
+        Meta(description="spans [from_s, to_s] since the start in which every packet is lost [s]"),
+    ] = ()

@@ -1,0 +1,137 @@
+"""The link as it shows in flight: did a step's news come in time? Pure; one observation each Δt boundary.
+
+An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the boundary
+is there at the boundary. All counts are forgotten exponentially, so the estimate follows a link that drifts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from scipy.special import betainc, betaincinv, ndtri
+
+from uavctl.data import LinkEstimate
+
+
+@dataclass(frozen=True)
+class LinkEstimateParameters:
+    """What the estimate goes by.
+
+    Attributes:
+        promised: The least p(k) that the design counts on.
+        half_life_steps: An observation this old counts half [steps].
+        credible: Level of the lower bound, and of `below_promise`.
+        false_alarm: Probability at which independent losses are taken for bursts, at one boundary.
+    """
+
+    promised: float
+    half_life_steps: float = 100.0
+    credible: float = 0.95
+    false_alarm: float = 0.001
+
+    @property
+    def forgetting(self) -> float:
+        """Weight of an observation one step later."""
+        return float(0.5 ** (1.0 / self.half_life_steps))
+
+
+@dataclass(frozen=True)
+class LinkBelief:
+    """What one boundary leaves to the next: forgotten counts.
+
+    Attributes:
+        arrived: Steps with news.
+        lost: Steps without.
+        pairs: Transitions from one step to the next, as (from lost, to lost): (no, no), (no, yes), (yes, no),
+            (yes, yes).
+        squares: Sum of the squared weights of the transitions.
+        last: Whether the last step had news; None before the first one.
+    """
+
+    arrived: float = 0.0
+    lost: float = 0.0
+    pairs: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    squares: float = 0.0
+    last: bool | None = None
+
+
+NOTHING_SEEN = LinkBelief()
+
+
+def observe(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameters) -> LinkBelief:
+    """Take the observation of one boundary.
+
+    Args:
+        belief: What the boundary before left.
+        arrived: Whether at least one position captured in the Δt that ends here is there.
+        parameters: What the estimate goes by.
+    """
+    weight = parameters.forgetting
+    pairs = [weight * count for count in belief.pairs]
+    squares = weight**2 * belief.squares
+    if belief.last is not None:
+        pairs[2 * (not belief.last) + (not arrived)] += 1.0
+        squares += 1.0
+    return LinkBelief(
+        arrived=weight * belief.arrived + arrived,
+        lost=weight * belief.lost + (not arrived),
+        pairs=(pairs[0], pairs[1], pairs[2], pairs[3]),
+        squares=squares,
+        last=arrived,
+    )
+
+
+def report(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
+    """What is believed at `at_ns`.
+
+    The mean is that of Jeffreys' prior, Beta(½, ½), and the counts' posterior, whose quantiles hold their level on
+    the average only. The bounds add another half step, to the losses for the lower one, to the arrivals for the
+    upper one: without forgetting they are Clopper and Pearson's, which hold it whatever p is.
+
+    Where losses come in bursts, steps say less than independent ones do: the counts are taken down to that many
+    independent ones, by (1 - r) / (1 + r) with r the correlation of a step with the next (the variance of the mean
+    of a two-state chain).
+    """
+    statistic = burst_statistic(belief)
+    bursts = statistic > -float(ndtri(parameters.false_alarm))
+    share = (1.0 - _correlation(belief)) / (1.0 + _correlation(belief)) if bursts else 1.0
+    arrived, lost = share * belief.arrived, share * belief.lost
+    return LinkEstimate(
+        at_ns=at_ns,
+        arrived=belief.arrived,
+        lost=belief.lost,
+        arrival_mean=(belief.arrived + 0.5) / (belief.arrived + belief.lost + 1.0),
+        arrival_lower=float(betaincinv(arrived, lost + 1.0, 1.0 - parameters.credible)) if arrived else 0.0,
+        credible=parameters.credible,
+        burst_statistic=statistic,
+        bursts=bursts,
+        promised=parameters.promised,
+        below_promise=bool(lost and betainc(arrived + 1.0, lost, parameters.promised) >= parameters.credible),
+    )
+
+
+def burst_statistic(belief: LinkBelief) -> float:
+    """Signed root of the likelihood ratio of a first-order Markov chain against independence.
+
+    G² = 2 Σ n_ij log(n_ij n / (n_i. n_.j)) of the transition counts is χ² with one degree of freedom without
+    forgetting; with weights w its scale is Σ w² / Σ w. The sign is that of the correlation: a loss after a loss is
+    more likely than after an arrival.
+    """
+    n00, n01, n10, n11 = belief.pairs
+    total = sum(belief.pairs)
+    if not total:
+        return 0.0
+    row, column = (n00 + n01, n10 + n11), (n00 + n10, n01 + n11)
+    cells = ((n00, row[0] * column[0]), (n01, row[0] * column[1]), (n10, row[1] * column[0]), (n11, row[1] * column[1]))
+    g2 = 2.0 * sum(n * math.log(n * total / expected) for n, expected in cells if n)
+    return math.copysign(math.sqrt(max(0.0, g2) * total / belief.squares), _correlation(belief))
+
+
+def _correlation(belief: LinkBelief) -> float:
+    """Correlation of a step's loss with the next one's, by the transition counts with Jeffreys' prior.
+
+    The prior keeps an outage that has not ended from being taken for a single observation.
+    """
+    n00, n01, n10, n11 = belief.pairs
+    return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
