@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -23,3 +24,13 @@ def kappa(gamma: float, n: int, rows: int, allocation: Allocation) -> float:
     if allocation == "ellipsoid":
         return float(np.sqrt(chi2.ppf(gamma, n)))
     return float(norm.isf((1.0 - gamma) / max(1, rows)))
+
+
+def component_kappa(gamma: float, sizes: Sequence[int]) -> float:
+    """κ of an ellipsoid for each of m independent parts: each holds with γ^(1/m), so that all hold with γ.
+
+    Args:
+        gamma: Likelihood that the whole vector has to be inside with.
+        sizes: Dimension of each part; the largest decides.
+    """
+    return float(np.sqrt(chi2.ppf(gamma ** (1.0 / len(sizes)), max(sizes))))
