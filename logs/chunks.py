@@ -39,7 +39,7 @@ class Message(NamedTuple):
     at_ns: int
     data: bytes
     offset: int  # of its chunk in the file
-    repeated: bool = False  # the header, once more, at the start of a later segment
+    repeated: bool = False  # header or library, once more, at the start of a later segment
 
 
 @dataclass(frozen=True)

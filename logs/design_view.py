@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uavctl.data import Header, Matrix, Vec3, Vector
 from uavctl.errors import RecordingError
+from uavctl.naming import Names, names_of
 
 Floats = NDArray[np.float64]
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
@@ -57,6 +58,11 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         wrong = [name for name, fits in shapes.items() if not fits]
         if wrong:
             raise ValueError(f"shapes do not fit each other: {', '.join(wrong)}")
+
+    @cached_property
+    def names(self) -> Names:
+        """What states and limits are called."""
+        return names_of(self.c_x, len(self.target), self.axes, self.position_index, self.velocity_index)
 
     @property
     def dt_ns(self) -> int:

@@ -137,6 +137,21 @@ class FlightData:
         return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
 
     @cached_property
+    def targets(self) -> tuple[Floats, Floats]:
+        """Where the mission wanted the vehicle to be: times (n,) [s] and states (n, n_x), one each boundary.
+
+        A recording without any says what its design was made for.
+        """
+        told = [(d.at_ns, d.target) for d in self.flown if d.boundary and d.target is not None]
+        told = told or [(self.origin_ns, self.design.target)]
+        return self.seconds([at_ns for at_ns, _ in told]), np.array([target for _, target in told])
+
+    @property
+    def moving_target(self) -> bool:
+        """Whether a trajectory was to be followed."""
+        return any(d.target is not None and d.waypoint is None for d in self.flown)
+
+    @cached_property
     def steps(self) -> Steps:
         """The flown Δt boundaries."""
         return Steps.of(self)
@@ -177,6 +192,7 @@ class Steps:
     t_s: Floats  # (n,)
     state: Floats  # (n, n_x), the true one if known, else the estimate
     input: Floats  # (n, n_u), applied during the step; NaN if unknown
+    target: Floats  # (n, n_x), where the mission wanted the vehicle to be
     from_truth: bool
 
     def __len__(self) -> int:
@@ -194,7 +210,8 @@ class Steps:
         applied = _applied(flight, at_ns) if flight.truths else decided
         near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
         state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
-        return cls(decisions, flight.seconds(at_ns.tolist()), state, applied, bool(flight.truths))
+        target = np.array([d.target or flight.design.target for d in decisions]).reshape(-1, n_x)
+        return cls(decisions, flight.seconds(at_ns.tolist()), state, applied, target, bool(flight.truths))
 
     @property
     def decided(self) -> Floats:

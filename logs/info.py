@@ -10,9 +10,11 @@ import msgspec
 from logs.chunks import Damage, End, Message
 from logs.encoding import decode
 from logs.reader import segment_files, walk
-from logs.topics import HEADER, RECORDER, RecorderNote
-from uavctl.data import Header
+from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote
+from uavctl.data import Header, PolicyLibrary
 from uavctl.errors import RecordingError
+
+_OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,8 +37,16 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
     command: str
     started_utc: str
     design_id: str
+    library_id: str | None  # None if no policy library was flown with
     versions: dict[str, str]
     cpu: str
+
+
+class LibraryInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """The policy library that the recording carries."""
+
+    library_id: str
+    bytes: int
 
 
 class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,6 +66,7 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
     failures: int  # failed writes
     topics: tuple[TopicInfo, ...]
     origin: Origin | None  # None without a readable header
+    library: LibraryInfo | None  # None without a readable policy library
 
 
 class _Course:
@@ -99,6 +110,7 @@ def info(path: Path) -> RecordingInfo:
     following: int | None = None
     note: RecorderNote | None = None
     origin: Origin | None = None
+    library: LibraryInfo | None = None
     for item in walk(path):
         if isinstance(item, Damage):
             damage.append(str(item))
@@ -112,14 +124,16 @@ def info(path: Path) -> RecordingInfo:
         if item.repeated:
             continue
         courses.setdefault(topic, _Course(item)).add(item)
-        if topic in (HEADER, RECORDER):
+        if topic in _OWN:
             record = decode(topic, item.data, item.at_ns)
             note = record if isinstance(record, RecorderNote) else note
             origin = _origin(record) if isinstance(record, Header) else origin
+            if isinstance(record, PolicyLibrary):
+                library = LibraryInfo(library_id=record.library_id, bytes=len(record.data))
     if not courses and not damage:
         raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
     files = segment_files(path)
-    flown = [one for topic, one in courses.items() if topic not in (HEADER, RECORDER)] or list(courses.values())
+    flown = [one for topic, one in courses.items() if topic not in _OWN] or list(courses.values())
     start_ns = min((one.first_ns for one in flown), default=0)
     end_ns = max((one.last_ns for one in flown), default=0)
     return RecordingInfo(
@@ -137,6 +151,7 @@ def info(path: Path) -> RecordingInfo:
         failures=0 if note is None else note.failures,
         topics=tuple(courses[topic].info(topic, start_ns) for topic in sorted(courses)),
         origin=origin,
+        library=library,
     )
 
 
@@ -151,6 +166,7 @@ def _origin(header: Header) -> Origin:
         command=header.command,
         started_utc=header.started_utc,
         design_id=header.design_id,
+        library_id=header.library_id,
         versions=header.versions,
         cpu=header.cpu,
     )

@@ -18,7 +18,7 @@ import msgspec
 from logs.disk import OutputFile, later_segments, segment_path
 from logs.encoding import encode
 from logs.segment import Entry, Segment
-from logs.topics import HEADER, RECORDER, RecorderNote, definition, record_type
+from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, definition, record_type
 from uavctl.data import Datagram, Record, raw_topic
 from uavctl.errors import RecordingError
 
@@ -82,7 +82,7 @@ class Journal:
         self._preface = 0  # records at the start of this segment that only repeat
         self._number = 1
         self._sequence = 0
-        self._header: bytes | None = None
+        self._repeats: dict[str, bytes] = {}  # header and library, for each segment
         self._at_ns = 0
         self._next_sync_s = clock() + SYNC_S
         self._retry_s = clock()
@@ -165,10 +165,12 @@ class Journal:
         self._segment = Segment(self._open_file(segment_path(self._path, self._number)), self._chunk_bytes)
         self._preface = 0
         if self._number > 1:
-            self._preface = 1 if self._header is None else 2
-            if self._header is not None:
-                self._write(HEADER, self._at_ns, self._header)
+            self._preface = 1 + len(self._repeats)
+            if HEADER in self._repeats:
+                self._write(HEADER, self._at_ns, self._repeats[HEADER])
             self._write_note(f"after a failed write: {self._reason}")
+            if LIBRARY in self._repeats:
+                self._write(LIBRARY, self._at_ns, self._repeats[LIBRARY])
         return True
 
     def _take(self, topic: str, at_ns: int, record: Record) -> None:
@@ -181,11 +183,12 @@ class Journal:
             self._refusal = str(error)
             return
         self._at_ns = at_ns
-        if topic == HEADER:
-            self._header = data
+        if topic in (HEADER, LIBRARY):
+            self._repeats[topic] = data
         self._write(topic, at_ns, data)
         if topic == HEADER:
             self._write_note("begin")
+        if topic in (HEADER, LIBRARY):
             self._open_segment().commit()
 
     def _write(self, topic: str, at_ns: int, data: bytes) -> None:

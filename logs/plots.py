@@ -9,14 +9,17 @@ from matplotlib.axes import Axes
 
 from logs.design_view import AXIS_NUMBER, DesignView, Floats
 from logs.flight_data import FALLBACK, FlightData
+from logs.moving_limits import box_at
 from logs.summary import position_error_m, state_outside
 from logs.svg import Drawing, canvas, colour, dots
 from uavctl.data import Plan
 
 POINTS = 1200
+LIMIT_POINTS = 200
 PLANS_SHOWN = 6
 ARRIVED_SHARE = 0.1
 DASHED = (0, (5, 3))
+DOTTED = (0, (1, 1.6))
 # Axes as people see them: down is drawn as height, upwards.
 SEEN = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("height", -1.0)}
 RATE = {"north": "speed north", "east": "speed east", "down": "climb rate"}
@@ -51,16 +54,26 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
     samples = seen(np.array([s.position_m for s in flight.samples]))
     estimate = seen(np.array([design.position_of(e.mean) for e in flight.estimates]))
     truth = seen(np.array([t.position_m for t in flight.truths]))
-    target = seen(np.array([design.target_m]))
+    target = seen(np.array([design.position_of(state) for state in _places(flight)]))
     _draw_room(ax, design, axes_shown)
     ax.plot(*estimate.T, color=colour("estimate"), lw=2.8, alpha=0.5, zorder=2)
     ax.plot(*truth.T, color=colour("truth"), lw=1.0, zorder=3)
     dots(ax, samples[:, 0], samples[:, 1], "sample", 2.4, zorder=4)
     flown = truth if len(truth) else estimate
     ax.plot(*flown[:1].T, "o", ms=6, mfc=colour("card"), mec=colour("truth"), mew=1.5, zorder=5)
-    ax.plot(*target.T, "*", ms=12, color=colour("target"), mec=colour("card"), mew=0.6, zorder=6)
+    if flight.moving_target:
+        ax.plot(*target.T, color=colour("target"), lw=1.1, ls=DOTTED, zorder=3)
+    else:
+        ax.plot(*target.T, "*", ms=12, color=colour("target"), mec=colour("card"), mew=0.6, zorder=6)
     ax.set_aspect("equal", adjustable="datalim")
     ax.margins(0.06)
+
+
+def _places(flight: FlightData) -> Floats:
+    """Each target once, or all of a motion."""
+    _, states = flight.targets
+    changes = np.flatnonzero(np.any(states[1:] != states[:-1], axis=1)) + 1
+    return np.asarray(states[[0, *changes]])
 
 
 def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> None:
@@ -110,11 +123,19 @@ def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, ti
             flight.seconds([t.at_ns for t in flight.truths]), np.array([sign * t.state[index] for t in flight.truths])
         )
         ax.plot(truth_s, truth, color=colour("truth"), lw=1.0)
-        ax.axhline(sign * flight.design.target[index], color=colour("target"), lw=1.1, ls=(0, (1, 1.6)))
+        _draw_target(ax, flight, index, sign)
         steps = flight.steps
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
         span(ax, flight)
     return Drawing(key, one.svg, f"{title} over time against its limits")
+
+
+def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
+    """What the mission wanted of a state: steps between waypoints, or a motion."""
+    t_s, states = flight.targets
+    ends_s = np.append(t_s, flight.duration_s)
+    values = sign * np.append(states[:, index], states[-1, index])
+    ax.step(*thin(ends_s, values), where="post", color=colour("target"), lw=1.1, ls=DOTTED)
 
 
 def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
@@ -122,19 +143,22 @@ def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     box = flight.design.state_box
     plans = list(flight.flown_plans.values())
     t_s = flight.seconds([plan.base_ns for plan in plans])
-    for side, row, inwards in (
-        (box.lower[index], box.row_lower[index], 1.0),
-        (box.upper[index], box.row_upper[index], -1.0),
-    ):
+    all_s = np.linspace(0.0, flight.duration_s, LIMIT_POINTS)
+    at_plans, at_all = box_at(flight, t_s), box_at(flight, all_s)
+    for which, row, inwards in ((0, box.row_lower[index], 1.0), (1, box.row_upper[index], -1.0)):
         if row < 0:
             continue
-        ax.axhline(sign * side, color=colour("limit"), lw=1.2, ls=DASHED)
+        side, over = at_plans[which][:, index], at_all[which][:, index]
+        if np.ptp(over):
+            ax.plot(all_s, sign * over, color=colour("limit"), lw=1.2, ls=DASHED)
+        else:
+            ax.axhline(sign * over[0], color=colour("limit"), lw=1.2, ls=DASHED)
         scale = abs(flight.design.c_x[row][index])
         reserve = np.array([max(stage[row] for stage in plan.backoff_x) for plan in plans]) / scale
         if len(plans):
-            kept = sign * (side + inwards * reserve)
-            shown_s, shown = thin(t_s, kept)
-            ax.fill_between(shown_s, sign * side, shown, step="post", color=colour("limit"), alpha=0.13, lw=0)
+            shown_s, kept = thin(t_s, side + inwards * reserve)
+            limit = np.interp(shown_s, t_s, side)
+            ax.fill_between(shown_s, sign * limit, sign * kept, step="post", color=colour("limit"), alpha=0.13, lw=0)
 
 
 def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:

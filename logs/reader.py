@@ -12,7 +12,7 @@ from typing import TypeVar
 from logs.chunks import Damage, End, Message, scan
 from logs.disk import later_segments
 from logs.encoding import decode
-from logs.topics import HEADER, RECORDER, RecorderNote, record_type
+from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, record_type
 from uavctl.data import Header, Record
 from uavctl.errors import RecordingError
 
@@ -34,17 +34,17 @@ def segment_files(path: Path) -> tuple[Path, ...]:
 
 
 def walk(path: Path) -> Iterator[Message | Damage | End]:
-    """Messages and damage of all segments; the header that later segments repeat is marked.
+    """Messages and damage of all segments; header and library that later segments repeat are marked.
 
     Raises:
         RecordingError: there is no such recording, or a file of it is none.
     """
-    first: bytes | None = None
+    first: dict[str, bytes] = {}
     for file in segment_files(path):
         for item in scan(file):
-            if isinstance(item, Message) and item.definition.topic == HEADER:
-                yield item._replace(repeated=item.data == first)
-                first = first or item.data
+            if isinstance(item, Message) and item.definition.topic in (HEADER, LIBRARY):
+                yield item._replace(repeated=item.data == first.get(item.definition.topic))
+                first.setdefault(item.definition.topic, item.data)
             else:
                 yield item
 

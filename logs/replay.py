@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
 import msgspec
 
-from uavctl.data import Datagram, Record, Sink, StepInput
+from logs.reader import records
+from uavctl.data import Datagram, PolicyLibrary, Record, Sink, StepInput
+from uavctl.errors import RecordingError
 from uavctl.loop import ControlLoop
 
 COMPARED = frozenset(
@@ -47,6 +50,20 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     compared: int
     identical: bool
     first_difference: Difference | None
+
+
+def recorded_library(path: Path) -> PolicyLibrary:
+    """The policy library that a recording was flown with.
+
+    Raises:
+        RecordingError: it cannot be read, or carries none.
+    """
+    for record in records(path, PolicyLibrary):
+        return record
+    raise RecordingError(
+        f"{path}: flown with a policy library, but carries none, so it cannot be decided alike; "
+        "was it cut, or the chunk lost? `uavctl log info` tells"
+    )
 
 
 class _Produced:

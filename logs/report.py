@@ -70,7 +70,7 @@ def _path_section(flight: FlightData) -> Section:
             _ESTIMATE,
             Mark("dot", "sample", "position used"),
             Mark("ring", "truth", "start"),
-            Mark("star", "target", "target"),
+            _TARGET if flight.moving_target else Mark("star", "target", "target"),
             _LIMIT,
         ),
     )

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from logs.design_view import Floats
 from logs.flight_data import FALLBACK, FLOWN, FlightData
+from logs.moving_limits import limits_at
 from uavctl.data import ControlMode, Matrix, SolveStatus, Vector
 
 RELATIVE_TOLERANCE = 1e-9
@@ -54,7 +55,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     state_violations: int  # flown boundaries with the state outside its set
     input_violations: int  # flown boundaries with the input outside its set
     slack_used: int  # flown plans in which a constraint or the terminal equality gave way
-    cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru
+    cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru, with the target of the moment
     recording: str | None
     report: str | None
     wall_s: float | None  # None when it is not known any more
@@ -128,15 +129,15 @@ def summarise(
 
 
 def position_error_m(flight: FlightData) -> Floats:
-    """Distance from the target at each flown boundary (n,) [m]."""
+    """Distance from the target of the moment at each flown boundary (n,) [m]."""
     index = list(flight.design.position_index)
-    target = np.array(flight.design.target)[index]
-    return np.asarray(np.linalg.norm(flight.steps.state[:, index] - target, axis=1))
+    return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
 
 
 def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which flown boundaries have the state outside its set (n,); a state that is no number is outside."""
-    return _outside(flight.steps.state, flight.design.c_x, flight.design.b_x, RELATIVE_TOLERANCE)
+    """Which flown boundaries have the state outside its set or beyond a fence (n,); no number is outside."""
+    limits = limits_at(flight, flight.steps.t_s)
+    return _outside(flight.steps.state, flight.design.c_x, limits, RELATIVE_TOLERANCE)
 
 
 def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -258,8 +259,10 @@ def _fallback_entries(modes: list[ControlMode]) -> int:
     return entered + (bool(modes) and modes[0] in FALLBACK)
 
 
-def _outside(values: Floats, c: Matrix, b: Vector, tolerance: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Rows of `values` (n, m) outside {v | c v <= b}, beyond a tolerance relative to the limit."""
+def _outside(
+    values: Floats, c: Matrix, b: Vector | Floats, tolerance: float
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Rows of `values` (n, m) outside {v | c v <= b}, b one for all or for each, by more than a relative tolerance."""
     normals = np.array(c).reshape(-1, values.shape[1])
     limit = np.array(b)
     return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
@@ -268,6 +271,6 @@ def _outside(values: Floats, c: Matrix, b: Vector, tolerance: float) -> np.ndarr
 def _cost(flight: FlightData) -> float:
     """Closed-loop cost (3), summed over the flown boundaries."""
     design, steps = flight.design, flight.steps
-    x = steps.state - np.array(design.target)
+    x = steps.state - steps.target
     u = steps.input
     return float(np.sum((x @ np.array(design.q_x)) * x) + np.sum((u @ np.array(design.q_u)) * u))

@@ -19,8 +19,10 @@ from uavctl.data import (
     Estimate,
     Event,
     Header,
+    LinkEstimate,
     LinkStats,
     Plan,
+    PolicyLibrary,
     Record,
     Setpoint,
     StepInput,
@@ -30,6 +32,7 @@ from uavctl.data import (
 )
 
 HEADER = "/uavctl/header"
+LIBRARY = "/uavctl/library"
 RECORDER = "/uavctl/recorder"
 
 
@@ -78,6 +81,7 @@ class Topic:
 
 TOPICS: tuple[Topic, ...] = (
     Topic(HEADER, Header, "configuration, design, seed, versions; first message of every segment"),
+    Topic(LIBRARY, PolicyLibrary, "policies that are decided with, as base64; again in every segment"),
     Topic("/uavctl/step_input", StepInput, "all that a tick knew; replay starts from here"),
     Topic("/uavctl/estimate", Estimate, "state estimate of a tick"),
     Topic("/uavctl/plan", Plan, "answer of the predictive controller, when one was made"),
@@ -87,6 +91,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/event", Event, "something worth telling a person"),
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
+    Topic("/uavctl/link_estimate", LinkEstimate, "what is believed of the link that carries the positions"),
     Topic("/sim/truth", Truth, "the simulator's own state, in simulated flights"),
     Topic(RECORDER, RecorderNote, "the recorder's own account: segments, drops, failed writes"),
 )

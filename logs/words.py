@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 
 from logs.flight_data import FALLBACK, FLOWN, FlightData
+from logs.moving_limits import box_at
 from logs.summary import Ending, FlightSummary, count, input_outside, number, position_error_m, state_outside
 from uavctl.data import ControlMode
+from uavctl.naming import severity, tell, worst
 
 _IN_FLIGHT = {
     ControlMode.BRAKE: "The recording ends while the fallback was braking.",
@@ -27,7 +29,8 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
         _fallback(flight, summary),
         _state_limits(flight, summary),
         _input_limits(flight, summary),
-        _plans(summary),
+        _plans(flight, summary),
+        *_waypoints(flight),
         _ending(flight, summary),
     ]
 
@@ -92,10 +95,12 @@ def _state_limits(flight: FlightData, s: FlightSummary) -> str:
 
 def _worst(flight: FlightData) -> str:
     """The largest excess over an axis-parallel limit, named."""
-    box, states = flight.design.state_box, flight.steps.state[state_outside(flight)]
-    excess = np.nan_to_num(np.maximum(box.lower - states, states - box.upper), nan=0.0, neginf=0.0)
-    _, index = np.unravel_index(int(excess.argmax()), excess.shape)
-    most = float(excess.max())
+    outside = state_outside(flight)
+    states = flight.steps.state[outside]
+    lower, upper = box_at(flight, flight.steps.t_s[outside])
+    beyond = np.nan_to_num(np.maximum(lower - states, states - upper), nan=0.0, neginf=0.0)
+    _, index = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    most = float(beyond.max())
     return f", at worst {most:.2g} beyond a limit of {flight.design.state_name(int(index))}" if most > 0 else ""
 
 
@@ -106,12 +111,35 @@ def _input_limits(flight: FlightData, s: FlightSummary) -> str:
     return f"An input was beyond its limits at {count(s.input_violations, 'step')}, first at {number(at_s)} s."
 
 
-def _plans(s: FlightSummary) -> str:
+def _plans(flight: FlightData, s: FlightSummary) -> str:
     if not s.solves:
         return "No plan was asked for."
     ended = "every one of them optimal" if not s.failed_solves else f"{s.failed_solves} without an optimum"
-    slack = "no constraint had to give way" if not s.slack_used else f"in {s.slack_used} flown a constraint gave way"
+    slack = "no constraint had to give way"
+    if s.slack_used:
+        slack = f"in {s.slack_used} flown a constraint gave way{_gave_way(flight)}"
     return f"{count(s.solves, 'plan')} {_were(s.solves)} computed, {ended}; {slack}."
+
+
+def _gave_way(flight: FlightData) -> str:
+    """What gave way the most in any plan flown."""
+    names = flight.design.names
+    plans = [plan for plan in flight.flown_plans.values() if plan.gave_way]
+    if not plans:
+        return ""
+    plan = max(plans, key=lambda plan: severity(names, worst(names, plan.gave_way)))
+    at_s = float(flight.seconds([plan.base_ns])[0])
+    return f"; at worst, in the plan of {number(at_s)} s, the {tell(names, worst(names, plan.gave_way))}"
+
+
+def _waypoints(flight: FlightData) -> list[str]:
+    """When the waypoints after the first were set out for."""
+    told = [(d.at_ns, d.waypoint) for d in flight.flown if d.waypoint is not None]
+    left = [(at_ns, then) for (_, now), (at_ns, then) in pairwise(told) if then != now]
+    if not left:
+        return []
+    times = ", ".join(f"waypoint {then + 1} at {_seconds(flight, at_ns)}" for at_ns, then in left)
+    return [f"It set out for {times}."]
 
 
 def _ending(flight: FlightData, s: FlightSummary) -> str:

@@ -14,8 +14,11 @@ from uavctl.data import ControlMode, PositionSample, SolveStatus, StepInput, Vec
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
+from uavctl.flight.link_estimate import LinkEstimateParameters
+from uavctl.flight.mission import hold
 from uavctl.flight.step import Controller, ControlState, StepOutput, initial_state, step
-from uavctl.smpc.answer import Answer
+from uavctl.naming import names_of
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -99,7 +102,7 @@ class StubSolver:
     faults: Mapping[int, Fault] = field(default_factory=dict)
     asked: list[tuple[int, Array]] = field(default_factory=list)
 
-    def solve(self, seq: int, x: Array, target: Array) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
         self.asked.append((seq, x))
         answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
         fault = self.faults.get(seq)
@@ -121,10 +124,12 @@ def make_controller(
         design_id="stub",
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
-        target=np.zeros(plant.n_x),
+        mission=hold(np.zeros(plant.n_x), plant.position_index, limits=np.zeros(0), horizon=horizon, dt_ns=DT_NS),
+        names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
         fallback=fallback,
         limits=LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=100.0),
+        link=LinkEstimateParameters(promised=0.5),
         dt_ns=DT_NS,
         tick_ns=TICK_NS,
     )

@@ -140,6 +140,8 @@ class Decision(Record, frozen=True, kw_only=True):
     accepted: int  # samples taken in this tick
     rejected: int  # samples refused in this tick (invalid, duplicate, too old)
     reason: str
+    target: Vector | None = None  # (n_x,), where the mission wants the vehicle in this step; None before it began
+    waypoint: int | None = None  # number of the waypoint flown to, from 0; None before, and on a trajectory
 
 
 class VehicleStatus(Record, frozen=True, kw_only=True):
@@ -246,6 +248,30 @@ class Header(Record, frozen=True, kw_only=True):
     design: dict[str, object]
     versions: dict[str, str]
     cpu: str
+    library_id: str | None = None  # hash of the policy library; None if none was flown with
+
+
+class LinkEstimate(Record, frozen=True, kw_only=True):
+    """What is believed of the link that carries the positions, at a Δt boundary."""
+
+    at_ns: int
+    arrived: float  # steps with news, the older the less they count
+    lost: float  # steps without
+    arrival_mean: float  # of the posterior of p
+    arrival_lower: float  # p is above this with probability `credible`
+    credible: float
+    burst_statistic: float  # about N(0, 1) if losses are independent, large if they come in bursts
+    bursts: bool
+    promised: float  # what the design counts on for p
+    below_promise: bool  # p is below `promised` with probability `credible` at least
+
+
+class PolicyLibrary(Record, frozen=True, kw_only=True):
+    """The policy library that is decided with; second record of a recording, for a replay that decides alike."""
+
+    library_id: str
+    design_id: str
+    data: bytes  # as `uavctl.library_store.encode` writes it
 
 
 class Sink(Protocol):

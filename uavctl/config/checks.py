@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
+from uavctl.config import mission_checks
+from uavctl.config.problem import Problem as Problem
 from uavctl.config.types import (
     CostConfig,
     DaemonConfig,
@@ -29,15 +30,8 @@ from uavctl.config.types import (
 _MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input")
 _DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
 _AXES = ("north", "east", "down")
+_SUM = 1e-4  # shares are written rounded
 _RELATIVE = 1e-9  # asymmetry and negative eigenvalues below this share of W's size are rounding
-
-
-class Problem(NamedTuple):
-    """One thing that is wrong with a configuration."""
-
-    key: str
-    reason: str
-    todo: str
 
 
 def dimensions(plant: PlantConfig) -> tuple[int, int]:
@@ -46,7 +40,7 @@ def dimensions(plant: PlantConfig) -> tuple[int, int]:
     return (len(plant.a) if plant.model == "matrices" else 3 * n_u), n_u
 
 
-def check(sections: Mapping[str, Section]) -> Iterator[Problem]:
+def check(sections: Mapping[str, Section | tuple[Section, ...]]) -> Iterator[Problem]:
     """All problems among the sections that are there (a section that is not decoded is left out)."""
     for names, check_one in _CHECKS:
         if all(name in sections for name in names):
@@ -195,21 +189,18 @@ def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) ->
 
 
 def _target(plant: PlantConfig, sets: SetsConfig, target: TargetConfig) -> Iterator[Problem]:
-    positions = plant.position_index if plant.model == "matrices" else tuple(range(0, 3 * len(plant.axes), 3))
-    for axis, i in zip(plant.axes, positions, strict=False):
-        if not 0 <= i < min(len(sets.state_lower), len(sets.state_upper)):
-            continue  # a problem of its own
-        place = target.position_m[_AXES.index(axis)]
-        low, high = sets.state_lower[i], sets.state_upper[i]
-        if not low <= place <= high:
-            yield Problem(
-                f"target.position_m[{_AXES.index(axis)}]",
-                f"{axis} {place:g} m is outside the admissible box [{low:g}, {high:g}]",
-                "move the target inside, or widen sets.state_lower and sets.state_upper",
-            )
+    yield from mission_checks.outside(plant, sets, target.position_m, "target.position_m", "target")
 
 
 def _link(link: LinkConfig) -> Iterator[Problem]:
+    if link.model == "empirical":
+        yield from _gaps(link.gaps)
+    if link.probability and link.probability[-1] == 0.0:
+        yield Problem(
+            "link.probability",
+            "ends in 0, which is repeated: nothing arrives for ever",
+            "add the probability that goes on; use link.blackout to test an outage",
+        )
     for i, (start, end) in enumerate(link.blackout):
         if not 0 <= start < end:
             yield Problem(
@@ -217,6 +208,14 @@ def _link(link: LinkConfig) -> Iterator[Problem]:
                 f"[{start:g}, {end:g}] is not a span of time",
                 "give [from_s, to_s] with 0 <= from_s < to_s",
             )
+
+
+def _gaps(gaps: Floats) -> Iterator[Problem]:
+    todo = "give the shares of the measured runs of 0, 1, 2 … lost packets"
+    if not gaps:
+        yield Problem("link.gaps", 'is missing, and model "empirical" needs it', todo)
+    elif abs(math.fsum(gaps) - 1.0) > _SUM:
+        yield Problem("link.gaps", f"the entries add up to {math.fsum(gaps):.6g}, probabilities of all runs to 1", todo)
 
 
 def _tick(plant: PlantConfig, daemon: DaemonConfig) -> Iterator[Problem]:
@@ -247,4 +246,8 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("link",), _link),
     (("plant", "daemon"), _tick),
     (("limits",), _limits),
+    (("plant", "sets", "mission"), mission_checks.mission),
+    (("plant", "sets", "fence"), mission_checks.fences),
+    (("solver", "mission"), mission_checks.solver),
+    (("solver", "fence"), mission_checks.solver_fences),
 )

@@ -21,7 +21,7 @@ _TOKEN = re.compile(
 
 
 def key_lines(text: str) -> dict[str, int]:
-    """Line (from 1) of every table, key and list element, named as `plant.a`, `plant.a[0][1]`."""
+    """Line (from 1) of every table, key and list element, named as `plant.a`, `plant.a[0][1]`, `fence[0].side`."""
     scanner = _Scanner(text)
     scanner.document()
     return scanner.lines
@@ -32,6 +32,7 @@ class _Scanner:
 
     def __init__(self, text: str) -> None:
         self.lines: dict[str, int] = {}
+        self._count: dict[str, int] = {}  # elements so far of each array of tables, less one
         self._tokens: list[tuple[str, int]] = []  # token, line; a newline is "\n"
         self._at = 0
         line = 1
@@ -47,9 +48,7 @@ class _Scanner:
             if self._peek() == "\n":
                 self._at += 1
             elif self._peek() == "[":
-                self._skip("[")
-                table = self._key("")
-                self._skip("]")
+                table = self._header()
             else:
                 self._pair(table)
 
@@ -59,6 +58,20 @@ class _Scanner:
     def _skip(self, mark: str) -> None:
         while self._peek() == mark:
             self._at += 1
+
+    def _header(self) -> str:
+        """Read `[table]`, or `[[table]]`, which is one more element of a list."""
+        before = self._at
+        self._skip("[")
+        many = self._at - before > 1
+        line = self._tokens[self._at][1]
+        path = self._key("")
+        self._skip("]")
+        if many:
+            self._count[path] = self._count.get(path, -1) + 1
+            path = f"{path}[{self._count[path]}]"
+            self.lines[path] = line
+        return path
 
     def _key(self, prefix: str) -> str:
         """Read a dotted key; each of its parts is recorded where it first stands."""

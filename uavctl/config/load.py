@@ -19,12 +19,15 @@ from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import Problem, check
 from uavctl.config.index import key_lines
-from uavctl.config.reference import description, is_section, type_text
+from uavctl.config.mission import MissionConfig
+from uavctl.config.reference import description, element, is_section, type_text
+from uavctl.config.samples import read_samples
 from uavctl.config.types import Config, Section
 from uavctl.errors import ConfigError, DesignError
 
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
 _DECODE_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
+Decoded = Section | tuple[Section, ...]
 _WORDS = {
     "`float`": "a number",
     "`int`": "a whole number",
@@ -106,13 +109,16 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     applied = tuple(_override(table, override, problems) for override in overrides)
     source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
     found: list[Problem] = []
-    sections: dict[str, Section] = {}
+    sections: dict[str, Decoded] = {}
     config = _decode(Config, table, "", found, sections)
+    mission = sections.get("mission", MissionConfig())
+    if isinstance(mission, MissionConfig):
+        sections["mission"] = mission = read_samples(mission, Path(file).parent, found)
     found.extend(check(sections))
     problems.extend(source.tell(problem) for problem in found)
     if problems or config is None:
         raise ConfigError(tuple(problems))
-    return Loaded(cast("Config", config), source)
+    return Loaded(msgspec.structs.replace(cast("Config", config), mission=mission), source)
 
 
 def dump_config(config: Config) -> str:
@@ -188,7 +194,7 @@ def _override_value(text: str) -> object:
 
 
 def _decode(
-    section: type[Section], table: Mapping[str, Any], path: str, found: list[Problem], sections: dict[str, Section]
+    section: type[Section], table: Mapping[str, Any], path: str, found: list[Problem], sections: dict[str, Decoded]
 ) -> Section | None:
     """Decode one table; its problems go to `found`, whole first-level sections to `sections`."""
     fields = {field.encode_name: field for field in msgspec.structs.fields(section)}
@@ -200,6 +206,11 @@ def _decode(
         if name not in table:
             if field.default is NODEFAULT:
                 found.append(_missing(key, field))
+        elif (one := element(field.type)) is not None and isinstance(value, list):
+            tables = tuple(_decode_element(one, table, f"{key}[{i}]", found) for i, table in enumerate(value))
+            decoded = tuple(one for one in tables if one is not None)
+            if len(decoded) == len(tables):
+                values[name] = sections[key] = decoded
         elif not is_section(field.type):
             wrong = next(_wrong(key, value, field), None)
             if wrong is None:
@@ -214,6 +225,14 @@ def _decode(
             found.append(Problem(key, f"expected a table, got {_short(value)}", f"write [{key}] and its keys below"))
     usable = all(problem.reason.startswith(_UNKNOWN) for problem in found[before:])
     return section(**values) if usable else None
+
+
+def _decode_element(section: type[Section], value: object, path: str, found: list[Problem]) -> Section | None:
+    """Decode one table of a list."""
+    if isinstance(value, dict):
+        return _decode(section, value, f"{path}.", found, {})
+    found.append(Problem(path, f"expected a table, got {_short(value)}", "write [[…]] and its keys below"))
+    return None
 
 
 def _unknown(path: str, key: str, names: Sequence[str], table: str) -> Problem:

@@ -14,7 +14,7 @@ from uavctl.config.types import Config, Section
 
 _HEAD = """# Configuration
 
-This page is generated from the types in `uavctl/config/types.py` (`make docs`); do not edit it.
+This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
 
 A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`: complete examples in
 `uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides any key, with a value as TOML writes
@@ -34,6 +34,17 @@ def is_section(annotation: object) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, Section)
 
 
+def element(annotation: Any) -> type[Section] | None:
+    """The tables that a field is a list of, if it is one: `[[name]]`."""
+    if get_origin(annotation) is Annotated:
+        return element(get_args(annotation)[0])
+    arguments = get_args(annotation)
+    if get_origin(annotation) is tuple and arguments[1:] == (Ellipsis,) and is_section(arguments[0]):
+        section: type[Section] = arguments[0]
+        return section
+    return None
+
+
 def type_text(annotation: Any) -> str:
     """A field's type with its limits, in words."""
     origin, arguments = get_origin(annotation), get_args(annotation)
@@ -43,6 +54,8 @@ def type_text(annotation: Any) -> str:
         return " or ".join(f'"{choice}"' for choice in arguments)
     if origin in (Union, types.UnionType):
         return ", or ".join(type_text(argument) for argument in arguments)
+    if element(annotation) is not None:
+        return "list of tables"
     if origin is tuple:
         count = "" if arguments[1:] == (Ellipsis,) else f"{len(arguments)} "
         return f"list of {count}{_plural(type_text(arguments[0]))}"
@@ -89,8 +102,12 @@ def _tables(section: type[Section], path: str) -> Iterator[str]:
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:
-        if is_section(field.type):
-            yield from _tables(field.type, f"{path}.{field.encode_name}" if path else field.encode_name)
+        name = f"{path}.{field.encode_name}" if path else field.encode_name
+        one = element(field.type)
+        if one is not None:
+            yield from _tables(one, f"[{name}]")
+        elif is_section(field.type):
+            yield from _tables(field.type, name)
 
 
 def _default(field: FieldInfo) -> str:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import msgspec
 from msgspec import Meta
 
-Rows = tuple[tuple[float, ...], ...]
-Floats = tuple[float, ...]
-Position = tuple[float, float, float]
-
-
-class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all sections."""
+from uavctl.config.link import LinkConfig as LinkConfig
+from uavctl.config.mission import FenceConfig as FenceConfig
+from uavctl.config.mission import MissionConfig as MissionConfig
+from uavctl.config.section import Floats as Floats
+from uavctl.config.section import Position as Position
+from uavctl.config.section import Rows as Rows
+from uavctl.config.section import Section as Section
 
 
 class PlantConfig(Section, frozen=True, kw_only=True):
@@ -118,6 +117,22 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
         0.985
     )
     search_states: Annotated[Rows, Meta(description="states (n_x each) over whose mean cost `search` minimises")] = ()
+    joint: Annotated[
+        bool,
+        Meta(
+            description="likelihoods γ by the exact probability that the feedback of all stages is usable; `false`: by "
+            "the product of the stages' own (6), as printed, which is more cautious where losses are independent"
+        ),
+    ] = False
+    late: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=8,
+            description="plan with a design made for their age on positions up to this many steps old [steps]; at "
+            "least what link.delay_s + link.jitter_s take, where they reach Δt",
+        ),
+    ] = 0
 
 
 class RiskConfig(Section, frozen=True, kw_only=True):
@@ -127,17 +142,29 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         Literal["ellipsoid", "halfspace"],
         Meta(description="`ellipsoid`: χ² of the whole vector, as printed; `halfspace`: Boole with Gaussian quantiles"),
     ] = "ellipsoid"
+    estimate: Annotated[
+        Literal["exact", "innovations"],
+        Meta(
+            description="`exact`: plan as if a position showed the whole state, as printed; `innovations`: plan on the "
+            "estimate that positions alone give, with the covariance of its error in every back-off of a state"
+        ),
+    ] = "exact"
 
 
 class SolverConfig(Section, frozen=True, kw_only=True):
     """The solver of the decision problem."""
 
     method: Annotated[
-        Literal["printed", "exact"],
+        Literal["library", "exact", "printed"],
         Meta(
-            description="`exact`: reduced program in Clarabel; `printed`: (19) through CVXPY (slow, hard constraints)"
+            description="`library`: policies made in advance, each answer with its certificate; `exact`: reduced "
+            "program in Clarabel; `printed`: (19) through CVXPY (slow, hard constraints)"
         ),
-    ] = "exact"
+    ] = "library"
+    exact: Annotated[
+        bool,
+        Meta(description="with `library`: ask the exact program where the certified gap of an answer is above 1e-3"),
+    ] = True
     max_iterations: Annotated[
         int,
         Meta(
@@ -148,55 +175,8 @@ class SolverConfig(Section, frozen=True, kw_only=True):
     ] = 100
 
 
-class LinkConfig(Section, frozen=True, kw_only=True):
-    """The radio link that carries positions: the design's assumption, and the simulator's channel."""
-
-    loss: Annotated[
-        float,
-        Meta(
-            ge=0,
-            lt=1,
-            description="probability that a packet is lost; the design uses p = 1 − (mean loss)ⁿ, n positions in time "
-            "each Δt (source.rate_hz)",
-        ),
-    ] = 0.0
-    model: Annotated[
-        Literal["bernoulli", "gilbert-elliott"],
-        Meta(
-            description="loss model of the channel; with `gilbert-elliott` the design counts on the mean loss: bursts "
-            "are not in its p(k)"
-        ),
-    ] = "bernoulli"
-    burst_enter: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1,
-            description="Gilbert–Elliott: probability of entering the bad state, each packet; the design takes the bad "
-            "state's share as enter / (enter + leave)",
-        ),
-    ] = 0.0
-    burst_leave: Annotated[
-        float, Meta(gt=0, le=1, description="Gilbert–Elliott: probability of leaving the bad state, each packet")
-    ] = 1.0
-    burst_loss: Annotated[
-        float, Meta(ge=0, le=1, description="Gilbert–Elliott: loss in the bad state (`loss` applies in the good one)")
-    ] = 1.0
-    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet [s]")] = 0.0
-    jitter_s: Annotated[
-        float, Meta(ge=0, description="uniform extra delay from 0 to this [s]; packets may overtake each other")
-    ] = 0.0
-    duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
-    corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
-    truncate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet is cut short")] = 0.0
-    blackout: Annotated[
-        tuple[tuple[float, float], ...],
-        Meta(description="spans [from_s, to_s] since the start in which every packet is lost [s]"),
-    ] = ()
-
-
 class TargetConfig(Section, frozen=True, kw_only=True):
-    """Where to fly to."""
+    """Where to fly to, unless `[mission]` says otherwise; the design's terminal set is checked there."""
 
     position_m: Annotated[
         Position, Meta(description="target position in local NED [m]; axes that the plant has not are ignored")
@@ -380,3 +360,5 @@ class Config(Section, frozen=True, kw_only=True):
     clock: ClockConfig = ClockConfig()
     source: SourceConfig = SourceConfig()
     log: LogConfig = LogConfig()
+    mission: MissionConfig = MissionConfig()
+    fence: Annotated[tuple[FenceConfig, ...], Meta(description="limits that change in flight")] = ()

@@ -7,8 +7,11 @@ from dataclasses import dataclass, field
 from uavctl.data import ControlMode, Plan, Vec3
 from uavctl.flight.estimator import History
 from uavctl.flight.fallback import Fallback, FallbackParameters
-from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, make_kalman
+from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
+from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
+from uavctl.flight.mission import Mission, MissionState
+from uavctl.naming import Names
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 
@@ -22,35 +25,42 @@ class Controller:
         design_id: Goes into every plan.
         horizon: H [steps].
         solver: Answers the decision problem.
-        target: Equilibrium to fly to (n_x,).
+        mission: Where to fly to, and within what limits.
+        names: What the rows and states are called in events.
         estimator: Parameters of the filter.
         fallback: Parameters of the fallback.
         limits: Parameters of the last gate.
         dt_ns: Δt [ns].
         tick_ns: Time between ticks [ns]; divides Δt.
+        link: What the estimate of the link goes by.
+        late_steps: Age up to which the solver counts what it has not seen since [steps].
         kalman: The filter, made from the others.
 
     Raises:
-        ValueError: If the ticks do not divide Δt, or the target has not one entry a state.
+        ValueError: If the ticks do not divide Δt, or a target has not one entry a state.
     """
 
     plant: Plant
     design_id: str
     horizon: int
     solver: Solver
-    target: Array
+    mission: Mission
+    names: Names
     estimator: EstimatorParameters
     fallback: FallbackParameters
     limits: LimitsParameters
     dt_ns: int
     tick_ns: int
+    link: LinkEstimateParameters
+    late_steps: int = 0
     kalman: Kalman = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
             raise ValueError(f"tick_ns = {self.tick_ns} does not divide dt_ns = {self.dt_ns}")
-        if self.target.shape != (self.plant.n_x,):
-            raise ValueError(f"target has shape {self.target.shape}, wanted ({self.plant.n_x},)")
+        for waypoint in self.mission.waypoints:
+            if waypoint.target.shape != (self.plant.n_x,):
+                raise ValueError(f"target has shape {waypoint.target.shape}, wanted ({self.plant.n_x},)")
         object.__setattr__(self, "kalman", make_kalman(self.plant, self.estimator, self.dt_ns))
 
     @property
@@ -70,6 +80,9 @@ class ControlState:
         fallback: The fallback that flies; None if it does not.
         fresh: Fresh samples in a row.
         accel_mps2: The last setpoint.
+        mission: How far the mission has come; None before the first decision.
+        link: What the boundaries so far have shown of the link.
+        link_alarms: What was told of the link and still holds, by event code.
     """
 
     history: History | None = None
@@ -78,6 +91,9 @@ class ControlState:
     fallback: Fallback | None = None
     fresh: int = 0
     accel_mps2: Vec3 = ZERO
+    mission: MissionState | None = None
+    link: LinkBelief = NOTHING_SEEN
+    link_alarms: tuple[str, ...] = ()
 
     @property
     def mode(self) -> ControlMode:

@@ -12,6 +12,7 @@ from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.estimator import History, estimate, newest_capture_ns
 from uavctl.flight.fallback import Fallback
 from uavctl.flight.limits import AXES, ZERO
+from uavctl.flight.mission import advance, ask_for
 from uavctl.flight.planning import ask
 from uavctl.smpc.plant import Plant
 
@@ -105,10 +106,16 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
 def _replan(state: ControlState, tick: Tick, controller: Controller) -> Choice:
     """Ask for a plan if there is news; else, or if that fails, the old one plays out."""
     base = estimate(controller.kalman, tick.history, tick.boundary_ns)
-    if base is None or (state.plan is not None and base.captured_ns <= state.plan.captured_ns):
+    if base is None:
         return Choice(state, "no news: the plan plays out")
+    mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
+    state = replace(state, mission=mission)
+    if state.plan is not None and base.captured_ns <= state.plan.captured_ns:
+        return Choice(state, "no news: the plan plays out")
+    target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
+    outlook = replace(outlook, late=min(tick.age_steps or 0, controller.late_steps))
     shape = (controller.horizon, controller.plant.n_u)
-    asked = ask(controller.solver, tick.number, base, controller.target, shape, controller.design_id)
+    asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:
         return Choice(state, "no new plan: the old one plays out", True, asked.status, None, asked.text)
     return Choice(replace(state, plan=asked.plan, fallback=None), "news: a new plan", True, asked.status, asked.plan)

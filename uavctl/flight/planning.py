@@ -8,7 +8,7 @@ import numpy as np
 
 from uavctl.data import Estimate, Matrix, Plan, SolveStatus, Vector
 from uavctl.flight.kalman import Array
-from uavctl.smpc.answer import Answer, Solver
+from uavctl.smpc.answer import Answer, Outlook, Solver
 
 # What arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
@@ -23,7 +23,15 @@ class Asked:
     text: str
 
 
-def ask(solver: Solver, seq: int, base: Estimate, target: Array, shape: tuple[int, int], design_id: str) -> Asked:
+def ask(
+    solver: Solver,
+    seq: int,
+    base: Estimate,
+    target: Array,
+    outlook: Outlook,
+    shape: tuple[int, int],
+    design_id: str,
+) -> Asked:
     """Plan from the estimate at a boundary; never raises on numbers.
 
     Args:
@@ -31,11 +39,12 @@ def ask(solver: Solver, seq: int, base: Estimate, target: Array, shape: tuple[in
         seq: Number of the step that asks.
         base: The estimate at the boundary.
         target: Equilibrium to go to (n_x,).
+        outlook: What is known ahead.
         shape: (H, n_u) of the inputs that an answer must have.
         design_id: Goes into the plan.
     """
     try:
-        answer = solver.solve(seq, np.array(base.mean), target)
+        answer = solver.solve(seq, np.array(base.mean), target, outlook)
     except SOLVER_ERRORS as error:
         return Asked(SolveStatus.FAILED, None, f"the solver raised {type(error).__name__}: {error}")
     if answer.seq != seq:

@@ -17,6 +17,7 @@ from uavctl.data import (
     Decision,
     Estimate,
     Event,
+    LinkEstimate,
     Plan,
     Setpoint,
     SetpointSource,
@@ -29,7 +30,10 @@ from uavctl.flight.decide import Choice, Tick, choose, place, unready, velocity
 from uavctl.flight.estimator import begin, set_input
 from uavctl.flight.kalman import Array
 from uavctl.flight.limits import ZERO, gate
+from uavctl.flight.link_estimate import LinkBelief, observe, report
+from uavctl.flight.mission import wanted
 from uavctl.flight.samples import take
+from uavctl.naming import Names, tell_all
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
@@ -52,6 +56,7 @@ class StepOutput:
         setpoint: What to send; None for nothing.
         events: What is worth telling.
         land: Ask for the vehicle's own landing, once.
+        link: What is believed of the link; at boundaries that were not missed.
     """
 
     estimate: Estimate | None
@@ -60,6 +65,7 @@ class StepOutput:
     setpoint: Setpoint | None
     events: tuple[Event, ...]
     land: bool
+    link: LinkEstimate | None = None
 
 
 def initial_state() -> ControlState:
@@ -87,12 +93,17 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     choice = choose(begun, tick, inp, controller)
     setpoint, applied = _setpoint(choice.state, tick, inp.at_ns, controller)
     acting = np.zeros(controller.plant.n_u) if applied is None or unready(inp.vehicle) else applied
+    belief, link = _link(state, tick, inp.at_ns, controller)
+    alarms = state.link_alarms if link is None else _alarms(link)
     after = replace(
         choice.state,
+        link=belief,
+        link_alarms=alarms,
         history=set_input(controller.kalman, intake.history, inp.at_ns, acting),
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
-    plan = choice.state.plan
+    plan, mission = choice.state.plan, choice.state.mission
+    on_waypoints = mission is not None and controller.mission.trajectory is None
     decision = Decision(
         tick=inp.tick,
         at_ns=inp.at_ns,
@@ -110,14 +121,52 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         accepted=intake.accepted,
         rejected=len(intake.refused),
         reason=choice.reason,
+        target=None if mission is None else wanted(controller.mission, mission, tick.boundary_ns),
+        waypoint=mission.waypoint if mission is not None and on_waypoints else None,
     )
     return after, StepOutput(
         estimate=tick.estimate,
         plan=choice.plan,
         decision=decision,
         setpoint=setpoint,
-        events=_events(state.mode, choice, inp, intake.refused),
+        events=(
+            *_events(state.mode, choice, inp, intake.refused, controller.names),
+            *_link_events(alarms, state.link_alarms, link),
+        ),
+        link=link,
         land=choice.state.mode is ControlMode.LAND and state.mode is not ControlMode.LAND,
+    )
+
+
+_LINK_TEXTS = {
+    "link-bursts": "positions are lost in bursts: silence is longer than independent losses would make it",
+    "link-below-promise": "fewer positions arrive in time than the design counts on; limits may be broken more often",
+}
+
+
+def _link(
+    state: ControlState, tick: Tick, at_ns: int, controller: Controller
+) -> tuple[LinkBelief, LinkEstimate | None]:
+    """Whether a position of the step that ends here has arrived, and what that makes one believe of the link."""
+    if not tick.boundary or tick.age_steps is None or at_ns != tick.boundary_ns:
+        return state.link, None
+    belief = observe(state.link, tick.age_steps == 0, controller.link)
+    return belief, report(belief, controller.link, at_ns)
+
+
+def _alarms(link: LinkEstimate) -> tuple[str, ...]:
+    holds = {"link-bursts": link.bursts, "link-below-promise": link.below_promise}
+    return tuple(code for code, on in holds.items() if on)
+
+
+def _link_events(alarms: tuple[str, ...], told: tuple[str, ...], link: LinkEstimate | None) -> tuple[Event, ...]:
+    """An event for each alarm that was not on before."""
+    if link is None:
+        return ()
+    return tuple(
+        Event(at_ns=link.at_ns, severity=Severity.WARNING, code=code, text=_LINK_TEXTS[code])
+        for code in alarms
+        if code not in told
     )
 
 
@@ -148,7 +197,9 @@ _ENTERED = {
 }
 
 
-def _events(before: ControlMode, choice: Choice, inp: StepInput, refused: tuple[str, ...]) -> tuple[Event, ...]:
+def _events(
+    before: ControlMode, choice: Choice, inp: StepInput, refused: tuple[str, ...], names: Names
+) -> tuple[Event, ...]:
     events = [
         Event(at_ns=inp.at_ns, severity=Severity.WARNING, code=code, text="the sample counts as lost", count=count)
         for code, count in sorted(Counter(refused).items())
@@ -161,6 +212,9 @@ def _events(before: ControlMode, choice: Choice, inp: StepInput, refused: tuple[
     if choice.solve is not None and choice.plan is None:
         code = f"solve-{choice.solve.value}"
         events.append(Event(at_ns=inp.at_ns, severity=Severity.WARNING, code=code, text=choice.trouble))
+    if choice.plan is not None and choice.plan.gave_way:
+        text = tell_all(names, choice.plan.gave_way)
+        events.append(Event(at_ns=inp.at_ns, severity=Severity.WARNING, code="gave-way", text=text))
     mode = choice.state.mode
     if mode is not before:
         severity, code = _ENTERED[mode]

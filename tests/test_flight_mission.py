@@ -1,0 +1,234 @@
+"""Flights of preset `room` with a mission, over the real bytes: waypoints, a trajectory, a fence that closes in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+
+import msgspec
+import numpy as np
+import pytest
+from flight_rig import MS, TICKS, StubSolver, codes, inputs_of, make_controller, one_a_step, run, small_plant, vehicle
+from loopback_rig import Memory, flight, lockstep, make_loop
+from numpy.typing import NDArray
+
+from logs.moving_limits import box_at
+from logs.replay import replay
+from logs.report import report_html
+from logs.summary import position_error_m, summarise
+from logs.words import story
+from uavctl.config import load_config
+from uavctl.config.load import dump_config
+from uavctl.data import ControlMode, Decision, Event, GaveWay, Plan, Truth
+from uavctl.flight.mission import Waypoint
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+
+Array = NDArray[np.float64]
+
+PLACES_M = ((1.5, 1.0, -1.2), (-1.0, 1.2, -0.9), (0.0, -1.0, -1.5))
+HOLD_S, ACCEPT_M = 2.0, 0.3
+WAYPOINTS = (f"mission.waypoints={[list(place) for place in PLACES_M]}", f"mission.hold_s={HOLD_S}")
+FENCE = ('fence=[{state="north",side="upper",times_s=[5,15],values=[3.0,0.9]}]',)
+SHUT_OUT = ('fence=[{state="north",side="upper",times_s=[7,7.2],values=[3.0,-0.5]}]',)
+
+
+def circle(seconds: float) -> list[list[float]]:
+    """Samples each half second: 0.9 m around the middle of the room in 10 s."""
+    angle = 2 * np.pi * np.arange(0.0, seconds + 0.1, 0.5) / 10.0
+    places: list[list[float]] = np.column_stack(
+        [0.9 * np.cos(angle), 0.9 * np.sin(angle), np.full(len(angle), -1.2)]
+    ).tolist()
+    return places
+
+
+def as_trajectory(seconds: float) -> tuple[str]:
+    places = circle(seconds)
+    return (f"mission.trajectory={{times_s={(0.5 * np.arange(len(places))).tolist()},positions_m={places}}}",)
+
+
+def as_waypoints(seconds: float) -> tuple[str]:
+    return (f"mission.waypoints={circle(seconds)}",)
+
+
+@cache
+def flown(seconds: float, *overrides: str) -> Memory:
+    return lockstep("room", seconds, *overrides)
+
+
+def steps(memory: Memory) -> list[tuple[Decision, Truth]]:
+    """Decisions at boundaries with the truth of that moment."""
+    truths = {truth.at_ns: truth for truth in memory.of(Truth)}
+    return [(one, truths[one.at_ns]) for one in memory.of(Decision) if one.boundary and one.at_ns in truths]
+
+
+def distance_m(decision: Decision, truth: Truth) -> float:
+    assert decision.target is not None
+    return float(np.linalg.norm(np.array(truth.state)[[0, 3, 6]] - np.array(decision.target)[[0, 3, 6]]))
+
+
+CASES = [
+    pytest.param(22.0, WAYPOINTS, id="waypoints"),
+    pytest.param(22.0, as_trajectory(20.0), id="circle"),
+    pytest.param(22.0, FENCE, id="fence"),
+    pytest.param(12.0, SHUT_OUT, id="shut out"),
+]
+
+
+@pytest.mark.parametrize(("seconds", "overrides"), CASES)
+def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: tuple[str, ...]) -> None:
+    memory = flown(seconds, *overrides)
+    summary = summarise(flight(memory), wall_s=1.0)
+    assert (summary.input_violations, summary.failed_solves, summary.fallbacks) == (0, 0, 0)
+    box = load_config("room").sets
+    states = np.array([truth.state for truth in memory.of(Truth)])
+    assert (states >= np.array(box.state_lower)).all() and (states <= np.array(box.state_upper)).all()
+    config = load_config("room", [f"duration_s={seconds}", *overrides])
+    result = replay(memory.entries, partial(make_loop, config))
+    assert result.identical, result.first_difference
+
+
+def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
+    told = steps(flown(22.0, *WAYPOINTS))
+    numbers = [decision.waypoint for decision, _ in told if decision.target is not None]
+    assert numbers == sorted(numbers, key=lambda number: -1 if number is None else number)
+    assert set(numbers) == {0, 1, 2}
+    for number, place in enumerate(PLACES_M):
+        there = [(d, t) for d, t in told if d.waypoint == number]
+        assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in there)
+        # Arrived as the estimate says, so the truth is near by what the estimate is off at most.
+        arrived = next(d.at_ns for d, t in there if distance_m(d, t) < ACCEPT_M + 0.15)
+        assert there[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
+        assert min(distance_m(d, t) for d, t in there) < 0.15
+    assert np.mean([distance_m(d, t) for d, t in told[-10:]]) < 0.2
+
+
+def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> None:
+    """Both after 5 s, in which the vehicle comes from the corner."""
+    circling, chasing = flown(22.0, *as_trajectory(20.0)), flown(22.0, *as_waypoints(20.0))
+
+    def middle(memory: Memory) -> list[tuple[Decision, Truth]]:
+        return [(d, t) for d, t in steps(memory) if 5e9 <= d.at_ns <= 20e9]
+
+    wanted = {decision.at_ns: decision for decision, _ in middle(circling)}
+    following = [distance_m(d, t) for d, t in middle(circling)]
+    behind = [distance_m(wanted[d.at_ns], t) for d, t in middle(chasing) if d.at_ns in wanted]
+    assert np.mean(following) < 0.15
+    assert np.max(following) < 0.4
+    assert np.mean(behind) > 3.0 * np.mean(following)
+    assert {decision.waypoint for decision, _ in middle(circling)} == {None}
+
+
+def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
+    memory = flown(22.0, *FENCE)
+    data = flight(memory)
+    assert summarise(data, wall_s=1.0).slack_used == 0
+    begun_s = data.targets[0][0]
+    for decision, truth in steps(memory):
+        fence_m = np.interp(decision.at_ns * 1e-9 - begun_s, [5.0, 15.0], [3.0, 0.9])
+        assert truth.state[0] <= fence_m
+    # It does what it can: as near to the target as the fence and its reserve let it.
+    late = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
+    assert 0.2 < np.mean(late) < 0.9
+    plan = memory.of(Plan)[-1]
+    assert plan.offset > 0.5
+    assert plan.gave_way == ()
+
+
+def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None:
+    memory = flown(12.0, *SHUT_OUT)
+    given = [plan for plan in memory.of(Plan) if plan.gave_way]
+    assert given
+    assert {"state", "equilibrium"} <= {one.constraint for plan in given for one in plan.gave_way}
+    events = [event for event in memory.of(Event) if event.code == "gave-way"]
+    assert [event.at_ns for event in events] == [plan.base_ns for plan in given]
+    assert {event.text.split(" by ")[0] for event in events} >= {"upper limit of north position gave way"}
+    assert memory.of(Plan)[-1].gave_way == ()
+    assert memory.of(Truth)[-1].state[0] < -0.5
+    data = flight(memory)
+    (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "gave way" in text]
+    assert f"in {len(given)} flown a constraint gave way; at worst, in the plan of " in sentence
+    assert "the upper limit of north position gave way by " in sentence
+
+
+def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
+    data = flight(flown(22.0, *WAYPOINTS))
+    times_s, targets = data.targets
+    assert len(times_s) == len(targets) == len({*times_s.tolist()})
+    assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
+    html = report_html(data, summarise(data, wall_s=1.0))
+    (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "set out" in text]
+    assert sentence.startswith("It set out for waypoint 2 at ") and ", waypoint 3 at " in sentence
+    assert sentence.replace("&", "&amp;") in html
+    assert position_error_m(data)[-1] < 0.3
+    fenced = flight(flown(22.0, *FENCE))
+    begun_s = fenced.targets[0][0]
+    lower, upper = box_at(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
+    assert upper[:, 0].tolist() == pytest.approx([3.0, 1.95, 0.9])
+    assert lower[:, 0].tolist() == [-3.0] * 3
+    assert report_html(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
+    moving = flight(flown(22.0, *as_trajectory(20.0)))
+    assert moving.moving_target and not data.moving_target
+    assert report_html(moving, summarise(moving, wall_s=1.0)).startswith("<!DOCTYPE html>")
+
+
+def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
+    data = flight(flown(22.0, *WAYPOINTS))
+    assert summarise(data, wall_s=1.0).state_violations == 0
+    fence = 'fence=[{state="north",side="upper",times_s=[0],values=[1.0]}]'
+    header = msgspec.structs.replace(data.header, config_toml=dump_config(load_config("room", [fence])))
+    fenced = replace(data, header=header)
+    beyond = fenced.steps.state[:, 0] - 1.0
+    summary = summarise(fenced, wall_s=1.0)
+    assert summary.state_violations == np.count_nonzero(beyond > 0) > 5
+    (sentence,) = [text for text in story(fenced, summary) if "was outside its limits" in text]
+    assert f"at worst {beyond.max():.2g} beyond a limit of north position" in sentence
+
+
+def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:
+    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick > 2 * TICKS))
+    outputs = run(make_controller(), inputs)
+    begun = 3 * TICKS
+    assert {(output.decision.target, output.decision.waypoint) for output in outputs[:begun]} == {(None, None)}
+    assert {(output.decision.target, output.decision.waypoint) for output in outputs[begun:]} == {((0.0, 0.0, 0.0), 0)}
+
+
+def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> None:
+    away = range(2 * TICKS, 4 * TICKS)
+    controller = make_controller()
+    leave_at_once = tuple(Waypoint(np.zeros(3), hold_ns=0) for _ in range(9))
+    controller = replace(controller, mission=replace(controller.mission, waypoints=leave_at_once))
+    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick not in away))
+    outputs = run(controller, inputs)
+    assert {outputs[tick].decision.mode for tick in away} == {ControlMode.WAIT}
+    assert [output.decision.waypoint for output in outputs[::TICKS]] == [1, 2, 2, 2, 3, 4]
+
+
+def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_others() -> None:
+    given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
+    solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, gave_way=given)})
+    outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step()))
+    told = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
+    assert [number for number, _ in told] == [TICKS]
+    (event,) = [event for event in told[0][1].events if event.code == "gave-way"]
+    assert event.text == "rest was missed by 0.3 of state 2 in stage 3; so did 2 others"
+    plan = told[0][1].plan
+    assert plan is not None and plan.gave_way == given
+
+
+@dataclass
+class ListeningSolver(StubSolver):
+    """Keeps what it was told of the time ahead."""
+
+    told: list[Outlook] = field(default_factory=list)
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        self.told.append(outlook)
+        return super().solve(seq, x, target, outlook)
+
+
+@pytest.mark.parametrize(("late_steps", "wanted"), [(0, 0), (1, 1), (3, 2)])
+def test_a_late_position_is_told_as_far_as_the_design_counts_with_it(late_steps: int, wanted: int) -> None:
+    solver = ListeningSolver(small_plant())
+    controller = replace(make_controller(solver), late_steps=late_steps)
+    run(controller, inputs_of(range(8 * TICKS), one_a_step(delay_ns=430 * MS)))
+    assert {outlook.late for outlook in solver.told} == {wanted}

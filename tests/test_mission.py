@@ -1,0 +1,383 @@
+"""Missions: waypoints in their order, motions the plant can make, limits that move, and their configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from uavctl.build import build_controller, build_design
+from uavctl.build_mission import build_mission, build_trajectory
+from uavctl.config import load_config
+from uavctl.config.load import dump_config, parse
+from uavctl.config.types import Config
+from uavctl.data import GaveWay
+from uavctl.errors import ConfigError, DesignError
+from uavctl.flight.mission import Fence, Mission, MissionState, Waypoint, advance, ask_for, wanted
+from uavctl.naming import names_of, tell, tell_all
+from uavctl.smpc.design import Design
+
+Array = NDArray[np.float64]
+
+DT_NS = 200_000_000
+SECOND_NS = 1_000_000_000
+ROOM = Path("uavctl/presets/room.toml").read_text(encoding="utf-8")
+
+
+def on_a_line(*places_m: float, hold_s: float = 1.0, fences: tuple[Fence, ...] = ()) -> Mission:
+    """Waypoints of one axis with states (p, v) and limits p <= 5, -p <= 5."""
+    return Mission(
+        waypoints=tuple(Waypoint(np.array([place, 0.0]), round(hold_s * SECOND_NS)) for place in places_m),
+        accept_m=0.2,
+        position_index=(0,),
+        limits=np.array([5.0, 5.0]),
+        horizon=4,
+        dt_ns=DT_NS,
+        fences=fences,
+    )
+
+
+def walk(mission: Mission, positions_m: list[float]) -> list[MissionState]:
+    """The mission's states with the vehicle at these places, one a Δt from 7 s on."""
+    state, states = None, []
+    for step, position in enumerate(positions_m):
+        state = advance(mission, state, (position, 0.0), 7 * SECOND_NS + step * DT_NS)
+        states.append(state)
+    return states
+
+
+def test_waypoints_are_left_after_their_time_and_the_last_one_never() -> None:
+    mission = on_a_line(0.0, 1.0, hold_s=0.6)
+    states = walk(mission, [0.5, 0.15, 0.0, 0.0, 0.0, 0.5, 0.9, 1.0] + [1.0] * 10)
+    assert [state.waypoint for state in states] == [0, 0, 0, 0, 1, 1, 1, 1] + [1] * 10
+    assert states[1].arrived_ns == 7 * SECOND_NS + DT_NS
+    assert states[4].arrived_ns is None
+    assert states[6].arrived_ns == states[-1].arrived_ns == 7 * SECOND_NS + 6 * DT_NS
+    assert {state.start_ns for state in states} == {7 * SECOND_NS}
+
+
+def test_a_gust_out_of_the_circle_does_not_start_the_time_anew() -> None:
+    states = walk(on_a_line(0.0, 1.0, hold_s=0.6), [0.0, 0.5, 0.5, 0.5])
+    assert [state.waypoint for state in states] == [0, 0, 0, 1]
+
+
+def test_an_estimate_that_is_no_number_reaches_nothing() -> None:
+    assert walk(on_a_line(0.0, 1.0, hold_s=0.0), [float("nan")] * 3)[-1].waypoint == 0
+
+
+def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
+    mission = on_a_line(0.3, 1.0)
+    target, outlook = ask_for(mission, MissionState(start_ns=0, waypoint=1), DT_NS)
+    assert target.tolist() == [1.0, 0.0]
+    assert outlook.nominal
+    assert wanted(mission, MissionState(start_ns=0, waypoint=1), DT_NS) == (1.0, 0.0)
+
+
+def test_a_fence_is_a_line_between_its_samples_and_constant_outside() -> None:
+    fence = Fence(row=1, times_ns=np.array([1.0, 2.0]) * SECOND_NS, values=np.array([4.0, 2.0]))
+    mission = on_a_line(0.0, fences=(fence,))
+    _, outlook = ask_for(mission, MissionState(start_ns=7 * SECOND_NS), 8 * SECOND_NS)
+    assert outlook.limits is not None
+    assert outlook.limits[:, 0].tolist() == [5.0] * 5
+    assert outlook.limits[:, 1] == pytest.approx([4.0, 3.6, 3.2, 2.8, 2.4])
+    _, outlook = ask_for(mission, MissionState(start_ns=7 * SECOND_NS), 20 * SECOND_NS)
+    assert outlook.limits is not None
+    assert outlook.limits[:, 1].tolist() == [2.0] * 5
+
+
+def test_a_fence_that_is_no_closer_than_the_limits_is_none_and_of_several_the_closest_counts() -> None:
+    wide = Fence(row=0, times_ns=np.array([0.0]), values=np.array([9.0]))
+    _, outlook = ask_for(on_a_line(0.0, fences=(wide,)), MissionState(start_ns=0), 0)
+    assert outlook.limits is None
+    near, nearer = (Fence(row=0, times_ns=np.array([0.0]), values=np.array([side])) for side in (3.0, 2.5))
+    _, outlook = ask_for(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
+    assert outlook.limits is not None
+    assert outlook.limits[:, 0].tolist() == [2.5] * 5
+
+
+def circle(seconds: float = 12.0, radius_m: float = 0.9, turn_s: float = 10.0) -> tuple[list[float], list[list[float]]]:
+    t = np.arange(0.0, seconds + 1e-9, 0.5)
+    angle = 2 * np.pi * t / turn_s
+    places = np.column_stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(len(t), -1.2)])
+    return t.tolist(), places.tolist()
+
+
+def room_with(*overrides: str) -> tuple[Config, Design]:
+    config = load_config("room", list(overrides))
+    return config, build_design(config)
+
+
+@pytest.fixture(scope="module")
+def flown_circle() -> tuple[Config, Design]:
+    times_s, places = circle()
+    return room_with(f"mission.trajectory={{times_s={times_s},positions_m={places}}}")
+
+
+def test_a_trajectory_is_a_motion_of_the_plant_near_the_samples(flown_circle: tuple[Config, Design]) -> None:
+    config, design = flown_circle
+    states = build_trajectory(config.mission.trajectory, design).states
+    t = config.plant.dt_s * np.arange(61)
+    wanted_m = np.column_stack([0.9 * np.cos(2 * np.pi * t / 10), 0.9 * np.sin(2 * np.pi * t / 10)])
+    assert np.abs(states[:55, [0, 3]] - wanted_m[:55]).max() < 2e-3
+    # There are inputs that make it: what A leaves over is in the range of B.
+    over = states[1:] - states[:-1] @ design.plant.a.T
+    u = np.linalg.lstsq(design.plant.b, over.T, rcond=None)[0]
+    assert np.abs(design.plant.b @ u - over.T).max() < 1e-9
+    # It ends at rest where the samples end.
+    assert states[-1] == pytest.approx([*wanted_m[60, :1], 0, 0, wanted_m[60, 1], 0, 0, -1.2, 0, 0], abs=5e-3)
+
+
+def test_plans_along_a_trajectory_are_motions_that_leave_it_late_and_end_at_rest(
+    flown_circle: tuple[Config, Design],
+) -> None:
+    config, design = flown_circle
+    plant, rest = design.plant, design.horizon - design.terminal.tau
+    trajectory = build_trajectory(config.mission.trajectory, design)
+    for row in (0, 7, 31):
+        x = trajectory.path_states[row] + trajectory.anchors[row]
+        u = trajectory.path_inputs[row]
+        assert x[0] == pytest.approx(trajectory.states[row])
+        for t in range(design.horizon - 1):
+            assert x[t + 1] == pytest.approx(plant.a @ x[t] + plant.b @ u[t], abs=1e-9)
+        assert x[rest] == pytest.approx(trajectory.anchors[row], abs=1e-9)
+        assert plant.a @ x[rest] == pytest.approx(x[rest], abs=1e-9)
+        assert np.abs(x[1:4] - trajectory.states[row + 1 : row + 4])[:, [0, 3, 6]].max() < 0.02
+
+
+def test_a_trajectory_towards_a_wall_turns_to_rest_before_it() -> None:
+    t = np.arange(0.0, 8.1, 0.5)
+    north = 1.35 - 1.25 * np.cos(2 * np.pi * t / 8.0)  # to 2.6 m at up to 1 m/s; the limit is 3 m
+    places = np.column_stack([north, 0 * t, 0 * t - 1.2]).tolist()
+    config, design = room_with(f"mission.trajectory={{times_s={t.tolist()},positions_m={places}}}")
+    anchors = build_trajectory(config.mission.trajectory, design).anchors
+    room_m = 3.0 - design.kappa_x_terminal * np.sqrt((design.terminal.sigma_x + design.estimate_cov)[0, 0])
+    assert anchors[:, 0].max() == pytest.approx(room_m)
+
+
+def test_samples_need_not_begin_at_zero_and_may_be_joined_by_lines() -> None:
+    config, design = room_with(
+        "mission.trajectory={times_s=[1.0,5.0],positions_m=[[0,0,-1],[1,0.5,-1]],interpolation='linear'}"
+    )
+    trajectory = build_trajectory(config.mission.trajectory, design)
+    assert trajectory.states[15, [0, 3, 6]] == pytest.approx([0.5, 0.25, -1.0], abs=5e-3)
+    assert trajectory.states[0, [0, 3, 6]] == pytest.approx([0.0, 0.0, -1.0], abs=5e-3)
+    assert len(trajectory.states) == 26 + config.smpc.horizon
+
+
+def test_given_velocities_are_flown() -> None:
+    config, design = room_with(
+        "mission.trajectory={times_s=[0,4],positions_m=[[0,0,-1],[1,0,-1]],velocities_mps=[[0,0,0],[0,0,0]]}"
+    )
+    trajectory = build_trajectory(config.mission.trajectory, design)
+    t = config.plant.dt_s * np.arange(21) / 4.0
+    assert trajectory.states[:21, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=5e-3)
+
+
+def test_too_fast_a_motion_is_refused_with_the_figures() -> None:
+    config, design = room_with("mission.trajectory={times_s=[0,1],positions_m=[[-2,0,-1],[2,0,-1]]}")
+    with pytest.raises(DesignError, match=r"[23]\.\d+ m/s beyond the upper limit of north velocity at 0\.") as raised:
+        build_mission(config, design)
+    assert raised.value.key == "mission.trajectory"
+
+
+def test_without_a_mission_the_target_is_held() -> None:
+    config, design = room_with()
+    mission = build_controller(config, design).mission
+    target, outlook = ask_for(mission, MissionState(start_ns=0), 0)
+    assert target.tolist() == design.target.tolist()
+    assert outlook.nominal
+
+
+def test_a_fence_becomes_a_row_of_the_state_set() -> None:
+    config, design = room_with('fence=[{state="down",side="lower",times_s=[0,9],values=[-2.5,-1.5]}]')
+    (fence,) = build_mission(config, design).fences
+    assert design.state_set.c[fence.row].tolist() == [0, 0, 0, 0, 0, 0, -1, 0, 0]
+    assert fence.values.tolist() == [2.5, 1.5]
+    assert fence.times_ns.tolist() == [0.0, 9e9]
+
+
+@pytest.mark.parametrize(
+    ("fence", "key", "words"),
+    [
+        ('state=2,side="upper",times_s=[0],values=[1]', "fence[0].side", "has no limit that could close in"),
+        ('state=1,side="upper",times_s=[0],values=[0.1]', "fence[0].values", "the terminal law needs"),
+    ],
+)
+def test_a_fence_that_the_design_cannot_take_is_refused(fence: str, key: str, words: str) -> None:
+    config, design = room_with(f"fence=[{{{fence}}}]")
+    with pytest.raises(DesignError, match=words) as raised:
+        build_mission(config, design)
+    assert raised.value.key == key
+
+
+MISSION = """
+[mission]
+waypoints = [[1.0, 1.0, -1.0],
+             [4.0, 0.0, 1.0]]
+hold_s = [1.0, -2.0, 3.0]
+
+[[fence]]
+state = "north"
+side = "upper"
+times_s = [5.0, 4.0]
+values = [2.0]
+
+[[fence]]
+state = "up"
+side = "lower"
+times_s = [0.0]
+values = [1.0]
+
+[[fence]]
+state = 0
+side = "lower"
+times_s = [-1.0]
+values = [-3.5]
+sides = 1
+"""
+
+
+def problems(text: str, *overrides: str) -> list[str]:
+    with pytest.raises(ConfigError) as raised:
+        parse(ROOM + text, "my.toml", overrides)
+    return str(raised.value).splitlines()
+
+
+def test_all_that_is_wrong_with_a_mission_is_told_at_once_with_its_line() -> None:
+    first = ROOM.count("\n") + 1
+    lines = dict(enumerate(MISSION.splitlines(), first))
+    told = problems(MISSION)
+    wanted_words = [
+        ("waypoints[1][0]", "north 4 m is outside the admissible box [-3, 3]", "             [4.0, 0.0, 1.0]]"),
+        ("waypoints[1][2]", "down 1 m is outside", "             [4.0, 0.0, 1.0]]"),
+        ("mission.hold_s", "has 3 entries, there are 2 waypoints", "hold_s = [1.0, -2.0, 3.0]"),
+        ("mission.hold_s", "negative", "hold_s = [1.0, -2.0, 3.0]"),
+        ("fence[0].times_s[1]", "4 s is not after 5 s", "times_s = [5.0, 4.0]"),
+        ("fence[0].values", "has 1 entries, there are 2 times", "values = [2.0]"),
+        ("fence[1].state", '"up" is no axis of the plant', 'state = "up"'),
+        ("fence[2].times_s", "begins at -1 s", "times_s = [-1.0]"),
+        ("fence[2].values", "-3.5 is beyond sets.state_lower[0] = -3", "values = [-3.5]"),
+        ("fence[2].sides", 'unknown key (nearest valid name "side")', "sides = 1"),
+    ]
+    for key, words, line in wanted_words:
+        (one,) = [text for text in told if key in text and words in text]
+        assert lines[int(one.split(":")[1])] == line
+    assert len(told) == len(wanted_words)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "key", "words"),
+    [
+        ("times_s=[0,1],positions_m=[[0,0,-1]]", "positions_m", "has 1 entries, there are 2 times"),
+        ("times_s=[0],positions_m=[[0,0,-1]]", "times_s", "at least 2"),
+        ("times_s=[0,1,1],positions_m=[[0,0,-1],[0,0,-1],[0,0,-1]]", "times_s[2]", "1 s is not after 1 s"),
+        ("times_s=[0,nan],positions_m=[[0,0,-1],[0,0,-1]]", "times_s[1]", "nan is not a finite number"),
+        ("times_s=[0,1],positions_m=[[0,0,-1],[0,9,-1]]", "positions_m[1][1]", "east 9 m is outside"),
+        ("times_s=[0,1],positions_m=[[0,0,-1],[0,0]]", "positions_m[1]", "length 3"),
+        (
+            "times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]],velocities_mps=[[0,0,0]]",
+            "velocities_mps",
+            "has 1 entries, there are 2 times",
+        ),
+        (
+            "times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]],velocities_mps=[[0,0,0],[0,0,0]],interpolation='linear'",
+            "velocities_mps",
+            "no meaning",
+        ),
+    ],
+)
+def test_a_wrong_trajectory_is_told(trajectory: str, key: str, words: str) -> None:
+    (told,) = problems("", f"mission.trajectory={{{trajectory}}}")
+    assert f"mission.trajectory.{key}: " in told
+    assert words in told
+
+
+def test_what_does_not_go_together_is_told() -> None:
+    motion = "mission.trajectory={times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]]}"
+    fence = 'fence=[{state=0,side="upper",times_s=[0],values=[1]}]'
+    (both,) = problems("", motion, "mission.waypoints=[[0,0,-1]]")
+    assert "mission.waypoints: there is a trajectory as well" in both
+    told = problems("", motion, fence, "solver.method=printed")
+    assert sorted(one.split("solver.method: ")[1].split(";")[0] for one in told) == [
+        '"printed" follows no trajectory',
+        '"printed" knows no limits that move',
+    ]
+    (no_table,) = problems("", "fence=[3]")
+    assert "fence[0]: expected a table, got 3" in no_table
+
+
+def with_file(tmp_path: Path, samples: str) -> Config:
+    (tmp_path / "way.csv").write_text(samples, encoding="utf-8")
+    text = ROOM + '\n[mission.trajectory]\nfile = "way.csv"\n'
+    return parse(text, str(tmp_path / "my.toml")).config
+
+
+@pytest.mark.parametrize("head", ["", "t,x,y,z\n", "\ufefftime,north,east,down\n\n"])
+def test_samples_come_from_a_file_beside_the_configuration(tmp_path: Path, head: str) -> None:
+    config = with_file(tmp_path, head + "0, 0, 0, -1\n2.5,1, 0.5 ,-1\n")
+    motion = config.mission.trajectory
+    assert (motion.times_s, motion.positions_m) == ((0.0, 2.5), ((0.0, 0.0, -1.0), (1.0, 0.5, -1.0)))
+    assert (motion.velocities_mps, motion.file) == ((), "")
+    # The configuration is complete in itself: a recording's header needs no other file.
+    assert parse(dump_config(config), "header").config == config
+
+
+def test_seven_columns_are_velocities_too(tmp_path: Path) -> None:
+    motion = with_file(tmp_path, "0,0,0,-1,0,0,0\n2,1,0,-1,0.1,0.2,0.3\n").mission.trajectory
+    assert motion.velocities_mps == ((0.0, 0.0, 0.0), (0.1, 0.2, 0.3))
+
+
+def test_bad_rows_of_a_file_are_told_with_file_and_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as raised:
+        with_file(tmp_path, "t,x,y,z\n0,0,0,-1\n1,zero,0,-1\n2,0,0\n3,0,0,nan\n4,0,0,-1,0,0,0\n")
+    told = str(raised.value).splitlines()
+    assert [one.split("way.csv:")[1].split(";")[0] for one in told] == [
+        '3: "zero" is not a finite number',
+        "4: has 3 columns",
+        '5: "nan" is not a finite number',
+        "6: has 7 columns, the first row has 4",
+    ]
+    assert all("my.toml:" in one and "mission.trajectory.file: " in one for one in told)
+
+
+def test_of_many_bad_rows_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as raised:
+        with_file(tmp_path, "0,0,0,-1\n" + "x,0,0,-1\n" * 12)
+    told = str(raised.value).splitlines()
+    assert len(told) == 6
+    assert "way.csv: 7 more" in told[-1]
+
+
+@pytest.mark.parametrize(("samples", "words"), [("", "has no rows"), ("t,x\n", "has no rows")])
+def test_an_empty_file_is_told(tmp_path: Path, samples: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        with_file(tmp_path, samples)
+
+
+def test_a_file_that_is_not_there_or_no_text_is_told(tmp_path: Path) -> None:
+    text = ROOM + '\n[mission.trajectory]\nfile = "way.csv"\n'
+    with pytest.raises(ConfigError, match="cannot be read"):
+        parse(text, str(tmp_path / "my.toml"))
+    (tmp_path / "way.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="is not UTF-8 text"):
+        parse(text, str(tmp_path / "my.toml"))
+    with pytest.raises(ConfigError, match="samples in the table as well"):
+        parse(text + "times_s = [0.0]\n", str(tmp_path / "my.toml"))
+
+
+def test_what_gave_way_is_told_in_words() -> None:
+    names = names_of([[2.0, 0.0], [0.0, -1.0], [1.0, 1.0]], 2, ("north",), (0,), (1,))
+    upper = GaveWay(constraint="state", stage=3, index=0, amount=0.24)
+    speed = GaveWay(constraint="terminal", stage=8, index=1, amount=0.05)
+    mixed = GaveWay(constraint="state", stage=1, index=2, amount=0.01)
+    rest = GaveWay(constraint="equilibrium", stage=8, index=1, amount=0.5)
+    assert tell(names, upper) == "upper limit of north position gave way by 0.12 m in stage 3"
+    assert tell(names, speed) == (
+        "lower limit of north velocity gave way by 0.05 m/s where the plan rests, from stage 8 on"
+    )
+    assert tell(names, mixed) == "row 2 of the state limits gave way by 0.01 in stage 1"
+    assert tell(names, rest) == "rest was missed by 0.5 m/s of north velocity in stage 8"
+    assert tell_all(names, (upper,)) == tell(names, upper)
+    assert tell_all(names, (speed, upper, rest)) == tell(names, upper) + "; so did 2 others"

@@ -1,0 +1,313 @@
+"""What is known ahead: a path, limits that move, and what gives way; against the same problem written in CVXPY."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from optimisation_cases import ORIGIN, PAPER_COST, PAPER_LOWER, PAPER_UPPER, ROOM_CORNER, START, paper, room
+from scipy.linalg import null_space, solve_discrete_lyapunov
+
+from uavctl.data import SolveStatus
+from uavctl.smpc.answer import Answer, Outlook, Path
+from uavctl.smpc.components import Component, decompose
+from uavctl.smpc.conic import ConicSolver
+from uavctl.smpc.design import Design
+
+Array = NDArray[np.float64]
+
+
+@cache
+def paper_case() -> tuple[Design, ConicSolver]:
+    design = paper()
+    return design, ConicSolver(design)
+
+
+@cache
+def room_case() -> tuple[Design, ConicSolver]:
+    design = room()
+    return design, ConicSolver(design)
+
+
+def constant_limits(design: Design) -> Array:
+    return np.tile(design.state_set.b, (design.horizon + 1, 1))
+
+
+def row_of(design: Design, state: int, side: int) -> int:
+    """Row that limits a state alone; `side` is 1 for the upper limit."""
+    c = design.state_set.c
+    (row,) = [i for i in range(len(c)) if side * c[i, state] > 0 and np.count_nonzero(c[i]) == 1]
+    return row
+
+
+def closing(design: Design, state: int, side: int, values: Array) -> Array:
+    limits = constant_limits(design)
+    row = row_of(design, state, side)
+    limits[:, row] = side * values * np.abs(design.state_set.c[row, state])
+    return limits
+
+
+def motion(design: Design, start: Array, inputs: Array) -> Array:
+    states = [start]
+    for u in inputs:
+        states.append(design.plant.a @ states[-1] + design.plant.b @ u)
+    return np.array(states)
+
+
+def half(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def stationary(part: Component, tau: int) -> Array:
+    """Covariance of z = (x, u, ..., the τ inputs on their way) under the terminal law u(k+τ) = K x(k)."""
+    n_x, n_u = part.b.shape
+    f = np.zeros((n_x + tau * n_u, n_x + tau * n_u))
+    f[:n_x, :n_x], f[:n_x, n_x : n_x + n_u] = part.a, part.b
+    f[n_x:-n_u, n_x + n_u :] = np.eye((tau - 1) * n_u)
+    f[-n_u:, :n_x] = part.k
+    g = np.vstack([part.e, np.zeros((tau * n_u, part.e.shape[1]))])
+    return np.asarray(solve_discrete_lyapunov(f, g @ part.w @ g.T))
+
+
+def oracle(design: Design, part: Component, x: Array, target: Array, limits: Array, path: Path) -> float:
+    """Optimal cost of one component: gains as matrices, covariances by recursion, Cov(z) under its stationary bound."""
+    H, tau = design.horizon, design.terminal.tau
+    N, (n_x, n_u), n_w = H - tau, part.b.shape, part.e.shape[1]
+    x, limits = x[part.states], limits[:, part.rows_x]
+    x_path, u_path = path.states[:, part.states], path.inputs[:, part.inputs]
+    place, wanted = cp.Variable(part.x_eq.shape[1]), part.coordinates @ target[part.states]
+    x_s, u_s = part.x_eq @ place, part.u_eq @ place
+    v, slack = cp.Variable((N, n_u)), cp.Variable((N, len(part.c_x) // 2), nonneg=True)
+    mean, effect = [x], [cp.Constant(np.zeros((n_x, H * n_w)))]
+    gains, cost = [], cp.Constant(0.0)
+    r_x, r_u, r_w = half(part.q_x), half(part.q_u), half(part.w)
+    for t in range(H):
+        known = [r for r in range(H) if r <= t - design.schedule.delays[t]]
+        gains.append(
+            cp.hstack([cp.Variable((n_u, n_w)) @ r_w if r in known else np.zeros((n_u, n_w)) for r in range(H)])
+        )
+        enter = np.zeros((n_x, H * n_w))
+        enter[:, t * n_w : (t + 1) * n_w] = part.e @ r_w
+        cost += cp.sum_squares(r_x @ effect[t]) + cp.sum_squares(r_u @ gains[t])
+        if t < N:
+            cost += cp.sum_squares(r_x @ (mean[t] - x_s - x_path[t])) + cp.sum_squares(r_u @ (v[t] - u_s - u_path[t]))
+            mean.append(part.a @ mean[t] + part.b @ v[t])
+        effect.append(part.a @ effect[t] + part.b @ gains[t] + enter)
+    stacked = cp.vstack(effect[N:])
+    z = cp.vstack([effect[N][:, : N * n_w], *(gain[:, : N * n_w] for gain in gains[N:])])
+    cost += cp.sum_squares(half(part.p_xi) @ stacked) + design.offset_weight * cp.norm1(place - wanted)
+    cost += design.slack_linear * cp.sum(slack) + design.slack_quadratic * cp.sum_squares(slack)
+    held = limits[N:].min(axis=0)
+    rows = [mean[N] == x_s, cp.bmat([[stationary(part, tau), z], [z.T, np.eye(N * n_w)]]) >> 0]
+    for i, c in enumerate(part.c_x):
+        rows += [
+            c @ mean[t] + design.kappa_x[t] * cp.norm(c @ effect[t]) <= limits[t, i] + slack[t, i // 2]
+            for t in range(1, N)
+        ]
+        if np.any(c @ part.x_eq):
+            rows.append(c @ x_s + design.kappa_x_terminal * np.sqrt(c @ part.sigma_x @ c) <= held[i])
+    for c, b in zip(part.c_u, part.b_u, strict=True):
+        rows += [c @ v[t] + design.kappa_u[t] * cp.norm(c @ gains[t]) <= b for t in range(N)]
+    problem = cp.Problem(cp.Minimize(cost), rows)
+    problem.solve(solver=cp.CLARABEL)
+    assert problem.status == cp.OPTIMAL
+    return float(problem.value)
+
+
+def no_path(design: Design) -> Path:
+    return Path(np.zeros((design.horizon, design.plant.n_x)), np.zeros((design.horizon, design.plant.n_u)))
+
+
+def wave(design: Design, seed: int) -> Path:
+    """A path that is no motion of the plant."""
+    rng = np.random.default_rng(seed)
+    size = np.tile([4.0, 1.0], 2)
+    return Path(size * rng.normal(size=(design.horizon, 4)).cumsum(axis=0) / 3, rng.normal(size=(design.horizon, 2)))
+
+
+def questions() -> list[tuple[str, Array, Array, Outlook]]:
+    design, _ = paper_case()
+    far = np.array([12.0, 0.0, -6.0, 0.0])
+    fence = closing(design, 0, 1, np.linspace(45.0, 20.0, 13))
+    both = closing(design, 2, -1, np.concatenate([np.full(4, -25.0), np.full(9, -21.0)]))
+    return [
+        ("a path", START, ORIGIN, Outlook(path=wave(design, 1))),
+        ("a path elsewhere", START, far, Outlook(path=wave(design, 2))),
+        ("a fence closing in", START, ORIGIN, Outlook(limits=fence)),
+        ("a fence beside the target", START, np.array([15.0, 0.0, -9.0, 0.0]), Outlook(limits=fence)),
+        ("a fence and a path", START, far, Outlook(limits=both, path=wave(design, 3))),
+    ]
+
+
+@pytest.mark.parametrize(("x", "target", "outlook"), [pytest.param(*q[1:], id=q[0]) for q in questions()])
+def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, outlook: Outlook) -> None:
+    design, solver = paper_case()
+    limits = constant_limits(design) if outlook.limits is None else outlook.limits
+    path = no_path(design) if outlook.path is None else outlook.path
+    wanted = sum(oracle(design, part, x, target, limits, path) for part in decompose(design))
+    answer = solver.solve(0, x, target, outlook)
+    assert answer.status is SolveStatus.OPTIMAL
+    assert answer.terminal_miss < 1e-6
+    assert answer.cost == pytest.approx(wanted, rel=1e-6)
+
+
+def bits(answer: Answer) -> tuple[bytes, ...]:
+    return tuple(np.asarray(value).tobytes() for value in (answer.inputs, answer.states, answer.cost, answer.backoff_x))
+
+
+def test_without_an_outlook_it_is_the_papers_answer_bit_for_bit() -> None:
+    design, solver = paper_case()
+    plain = solver.solve(0, START, ORIGIN)
+    assert plain.cost == pytest.approx(PAPER_COST, abs=0.01)
+    assert plain.gave_way == ()
+    for outlook in (Outlook(limits=constant_limits(design)), Outlook(path=no_path(design)), Outlook()):
+        assert bits(solver.solve(0, START, ORIGIN, outlook)) == bits(plain)
+
+
+def test_a_path_that_the_plant_can_fly_to_rest_is_flown_exactly() -> None:
+    design, solver = room_case()
+    rest, there = design.horizon - design.terminal.tau, design.target
+    # Inputs whose effects cancel by the stage from which on a plan rests.
+    reach = np.hstack([np.linalg.matrix_power(design.plant.a, rest - 1 - t) @ design.plant.b for t in range(rest)])
+    inputs = np.zeros((design.horizon, 3))
+    inputs[:rest] = 0.5 * null_space(reach)[:, :3].sum(axis=1).reshape(rest, 3)
+    states = motion(design, np.zeros(9), inputs)
+    answer = solver.solve(0, there, there, Outlook(path=Path(states[:-1], inputs)))
+    assert answer.states == pytest.approx(there + states, abs=1e-5)
+    assert np.abs(states[:rest, [0, 3, 6]]).max() > 0.005
+    # With nothing known ahead the same state is held.
+    assert solver.solve(0, there, there).states == pytest.approx(np.tile(there, (13, 1)), abs=1e-5)
+
+
+def check_told(design: Design, answer: Answer, limits: Array) -> None:
+    """What gave way is what the means and back-offs themselves say, row by row."""
+    rest = design.horizon - design.terminal.tau
+    means = motion(design, answer.states[0], answer.inputs)
+    assert answer.states == pytest.approx(means, rel=1e-9, abs=1e-9)
+    excess = means @ design.state_set.c.T + answer.backoff_x - limits
+    wanted = {
+        ("state", t, i): excess[t, i]
+        for t in range(1, design.horizon + 1)
+        for i in range(excess.shape[1])
+        if excess[t, i] > 1e-6
+    }
+    sigma = design.terminal.sigma_x
+    for i, c in enumerate(design.state_set.c):
+        over = c @ answer.reference + design.kappa_x_terminal * np.sqrt(c @ sigma @ c) - limits[rest:, i].min()
+        if over > 1e-6:
+            wanted["terminal", rest, i] = over
+    for i, miss in enumerate(np.abs(means[rest] - answer.reference)):
+        if miss > 1e-6:
+            wanted["equilibrium", rest, i] = miss
+    told = {(one.constraint, one.stage, one.index): one.amount for one in answer.gave_way}
+    assert set(told) == set(wanted)
+    for key, amount in told.items():
+        assert amount == pytest.approx(wanted[key], rel=1e-6, abs=1e-8)
+
+
+def kinds(answer: Answer) -> set[str]:
+    return {one.constraint for one in answer.gave_way}
+
+
+def test_a_fence_that_shuts_the_drone_out_is_answered_and_told() -> None:
+    design, solver = paper_case()
+    row = row_of(design, 0, 1)
+    limits = closing(design, 0, 1, np.full(13, 20.0))
+    x = np.array([22.0, 0.0, 0.0, 0.0])
+    answer = solver.solve(0, x, ORIGIN, Outlook(limits=limits))
+    assert answer.status is SolveStatus.OPTIMAL
+    assert {(one.constraint, one.index) for one in answer.gave_way} == {("state", row)}
+    assert {one.stage for one in answer.gave_way} == set(range(1, 1 + len(answer.gave_way)))
+    amounts = [one.amount for one in answer.gave_way]
+    assert amounts == sorted(amounts, reverse=True)
+    assert 1.5 < amounts[0] < 5.0
+    assert answer.slack == pytest.approx(sum(amounts), abs=1e-5)
+    check_told(design, answer, limits)
+
+
+def test_a_fence_around_nothing_is_answered_and_told() -> None:
+    """Upper limit below the lower one: no place to rest is left."""
+    design, solver = paper_case()
+    limits = np.minimum(closing(design, 0, 1, np.full(13, -10.0)), closing(design, 0, -1, np.full(13, 5.0)))
+    answer = solver.solve(0, START, ORIGIN, Outlook(limits=limits))
+    assert answer.status is SolveStatus.OPTIMAL
+    assert {"state", "terminal"} <= kinds(answer)
+    check_told(design, answer, limits)
+
+
+def test_a_target_out_of_reach_or_outside_gives_the_nearest_place_and_no_constraint_gives_way() -> None:
+    design, solver = paper_case()
+    for target in ([1000.0, 0.0, 0.0, 0.0], [49.9, 0.0, -24.9, 0.0]):
+        answer = solver.solve(0, START, np.array(target), Outlook())
+        assert answer.status is SolveStatus.OPTIMAL
+        assert answer.gave_way == ()
+        assert answer.offset > 1.0
+        check_told(design, answer, constant_limits(design))
+
+
+@pytest.mark.parametrize("x", [[60.0, 0.0, 0.0, 0.0], [0.0, 40.0, 0.0, -30.0], [500.0, 20.0, -400.0, 0.0]], ids=str)
+def test_a_state_outside_the_box_is_answered_and_told(x: list[float]) -> None:
+    design, solver = paper_case()
+    answer = solver.solve(0, np.array(x), ORIGIN)
+    assert answer.status is SolveStatus.OPTIMAL
+    assert "state" in kinds(answer)
+    check_told(design, answer, constant_limits(design))
+
+
+def test_speed_that_no_stop_fits_misses_rest_and_tells_it() -> None:
+    design, solver = paper_case()
+    x = np.array([0.0, 400.0, 0.0, 0.0])
+    answer = solver.solve(0, x, ORIGIN)
+    assert answer.status is SolveStatus.OPTIMAL
+    assert "equilibrium" in kinds(answer)
+    check_told(design, answer, constant_limits(design))
+
+
+def test_in_a_room_everything_that_gives_way_is_told() -> None:
+    design, solver = room_case()
+    limits = closing(design, 0, 1, np.linspace(-2.0, -2.8, 13))
+    for x in (ROOM_CORNER, ROOM_CORNER + np.array([0.0, 1.4, 0, 0, 0, 0, 0, 0, 0])):
+        answer = solver.solve(0, x, design.target, Outlook(limits=limits))
+        assert answer.status is SolveStatus.OPTIMAL
+        assert answer.gave_way
+        check_told(design, answer, limits)
+
+
+def test_a_kept_plan_tells_nothing() -> None:
+    _, solver = paper_case()
+    rng = np.random.default_rng(3)
+    seen = 0
+    for x in rng.uniform(PAPER_LOWER, PAPER_UPPER, size=(20, 4)) * 0.5:
+        answer = solver.solve(0, x, ORIGIN)
+        assert (answer.gave_way == ()) == (max(answer.slack, answer.terminal_miss) <= 1e-6)
+        seen += answer.gave_way == ()
+    assert seen > 5
+
+
+def extremes(
+    design: Design, lower: Array, upper: Array, count: int, farthest: float
+) -> Iterator[tuple[Array, Outlook]]:
+    """States from inside to `farthest` boxes away, half of them with limits that leave little or nothing."""
+    rng = np.random.default_rng(11)
+    size = np.where(np.isfinite(upper - lower), upper - lower, 4.0)
+    for _ in range(count):
+        reach = 10.0 ** rng.uniform(-1.0, np.log10(farthest))
+        x = size * reach * rng.uniform(-1.0, 1.0, size=len(size))
+        limits = constant_limits(design)
+        if rng.random() < 0.5:
+            limits *= rng.uniform(-1.0, 1.0, size=limits.shape)
+        yield x, Outlook(limits=limits)
+
+
+@pytest.mark.parametrize(("count", "farthest"), [(1000, 100.0), (100, 1e4)])
+def test_states_and_limits_far_beyond_sense_have_an_answer(count: int, farthest: float) -> None:
+    design, solver = paper_case()
+    cases = extremes(design, PAPER_LOWER, PAPER_UPPER, count, farthest)
+    endings = Counter(solver.solve(0, x, ORIGIN, outlook).status for x, outlook in cases)
+    assert endings == {SolveStatus.OPTIMAL: count}

@@ -1,0 +1,148 @@
+"""Composition: a configuration's mission becomes the flight's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+from uavctl.config.mission import FenceConfig, TrajectoryConfig
+from uavctl.config.types import Config
+from uavctl.errors import DesignError
+from uavctl.flight.mission import Fence, Mission, Trajectory, Waypoint, hold
+from uavctl.flight.trajectory import Motion, along, follow
+from uavctl.naming import Names, names_of
+from uavctl.smpc.components import decompose
+from uavctl.smpc.design import Design
+from uavctl.smpc.program import terminal_backoff_x
+
+Array = NDArray[np.float64]
+
+NANOSECONDS = 1e9
+_ROUNDING = 1e-9
+
+
+def build_mission(config: Config, design: Design) -> Mission:
+    """Waypoints or trajectory, and fences; without any, `target.position_m` is held.
+
+    Raises:
+        DesignError: The plant cannot rest or move there, or a fence limits what has no limit.
+    """
+    given, plant = config.mission, design.plant
+    mission = hold(
+        design.target,
+        plant.position_index,
+        design.state_set.b,
+        horizon=design.horizon,
+        dt_ns=round(plant.dt_s * NANOSECONDS),
+    )
+    if given.waypoints:
+        holds_s = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,) * len(given.waypoints)
+        waypoints = tuple(
+            Waypoint(plant.equilibrium(place), round(hold_s * NANOSECONDS))
+            for place, hold_s in zip(given.waypoints, holds_s, strict=True)
+        )
+        mission = replace(mission, waypoints=waypoints, accept_m=given.accept_m)
+    return replace(
+        mission,
+        trajectory=build_trajectory(given.trajectory, design) if given.trajectory.times_s else None,
+        fences=tuple(_fence(number, one, design) for number, one in enumerate(config.fence)),
+    )
+
+
+def build_names(design: Design) -> Names:
+    """What the design's rows and states are called."""
+    plant = design.plant
+    return names_of(design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index)
+
+
+def build_trajectory(given: TrajectoryConfig, design: Design) -> Trajectory:
+    """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
+
+    Raises:
+        DesignError: The motion leaves the state limits.
+    """
+    plant = design.plant
+    times_s, places = np.array(given.times_s), np.array(given.positions_m)
+    last_s = plant.dt_s * np.ceil(times_s[-1] / plant.dt_s - _ROUNDING)
+    grid_s = plant.dt_s * np.arange(round(last_s / plant.dt_s) + design.horizon + 1)
+    within_s = np.clip(grid_s, times_s[0], times_s[-1])
+    moves = ((grid_s >= times_s[0]) & (grid_s < times_s[-1]))[:, None]
+    if given.interpolation == "linear":
+        positions = np.column_stack([np.interp(within_s, times_s, column) for column in places.T])
+        motion = follow(plant, positions, None)
+    else:
+        spline = (
+            CubicHermiteSpline(times_s, places, np.array(given.velocities_mps))
+            if given.velocities_mps
+            else CubicSpline(times_s, places)
+        )
+        motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
+    _check_limits(motion, design)
+    return along(plant, motion, design.horizon, design.horizon - design.terminal.tau, *_room(design))
+
+
+def _room(design: Design) -> tuple[Array, Array]:
+    """Least and largest place to rest at of each axis [m]: the terminal set fits the constant limits there."""
+    index = design.plant.position_index
+    lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
+    for part in decompose(design):
+        room = part.b_x - terminal_backoff_x(design, part)
+        for c, side in zip(part.c_x, room, strict=True):
+            (used,) = np.nonzero(c)
+            state = int(part.states[used[0]])
+            if used.size == 1 and state in index:
+                axis, place = index.index(state), side / c[used[0]]
+                if c[used[0]] > 0:
+                    upper[axis] = min(upper[axis], place)
+                else:
+                    lower[axis] = max(lower[axis], place)
+    return lower, upper
+
+
+def _check_limits(motion: Motion, design: Design) -> None:
+    excess = motion.states @ design.state_set.c.T - design.state_set.b
+    step, row = np.unravel_index(int(excess.argmax()), excess.shape)
+    if excess[step, row] > _ROUNDING:
+        name, unit, size = build_names(design).rows[int(row)]
+        raise DesignError(
+            "mission.trajectory",
+            f"the motion is {excess[step, row] / size:.3g} {unit} beyond the {name}".rstrip()
+            + f" at {step * design.plant.dt_s:g} s",
+            "fly it slower or further inside, or widen [sets]",
+        )
+
+
+def _fence(number: int, given: FenceConfig, design: Design) -> Fence:
+    key, plant = f"fence[{number}]", design.plant
+    axis = given.state
+    state = plant.position_index[plant.axes.index(axis)] if isinstance(axis, str) else axis
+    sign = 1.0 if given.side == "upper" else -1.0
+    alone = np.flatnonzero((design.state_set.c != 0).sum(axis=1) == 1)
+    rows = [int(row) for row in alone if sign * design.state_set.c[row, state] > 0]
+    if not rows:
+        raise DesignError(
+            f"{key}.side",
+            f"the {given.side} side of state {state} has no limit that could close in",
+            f"give sets.state_{given.side}[{state}] a finite limit, further out",
+        )
+    row = rows[0]
+    right = abs(design.state_set.c[row, state]) * sign * np.array(given.values)
+    _check_room(key, row, float(right.min()), design)
+    return Fence(row=row, times_ns=np.array(given.times_s) * NANOSECONDS, values=right)
+
+
+def _check_room(key: str, row: int, least: float, design: Design) -> None:
+    """Where no place to rest changes a state, as with a velocity, its limit has to leave room for the terminal law."""
+    for part in decompose(design):
+        found = np.flatnonzero(part.rows_x == row)
+        if found.size and not np.any(part.c_x[found[0]] @ part.x_eq):
+            needed = float(terminal_backoff_x(design, part)[found[0]])
+            if least < needed:
+                raise DesignError(
+                    f"{key}.values",
+                    f"{least:.3g} is less than the {needed:.3g} that the terminal law needs at rest",
+                    "keep the limit further out",
+                )

@@ -1,0 +1,64 @@
+"""Where to fly to in the course of a flight: waypoints or a trajectory, and limits that close in."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from uavctl.config.section import Floats, Position, Section
+
+
+class TrajectoryConfig(Section, frozen=True, kw_only=True):
+    """A trajectory as samples; time counts from the first decision with a vehicle that takes setpoints."""
+
+    times_s: Annotated[Floats, Meta(description="times of the samples, increasing from 0 or later [s]")] = ()
+    positions_m: Annotated[tuple[Position, ...], Meta(description="positions at these times, local NED [m]")] = ()
+    velocities_mps: Annotated[
+        tuple[Position, ...],
+        Meta(description="velocities at these times, local NED [m/s]; without them they follow from the positions"),
+    ] = ()
+    file: Annotated[
+        str,
+        Meta(
+            description="CSV file with the samples instead, beside this file: columns t, x, y, z in s and m, and "
+            "vx, vy, vz in m/s or none of them; a header line is allowed"
+        ),
+    ] = ""
+    interpolation: Annotated[
+        Literal["cubic", "linear"],
+        Meta(description="between the samples: `cubic` spline, or `linear`"),
+    ] = "cubic"
+
+
+class MissionConfig(Section, frozen=True, kw_only=True):
+    """Waypoints, or a trajectory; with neither, `target.position_m` is held from start to end."""
+
+    waypoints: Annotated[
+        tuple[Position, ...], Meta(description="positions to fly to, one after the other, local NED [m]")
+    ] = ()
+    hold_s: Annotated[
+        float | Floats,
+        Meta(description="time at each waypoint, from the arrival on: one number, or one for each of them [s]"),
+    ] = 0.0
+    accept_m: Annotated[
+        float, Meta(gt=0, description="a waypoint is reached when the estimate is this near to it [m]")
+    ] = 0.3
+    trajectory: TrajectoryConfig = TrajectoryConfig()
+
+
+class FenceConfig(Section, frozen=True, kw_only=True):
+    """A limit of a state that changes in time, inside the constant one of `[sets]`."""
+
+    state: Annotated[
+        str | int, Meta(description="axis whose position is limited (`north`, `east`, `down`), or index of a state")
+    ]
+    side: Annotated[Literal["lower", "upper"], Meta(description="which limit")]
+    times_s: Annotated[Floats, Meta(min_length=1, description="times, increasing; counted as those of the mission [s]")]
+    values: Annotated[
+        Floats,
+        Meta(
+            min_length=1,
+            description="limit at these times, a line in between, constant before and after [m, m/s, m/s²]",
+        ),
+    ]

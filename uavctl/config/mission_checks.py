@@ -1,0 +1,134 @@
+"""Checks of a mission and its fences: lengths, times, and whether the places are inside the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+from uavctl.config.mission import FenceConfig, MissionConfig, TrajectoryConfig
+from uavctl.config.problem import Problem
+from uavctl.config.section import Floats, Position
+from uavctl.config.types import PlantConfig, SetsConfig, SolverConfig
+
+_AXES = ("north", "east", "down")
+
+
+def position_index(plant: PlantConfig) -> tuple[int, ...]:
+    """State index of each axis' position."""
+    return plant.position_index if plant.model == "matrices" else tuple(range(0, 3 * len(plant.axes), 3))
+
+
+def outside(plant: PlantConfig, sets: SetsConfig, place: Position, key: str, what: str) -> Iterator[Problem]:
+    """Coordinates of a place that are outside the limits of the position."""
+    for axis, i in zip(plant.axes, position_index(plant), strict=False):
+        if not 0 <= i < min(len(sets.state_lower), len(sets.state_upper)):
+            continue  # a problem of its own
+        low, high = sets.state_lower[i], sets.state_upper[i]
+        value = place[_AXES.index(axis)]
+        if not low <= value <= high:
+            yield Problem(
+                f"{key}[{_AXES.index(axis)}]",
+                f"{axis} {value:g} m is outside the admissible box [{low:g}, {high:g}]",
+                f"move the {what} inside, or widen sets.state_lower and sets.state_upper",
+            )
+
+
+def mission(plant: PlantConfig, sets: SetsConfig, given: MissionConfig) -> Iterator[Problem]:
+    """Problems of `[mission]`."""
+    motion = given.trajectory
+    moves = bool(motion.times_s or motion.positions_m or motion.velocities_mps)
+    if given.waypoints and moves:
+        yield Problem("mission.waypoints", "there is a trajectory as well", "give waypoints or a trajectory")
+    if isinstance(given.hold_s, tuple) and len(given.hold_s) != len(given.waypoints):
+        yield Problem(
+            "mission.hold_s",
+            f"has {len(given.hold_s)} entries, there are {len(given.waypoints)} waypoints",
+            "give one number, or one for each waypoint",
+        )
+    holds = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,)
+    if min(holds, default=0.0) < 0:
+        yield Problem("mission.hold_s", "a time is negative", "give numbers >= 0")
+    for i, place in enumerate(given.waypoints):
+        yield from outside(plant, sets, place, f"mission.waypoints[{i}]", "waypoint")
+    if moves:
+        yield from _trajectory(plant, sets, motion)
+
+
+def _trajectory(plant: PlantConfig, sets: SetsConfig, motion: TrajectoryConfig) -> Iterator[Problem]:
+    key, count = "mission.trajectory", len(motion.times_s)
+    if count < 2:
+        yield Problem(f"{key}.times_s", f"has {count} entries, a motion has at least 2", "add samples")
+    yield from _increasing(f"{key}.times_s", motion.times_s)
+    for name in ("positions_m", "velocities_mps"):
+        entries = len(getattr(motion, name))
+        if entries != count and (entries or name == "positions_m"):
+            yield Problem(f"{key}.{name}", f"has {entries} entries, there are {count} times", "give one for each time")
+    if motion.velocities_mps and motion.interpolation == "linear":
+        yield Problem(
+            f"{key}.velocities_mps",
+            'has no meaning with interpolation "linear"',
+            'remove it, or use interpolation "cubic"',
+        )
+    for i, place in enumerate(motion.positions_m):
+        yield from outside(plant, sets, place, f"{key}.positions_m[{i}]", "trajectory")
+
+
+def fences(plant: PlantConfig, sets: SetsConfig, given: Sequence[FenceConfig]) -> Iterator[Problem]:
+    """Problems of `[[fence]]`."""
+    for number, fence in enumerate(given):
+        key = f"fence[{number}]"
+        yield from _increasing(f"{key}.times_s", fence.times_s)
+        if len(fence.values) != len(fence.times_s):
+            yield Problem(
+                f"{key}.values",
+                f"has {len(fence.values)} entries, there are {len(fence.times_s)} times",
+                "give one for each time",
+            )
+        state = fence.state
+        if isinstance(state, str):
+            if state not in plant.axes:
+                yield Problem(
+                    f"{key}.state",
+                    f'"{state}" is no axis of the plant',
+                    f"give one of {', '.join(plant.axes)}, or the index of a state",
+                )
+                continue
+            state = position_index(plant)[plant.axes.index(state)] if position_index(plant) else 0
+        yield from _tightens(key, sets, fence, state)
+
+
+def _tightens(key: str, sets: SetsConfig, fence: FenceConfig, state: int) -> Iterator[Problem]:
+    """A fence stands inside the constant limits."""
+    if not 0 <= state < min(len(sets.state_lower), len(sets.state_upper)):
+        count = len(sets.state_lower)
+        yield Problem(f"{key}.state", f"there is no state {state}", f"give 0 to {count - 1}")
+        return
+    low, high = sets.state_lower[state], sets.state_upper[state]
+    wide = [value for value in fence.values if (value > high if fence.side == "upper" else value < low)]
+    if wide:
+        side = high if fence.side == "upper" else low
+        yield Problem(
+            f"{key}.values",
+            f"{wide[0]:g} is beyond sets.state_{fence.side}[{state}] = {side:g}",
+            "a fence may only close in; widen the constant limit",
+        )
+
+
+def _increasing(key: str, times_s: Floats) -> Iterator[Problem]:
+    if times_s and times_s[0] < 0:
+        yield Problem(key, f"begins at {times_s[0]:g} s, before the mission does", "give times >= 0")
+    for i, (now, then) in enumerate(pairwise(times_s)):
+        if not now < then:
+            yield Problem(f"{key}[{i + 1}]", f"{then:g} s is not after {now:g} s", "give increasing times")
+
+
+def solver(given: SolverConfig, told: MissionConfig) -> Iterator[Problem]:
+    """The printed problem knows no trajectory."""
+    if given.method == "printed" and told.trajectory.times_s:
+        yield Problem("solver.method", '"printed" follows no trajectory', 'use "exact"')
+
+
+def solver_fences(given: SolverConfig, told: Sequence[FenceConfig]) -> Iterator[Problem]:
+    """Nor does it know moving limits."""
+    if given.method == "printed" and told:
+        yield Problem("solver.method", '"printed" knows no limits that move', 'use "exact"')

@@ -1,0 +1,175 @@
+"""Where to fly to, step by step: waypoints, a trajectory, limits that change in time. Pure.
+
+Time counts from the first decision with a vehicle that takes setpoints, and runs on from there. That decision is at a
+Δt boundary, and so is every other: a trajectory is met at its own samples only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import Vector
+from uavctl.smpc.answer import Outlook, Path
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoint:
+    """A place to fly to and to stay at.
+
+    Attributes:
+        target: Equilibrium there (n_x,).
+        hold_ns: Time to stay, from the arrival on [ns]; the last one is held to the end.
+    """
+
+    target: Array
+    hold_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion of the plant and the plans along it, one row a Δt; after the last row it rests there.
+
+    Attributes:
+        states: The motion (n, n_x).
+        anchors: (n, n_x): the equilibrium that a plan from this row on ends in.
+        path_states: (n, H, n_x): the states of that plan, as deviations from its anchor.
+        path_inputs: (n, H, n_u): its inputs, as deviations from what holds the plant at the anchor.
+    """
+
+    states: Array
+    anchors: Array
+    path_states: Array
+    path_inputs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fence:
+    """A moving limit: the right side of a row of the state set, a line between samples, constant outside of them.
+
+    Attributes:
+        row: Index of the row.
+        times_ns: (n,), increasing.
+        values: (n,), right sides at these times.
+    """
+
+    row: int
+    times_ns: Array
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """What is asked for in a flight; constant.
+
+    Attributes:
+        waypoints: At least one; a trajectory takes their place.
+        accept_m: A waypoint is reached when the estimate is this near [m].
+        position_index: States that are positions.
+        limits: Right sides of the state set's rows (m_x,).
+        horizon: H [steps].
+        dt_ns: Δt [ns].
+        trajectory: The motion to follow; None to fly to the waypoints.
+        fences: Moving limits.
+    """
+
+    waypoints: tuple[Waypoint, ...]
+    accept_m: float
+    position_index: tuple[int, ...]
+    limits: Array
+    horizon: int
+    dt_ns: int
+    trajectory: Trajectory | None = None
+    fences: tuple[Fence, ...] = ()
+
+
+@dataclass(frozen=True)
+class MissionState:
+    """How far a mission has come.
+
+    Attributes:
+        start_ns: Its time zero [ns].
+        waypoint: Number of the waypoint flown to, from 0.
+        arrived_ns: When that one was reached [ns]; None if it has not been.
+    """
+
+    start_ns: int
+    waypoint: int = 0
+    arrived_ns: int | None = None
+
+
+def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:
+    """The mission at a boundary; it begins where there was none.
+
+    A waypoint's time runs from the arrival on, also when a gust carries the vehicle out of the circle again.
+
+    Args:
+        mission: What is asked for.
+        state: State at the boundary before.
+        estimate: Estimated state at the boundary (n_x,).
+        at_ns: The boundary [ns].
+    """
+    state = state or MissionState(start_ns=at_ns)
+    if mission.trajectory is not None:
+        return state
+    waypoint = mission.waypoints[state.waypoint]
+    index = list(mission.position_index)
+    if state.arrived_ns is None:
+        if not float(np.linalg.norm(np.array(estimate)[index] - waypoint.target[index])) <= mission.accept_m:
+            return state
+        state = replace(state, arrived_ns=at_ns)
+    over = state.arrived_ns is not None and at_ns - state.arrived_ns >= waypoint.hold_ns
+    if over and state.waypoint + 1 < len(mission.waypoints):
+        return replace(state, waypoint=state.waypoint + 1, arrived_ns=None)
+    return state
+
+
+def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
+    """State (n_x,) that the mission wants the vehicle to be in at a boundary."""
+    if mission.trajectory is None:
+        return tuple(mission.waypoints[state.waypoint].target.tolist())
+    return tuple(mission.trajectory.states[_row(mission, state, at_ns, mission.trajectory)].tolist())
+
+
+def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Outlook]:
+    """Question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
+    limits = _limits(mission, at_ns - state.start_ns)
+    motion = mission.trajectory
+    if motion is None:
+        return mission.waypoints[state.waypoint].target, Outlook(limits=limits)
+    row = _row(mission, state, at_ns, motion)
+    path = Path(states=motion.path_states[row], inputs=motion.path_inputs[row])
+    return motion.anchors[row], Outlook(limits=limits, path=path)
+
+
+def _row(mission: Mission, state: MissionState, at_ns: int, motion: Trajectory) -> int:
+    """Row of the trajectory at a boundary."""
+    return min((at_ns - state.start_ns) // mission.dt_ns, len(motion.states) - 1)
+
+
+def _limits(mission: Mission, since_ns: int) -> Array | None:
+    """Right sides of the state rows in stages 0 … H (H+1, m_x); None where no fence is closer than they are."""
+    if not mission.fences:
+        return None
+    times_ns = since_ns + mission.dt_ns * np.arange(mission.horizon + 1, dtype=np.float64)
+    limits = np.tile(mission.limits, (mission.horizon + 1, 1))
+    for fence in mission.fences:
+        moving = np.interp(times_ns, fence.times_ns, fence.values)
+        limits[:, fence.row] = np.minimum(limits[:, fence.row], moving)
+    return None if bool((limits == mission.limits).all()) else limits
+
+
+def hold(target: Array, position_index: tuple[int, ...], limits: Array, horizon: int, dt_ns: int) -> Mission:
+    """The mission to stay at one equilibrium (n_x,)."""
+    return Mission(
+        waypoints=(Waypoint(target=target, hold_ns=0),),
+        accept_m=np.inf,
+        position_index=position_index,
+        limits=limits,
+        horizon=horizon,
+        dt_ns=dt_ns,
+    )

@@ -1,0 +1,87 @@
+"""What limits and states are called when people are told of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from uavctl.data import GaveWay
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names and units.
+
+    Attributes:
+        states: (name, unit) of each state; the unit is empty where it is not known.
+        rows: (name, unit, size) of each row of the state set; a row's excess divided by its size is in the unit.
+    """
+
+    states: tuple[tuple[str, str], ...]
+    rows: tuple[tuple[str, str, float], ...]
+
+
+def names_of(
+    c_x: Iterable[Sequence[float]],
+    n_x: int,
+    axes: Sequence[str],
+    position_index: Sequence[int],
+    velocity_index: Sequence[int],
+) -> Names:
+    """Names of a plant's states, and of the rows of {x | c_x x <= b_x}.
+
+    Args:
+        c_x: Rows (m_x, n_x).
+        n_x: Number of states.
+        axes: Axes of local NED that the plant moves in.
+        position_index: State index of each axis' position.
+        velocity_index: State index of each axis' velocity.
+    """
+    states = [(f"state {index}", "") for index in range(n_x)]
+    for axis, position, velocity in zip(axes, position_index, velocity_index, strict=True):
+        states[position], states[velocity] = (f"{axis} position", "m"), (f"{axis} velocity", "m/s")
+    return Names(tuple(states), tuple(_row(number, row, states) for number, row in enumerate(c_x)))
+
+
+def _row(number: int, row: Sequence[float], states: Sequence[tuple[str, str]]) -> tuple[str, str, float]:
+    used = [index for index, value in enumerate(row) if value]
+    if len(used) != 1:
+        return f"row {number} of the state limits", "", 1.0
+    value, (name, unit) = float(row[used[0]]), states[used[0]]
+    return f"{'upper' if value > 0 else 'lower'} limit of {name}", unit, abs(value)
+
+
+def tell(names: Names, one: GaveWay) -> str:
+    """One constraint that gave way, in words."""
+    if one.constraint == "equilibrium":
+        name, unit = names.states[one.index]
+        return f"rest was missed by {_amount(one.amount, unit)} of {name} in stage {one.stage}"
+    name, unit, _ = names.rows[one.index]
+    where = f"in stage {one.stage}" if one.constraint == "state" else f"where the plan rests, from stage {one.stage} on"
+    return f"{name} gave way by {_amount(excess(names, one), unit)} {where}"
+
+
+def worst(names: Names, given: Iterable[GaveWay]) -> GaveWay:
+    """The one that gave way the most, each in its own unit; a limit before a missed rest, the first of equals."""
+    return max(given, key=lambda one: severity(names, one))
+
+
+def severity(names: Names, one: GaveWay) -> tuple[bool, float]:
+    """Order of constraints that gave way: limits above the rest at the end of a plan, then by the amount."""
+    return one.constraint != "equilibrium", excess(names, one)
+
+
+def excess(names: Names, one: GaveWay) -> float:
+    """By how much a constraint gave way, in the unit of its state."""
+    return one.amount / (1.0 if one.constraint == "equilibrium" else names.rows[one.index][2])
+
+
+def tell_all(names: Names, given: Sequence[GaveWay]) -> str:
+    """The worst of the constraints that a plan did not keep, and how many others there are."""
+    others = len(given) - 1
+    more = "" if not others else f"; so did {others} other{'' if others == 1 else 's'}"
+    return tell(names, worst(names, given)) + more
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.2g} {unit}".rstrip()
