@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
+from numpy.typing import NDArray
 
-from uavctl.config.types import Config, LinkConfig
+from uavctl.build_late import build_delayed_link, late_steps
+from uavctl.build_link import link_probability
+from uavctl.build_mission import build_mission, build_names
+from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
+from uavctl.flight.link_estimate import LinkEstimateParameters
+from uavctl.library_store import library_for
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
 from uavctl.smpc.feasibility import check_schedule, optimal_cost
+from uavctl.smpc.innovation import innovations
+from uavctl.smpc.late import with_late
+from uavctl.smpc.library import Library
+from uavctl.smpc.library_solver import LibrarySolver
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.printed import PrintedSolver
 from uavctl.smpc.sets import Polytope
@@ -48,52 +56,16 @@ def build_plant(config: Config) -> Plant:
     )
 
 
-def link_probability(config: Config) -> float:
-    """p(k): probability that at least one position captured within a Δt is there at its end.
-
-    Positions are lost one by one with the mean loss of the link. Of a Δt's positions, those count that even the
-    longest delay lets arrive in time; without `source.rate_hz` it is one, which is what the paper's link sends.
-
-    Raises:
-        DesignError: No position can be counted on: the delay is Δt or more, or the rate too low.
-    """
-    link, rate_hz, dt_s = config.link, config.source.rate_hz, config.plant.dt_s
-    longest_s = link.delay_s + link.jitter_s
-    if longest_s >= dt_s:
-        raise DesignError(
-            "link.delay_s",
-            f"a position is on its way for up to {link.delay_s:g} + {link.jitter_s:g} s (delay and jitter), and is of "
-            f"use within the step of {dt_s:g} s only",
-            f"keep link.delay_s + link.jitter_s below plant.dt_s = {dt_s:g}, or take a longer step",
-        )
-    in_time = math.floor(rate_hz * (dt_s - longest_s) + 1e-9) if rate_hz else 1
-    if in_time < 1:
-        raise DesignError(
-            "source.rate_hz",
-            f"{rate_hz:g} positions a second are none that is sure to be captured in the {dt_s - longest_s:g} s of a "
-            "step that leave time for the delay",
-            f"give at least {1.0 / (dt_s - longest_s):.4g}, or 0 to count on one position a step",
-        )
-    return 1.0 - mean_loss(link) ** in_time
-
-
-def mean_loss(link: LinkConfig) -> float:
-    """Share of packets lost in the long run; of Gilbert-Elliott's chain, in its stationary distribution."""
-    if link.model == "bernoulli":
-        return link.loss
-    bad = link.burst_enter / (link.burst_enter + link.burst_leave)  # burst_leave is positive by its type
-    return (1.0 - bad) * link.loss + bad * link.burst_loss
-
-
 def build_spec(config: Config) -> DesignSpec:
     """What the configuration asks of a design.
 
     Raises:
-        DesignError: See `build_plant` and `link_probability`.
+        DesignError: See `build_plant` and `build_delayed_link`.
     """
     smpc, schedule, sets = config.smpc, config.schedule, config.sets
+    plant, estimate_cov = _seen(config, build_plant(config))
     return DesignSpec(
-        plant=build_plant(config),
+        plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
         input_set=Polytope.from_box(sets.input_lower, sets.input_upper),
         q_x=np.diag(config.cost.state),
@@ -104,7 +76,7 @@ def build_spec(config: Config) -> DesignSpec:
         delta_u=smpc.delta_u,
         delta_tau=smpc.delta_tau,
         k_tau=np.array(smpc.k_tau, dtype=np.float64),
-        link_p=np.full(max(smpc.horizon, smpc.tau), link_probability(config)),
+        link=build_delayed_link(config),
         target_m=config.target.position_m,
         rule=schedule.rule,
         delays=schedule.delays,
@@ -116,31 +88,63 @@ def build_spec(config: Config) -> DesignSpec:
         offset_weight=smpc.offset_weight,
         terminal_weight=smpc.terminal_weight,
         max_iterations=config.solver.max_iterations,
+        joint=schedule.joint,
+        estimate_cov=estimate_cov,
     )
 
 
+def _seen(config: Config, plant: Plant) -> tuple[Plant, NDArray[np.float64] | None]:
+    """The plant that is planned with, and the covariance of what the estimator does not see of it."""
+    if config.risk.estimate == "exact":
+        return plant, None
+    link, dt_s = config.link, config.plant.dt_s
+    # A step's position may be from its very begin, unless others follow it.
+    since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
+    age_s = min(dt_s, since_s + link.delay_s + link.jitter_s)
+    # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
+    form = innovations(plant, config.estimator.position_std_m, age_s, config.smpc.tau + 1)
+    return form.plant, form.estimate_cov
+
+
 def build_design(config: Config) -> Design:
-    """The design, checked against Assumption 4 and for a terminal condition that its schedule can meet.
+    """The design, and those for late positions, checked against Assumption 4 and for a schedule that is fast enough.
 
     Raises:
         DesignError: There is none, naming key, reason and what to do.
     """
-    design = make_design(build_spec(config), optimal_cost)
+    spec = build_spec(config)
+    design = make_design(spec, optimal_cost)
     check_schedule(design)
-    return design
+    return with_late(design, spec, late_steps(config))
 
 
-def build_solver(design: Design, config: Config) -> Solver:
+def build_solver(design: Design, config: Config, library: Library | None = None) -> Solver:
     """The solver of `solver.method`.
 
+    Args:
+        design: The design.
+        config: The configuration that it is made from.
+        library: Its policy library, for method `library`; from the cache, or made, if it is not given.
+
     Raises:
-        DesignError: The design does not fit the solver.
+        DesignError: The design does not fit the solver, or the library does not fit the design.
     """
-    return PrintedSolver(design) if config.solver.method == "printed" else ConicSolver(design)
+    if config.solver.method == "library":
+        found = library_for(design).library if library is None else library
+        return LibrarySolver(design, found, exact=config.solver.exact)
+    if config.solver.method == "exact":
+        return ConicSolver(design)
+    if design.late or design.estimate_cov.any():
+        raise DesignError(
+            "solver.method",
+            "the printed problem knows neither late positions nor an estimate with an error",
+            "take `library` or `exact`; or risk.estimate = `exact`, schedule.late = 0 and delays below the step",
+        )
+    return PrintedSolver(design)
 
 
-def build_controller(config: Config, design: Design | None = None) -> Controller:
-    """Everything constant that a control tick needs; the design is made if it is not given.
+def build_controller(config: Config, design: Design | None = None, library: Library | None = None) -> Controller:
+    """Everything constant that a control tick needs; design and policy library are made if they are not given.
 
     Raises:
         DesignError: There is no design.
@@ -148,11 +152,14 @@ def build_controller(config: Config, design: Design | None = None) -> Controller
     design = build_design(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
     return Controller(
-        plant=design.plant,
+        plant=build_plant(config),  # the design's own may be the one that the estimator makes of it
         design_id=design.design_id,
         horizon=design.horizon,
-        solver=build_solver(design, config),
-        target=design.target,
+        solver=build_solver(design, config, library),
+        mission=build_mission(config, design),
+        names=build_names(design),
+        link=LinkEstimateParameters(promised=link_probability(config)),
+        late_steps=len(design.late),
         estimator=EstimatorParameters(
             position_std_m=estimator.position_std_m,
             velocity_std_mps=estimator.velocity_std_mps,

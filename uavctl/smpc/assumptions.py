@@ -43,6 +43,7 @@ def check_assumptions(
     state_set: Polytope,
     input_set: Polytope,
     target: Array,
+    estimate_cov: Array,
     kappa_x: float,
     kappa_u: float,
     age_within_tau: float,
@@ -56,6 +57,7 @@ def check_assumptions(
         state_set: X.
         input_set: U.
         target: Equilibrium x_s (n_x,) around which the terminal set lies.
+        estimate_cov: Covariance of the state estimate's error (n_x, n_x), which comes on top of Σ_x.
         kappa_x: κ of the terminal states.
         kappa_u: κ of the terminal inputs.
         age_within_tau: The least P(a(k) <= τ).
@@ -77,7 +79,7 @@ def check_assumptions(
             1.0,
             f"spectral radius of the delayed loop (residual of the invariant covariance {residual:.1g})",
         ),
-        _fits("4.3", state_set, target, terminal.sigma_x, kappa_x, "state"),
+        _fits("4.3", state_set, target, terminal.sigma_x + estimate_cov, kappa_x, "state"),
         _fits("4.4", input_set, rest, k_sigma, kappa_u, "input"),
         AssumptionCheck("4.5", drop <= _ROUNDING, drop, _ROUNDING, "largest eigenvalue of A'PA - P + Q, relative to P"),
     )

@@ -36,6 +36,7 @@ class DesignSpec:
         link: Model of the link.
         target_m: Where the terminal set has to fit the limits, local NED [m].
         joint: Likelihoods by the exact probability that all stages' feedback is usable, not by the product (6).
+        estimate_cov: Covariance of the state estimate's error (n_x, n_x); None: the state is known exactly.
     """
 
     plant: Plant
@@ -62,6 +63,7 @@ class DesignSpec:
     terminal_weight: float
     max_iterations: int
     joint: bool = False
+    estimate_cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +135,9 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
     demand = Demand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint)
     terminal = make_terminal(spec.plant, spec.tau, spec.k_tau, spec.q_x, spec.q_u)
     if spec.rule == "fixed":
-        return _assemble(spec, fixed(demand, spec.delays), terminal)
+        return assembled(spec, fixed(demand, spec.delays), terminal)
     if spec.rule == "greedy":
-        return _assemble(spec, greedy(demand, spec.gamma_max), terminal)
+        return assembled(spec, greedy(demand, spec.gamma_max), terminal)
     return _search(spec, demand, terminal, cost_of)
 
 
@@ -172,7 +174,7 @@ def _search(
     refused, why = 0, ""
     for schedule in candidates:
         try:
-            design = _assemble(spec, schedule, terminal)
+            design = assembled(spec, schedule, terminal)
         except DesignError as error:  # this schedule's likelihoods ask for more than the limits leave
             refused, why = refused + 1, f": {error.reason}"
             continue
@@ -191,7 +193,12 @@ def _search(
     return best[1]
 
 
-def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Design:
+def assembled(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: int = 0) -> Design:
+    """The design with a given schedule and terminal law, for positions that are `past` steps old.
+
+    Raises:
+        DesignError: An item of Assumption 4 fails.
+    """
     n_x, n_u = spec.plant.n_x, spec.plant.n_u
     m_x, m_u = spec.state_set.b.size, spec.input_set.b.size
 
@@ -203,6 +210,7 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
     kappa_x_terminal = max(factor(spec.delta_x, n_x, m_x), float(kappa_x[-1]))
     kappa_u_terminal = max(factor(spec.delta_u, n_u, m_u), float(kappa_u[-spec.tau :].max()))
     target = spec.plant.equilibrium(spec.target_m)
+    estimate_cov = np.zeros((n_x, n_x)) if spec.estimate_cov is None else spec.estimate_cov
     mu = spec.link.age(max(spec.horizon, spec.tau))
     checks = check_assumptions(
         plant=spec.plant,
@@ -210,6 +218,7 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
         state_set=spec.state_set,
         input_set=spec.input_set,
         target=target,
+        estimate_cov=estimate_cov,
         kappa_x=kappa_x_terminal,
         kappa_u=kappa_u_terminal,
         # (17) is asked of all times: those of the horizon, and the long run.
@@ -235,8 +244,8 @@ def _assemble(spec: DesignSpec, schedule: Schedule, terminal: Terminal) -> Desig
         offset_weight=spec.offset_weight,
         terminal_weight=spec.terminal_weight,
         max_iterations=spec.max_iterations,
-        estimate_cov=np.zeros((n_x, n_x)),
-        past=0,
+        estimate_cov=estimate_cov,
+        past=past,
         late=(),
         assumptions=checks,
         design_id="",
@@ -289,6 +298,18 @@ def design_record(design: Design) -> dict[str, object]:
         "q_u": design.q_u.tolist(),
         "k_tau": terminal.k.tolist(),
         "sigma_x": terminal.sigma_x.tolist(),
+        "estimate_cov": design.estimate_cov.tolist(),
+        "late": [
+            {
+                "delays": list(late.schedule.delays),
+                "alpha": late.schedule.alpha.tolist(),
+                "gamma_x": late.schedule.gamma_x.tolist(),
+                "gamma_u": late.schedule.gamma_u.tolist(),
+                "kappa_x": late.kappa_x.tolist(),
+                "kappa_u": late.kappa_u.tolist(),
+            }
+            for late in design.late
+        ],
         "slack_linear": design.slack_linear,
         "slack_quadratic": design.slack_quadratic,
         "offset_weight": design.offset_weight,
