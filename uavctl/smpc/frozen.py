@@ -82,11 +82,11 @@ class Frozen:
         curve = np.concatenate([problem.curve for problem in problems])
         links = np.concatenate([s.start + problem.links for s, problem in zip(self.rows, problems, strict=True)])
         slope = np.zeros(soft.size)
-        slope[links] = np.concatenate([mixture.slope[0] for mixture in mixtures])
+        slope[links] = np.concatenate([mixture.first.slope for mixture in mixtures])
         self._pins = np.flatnonzero(slope > 0.0)
         self._backoff = np.concatenate([problem.backoff for problem in problems])
-        self._backoff[links] = np.concatenate([mixture.backoff[0] for mixture in mixtures])
-        scale = np.repeat([mixture.cost[0] for mixture in mixtures], [len(problem.rows) for problem in problems])
+        self._backoff[links] = np.concatenate([mixture.first.backoff for mixture in mixtures])
+        scale = np.repeat([mixture.first.cost for mixture in mixtures], [len(problem.rows) for problem in problems])
         # A multiplier at a state row's price means slack, and slack is for the mixture to tell.
         state = np.concatenate([[row.kind is Kind.STATE for row in problem.rows] for problem in problems])
         allowed = np.where(soft, price * np.where(state, 1.0 - 1e-9, 1.0 + 1e-9), np.inf)
@@ -152,8 +152,8 @@ class _Certifier:
         self._a = block_diag(*(problem.a for problem in problems))
         self._h = 0.5 * block_diag(*(problem.h for problem in problems))
         self._h_inverse = 0.5 * block_diag(*(np.linalg.inv(problem.h) for problem in problems))
-        self._covariance = float(sum(mixture.cost[0] for mixture in mixtures))
-        self._level = float(sum(mixture.level[0] - mixture.slope[0] @ _room(mixture) for mixture in mixtures))
+        self._covariance = float(sum(mixture.first.cost for mixture in mixtures))
+        self._level = float(sum(mixture.first.level - mixture.first.slope @ _room(mixture) for mixture in mixtures))
         kinds = np.concatenate([[row.kind for row in problem.rows] for problem in problems])
         self._off = np.flatnonzero(kinds == Kind.OFFSET)
         self._a_off = self._a[self._off]
@@ -174,7 +174,7 @@ def _room(mixture: Mixture) -> Array:
     """Half the room between the two sides of the rows that the first policy has multipliers for (n_l,), else 0."""
     problem, links = mixture.problem, mixture.problem.links
     room = 0.5 * (problem.upper - problem.lower)[links]
-    return np.where(mixture.slope[0] > 0.0, np.where(np.isfinite(room), room, 0.0), 0.0)
+    return np.where(mixture.first.slope > 0.0, np.where(np.isfinite(room), room, 0.0), 0.0)
 
 
 def slices(sizes: Sequence[int]) -> list[slice]:

@@ -124,7 +124,8 @@ class PlanMap:
         here = p[problem.n_p - problem.n_y :]
         table = share.weights @ self._tables[i][share.policies]
         split = (steps + 1) * part.rows_x.size
-        off_target = (problem.a @ share.q + problem.r @ p)[-problem.n_y :]  # the offset rows are the last
+        # The offset rows are the last.
+        off_target = (problem.a @ share.q + problem.r @ p)[len(problem.rows) - problem.n_y :]
         return PartAnswer(
             status=SolveStatus.OPTIMAL,
             iterations=0,
@@ -208,7 +209,7 @@ class PlanMap:
                 reference[part.states] = part.x_eq @ (of_w[problem.n_v :, j] + here[:, j])
                 columns[:, column] = np.concatenate([inputs.ravel(), reference])
             rows = np.zeros((problem.n_y, n_q + n_p))
-            rows[:, where] = np.hstack([problem.a, problem.r])[-problem.n_y :]  # the offset rows are the last
+            rows[:, where] = np.hstack([problem.a, problem.r])[len(problem.rows) - problem.n_y :]  # the last rows
             offsets.append(rows)
             at_q, at_p = at_q + size_q, at_p + problem.n_p
         return np.vstack([columns, *offsets])

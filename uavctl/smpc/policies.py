@@ -116,7 +116,7 @@ class Covariance:
             level -= float(noise.offset @ tail)
         along = self._vectors.T @ residual
         # P is definite: what is not, is rounding. A curvature taken too small only loosens the cut.
-        level -= 0.5 * float(np.sum(along**2 / np.maximum(self._values, 1e-16 * self._values[-1])))
+        level -= 0.5 * float(np.sum(along**2 / np.maximum(self._values, 1e-16 * self._values.max(initial=0.0))))
         return Policy(theta, backoff, self.cost(theta), level, slope)
 
 

@@ -19,6 +19,8 @@ OPEN = 1e30  # DAQP's infinity
 SOFT, EQUAL = 8, 5
 TOLERANCE = 1e-10
 _MOST_ITERATIONS = 2000
+# Share of the largest curvature that a soft row has at least: without any, DAQP loses its way between equalities.
+_LEAST_CURVE = 1e-8
 _OPTIMAL = (1, 2)  # 2: soft rows were left
 
 
@@ -47,7 +49,7 @@ class QuadraticProgram:
             "eps_prox": 0.0,
             "iter_limit": _MOST_ITERATIONS,
         }
-        rho = np.where(curve > 0.0, 0.5 / np.where(curve > 0.0, curve, 1.0), OPEN)
+        rho = 0.5 / np.maximum(curve, _LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
         self._update, self._solve = model.update, model.solve
 

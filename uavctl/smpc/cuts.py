@@ -1,0 +1,189 @@
+"""A lower bound of one component's optimum: the mean's QP with φ replaced by the library's cuts.
+
+The bound is the Lagrangian's value at the multipliers that the QP solver found, with the cuts mixed alike: whatever its
+error, the value is a bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.meanqp import MeanProblem, Question
+from uavctl.smpc.policies import Policy
+from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
+
+Array = NDArray[np.float64]
+
+# Curvature, relative to the covariance cost, of variables that have none: DAQP wants a definite Hessian. The bound is
+# evaluated without it.
+_CURVATURE = 1e-4
+# The QP is degenerate, and its answer only a guess of the multipliers: a finer tolerance makes it cycle.
+TOLERANCE = 1e-7
+_EXCEEDS = 1e-9  # share by which a multiplier may exceed a price by rounding
+
+
+class RowOrder:
+    """Rows of a mean QP in the order: those that no gain moves, links from above, links from below.
+
+    Attributes:
+        static: Rows that no gain moves.
+        origin: Row of the mean problem that each of them is.
+        up: Where the links from above are.
+        low: Where the links from below are.
+    """
+
+    def __init__(self, problem: MeanProblem) -> None:
+        self._problem = problem
+        links = problem.links
+        self.static = np.setdiff1d(np.arange(len(problem.rows)), links)
+        self.origin = np.concatenate([self.static, links, links])
+        s, n_l = self.static.size, links.size
+        self.up, self.low = slice(s, s + n_l), slice(s + n_l, s + 2 * n_l)
+        self._soft = np.isfinite(problem.price[self.origin])
+
+    def softness(self, others: int) -> tuple[NDArray[np.int32], Array, Array]:
+        """Sense, price and curve of these rows and `others` more that are hard."""
+        rest = np.zeros(others)
+        price = np.where(self._soft, self._problem.price[self.origin], 0.0)
+        return (
+            np.concatenate([np.where(self._soft, SOFT, 0), rest]).astype(np.int32),
+            np.concatenate([price, rest]),
+            np.concatenate([self._problem.curve[self.origin], rest]),
+        )
+
+    def sides(self, question: Question) -> tuple[Array, Array]:
+        """Right and left sides: of static rows with their back-offs, of links without."""
+        backoff = self._problem.backoff
+        upper = (question.upper - question.offset - backoff)[self.origin]
+        lower = (question.lower - question.offset + backoff)[self.origin]
+        upper[self.low] = OPEN
+        lower[self.up] = -OPEN
+        return upper, lower
+
+
+@dataclass(frozen=True, eq=False)
+class Below:
+    """What the cuts say of a question.
+
+    Attributes:
+        bound: Lower bound of the optimum.
+        weights: Weights of the cuts (K,), of sum 1.
+        room: What the bound leaves to each link's back-off (n_l,).
+        height: How far the bound's φ is above each cut (K,).
+    """
+
+    bound: float
+    weights: Array
+    room: Array
+    height: Array
+
+
+class Cuts:
+    """Lower bounds by the cuts of a component's policies.
+
+    Variables: q, the room r that is left to each link's back-off, and ϑ above every cut; r and ϑ count from the first
+    policy's back-offs and cost, in units of the largest.
+
+    Args:
+        problem: The mean half of the component's problem.
+        policies: The library.
+        order: Its rows in order.
+    """
+
+    def __init__(self, problem: MeanProblem, policies: Sequence[Policy], order: RowOrder) -> None:
+        self._problem, self._order = problem, order
+        self._level = np.array([policy.level for policy in policies])
+        self._slope = np.array([policy.slope for policy in policies])
+        self._first = policies[0]
+        largest = np.max([policy.backoff for policy in policies], axis=0)
+        self._unit = np.where(largest > 0.0, largest, 1.0)
+        self._cost_unit = max(policy.cost for policy in policies)
+        self._h_inverse = np.linalg.inv(problem.h)
+        self._soft = np.flatnonzero(np.isfinite(problem.price))
+        self._price, self._curve = problem.price[self._soft], problem.curve[self._soft]
+        above, below = np.isfinite(problem.upper), np.isfinite(problem.lower)
+        self._above, self._below = above, below
+        self._share = np.where(above & below, 0.5, np.where(above, 1.0, 0.0))[problem.links]
+        self._program = self._set_up()
+
+    def bound(self, question: Question, plus: Array, minus: Array, level: float, slope: Array) -> float:
+        """The Lagrangian's value at any multipliers: a lower bound of the optimum (theory notes, C).
+
+        Args:
+            question: The question.
+            plus: Multipliers >= 0 of the rows' upper sides (m,); of links, changed where the cut asks for more.
+            minus: Those of the lower sides (m,).
+            level: D of the cut.
+            slope: μ of the cut (n_l,).
+        """
+        problem, links = self._problem, self._problem.links
+        lacking = np.maximum(slope - plus[links] - minus[links], 0.0)
+        plus[links] += self._share * lacking
+        minus[links] += (1.0 - self._share) * lacking
+        net, total = plus - minus, plus + minus
+        g = question.f + net @ problem.a
+        value = question.constant + level - 0.5 * float(g @ self._h_inverse @ g)
+        value += float(net @ question.offset + total @ problem.backoff)
+        value -= float(plus @ np.where(self._above, question.upper, 0.0))
+        value += float(minus @ np.where(self._below, question.lower, 0.0))
+        beyond = total[self._soft] - self._price
+        return value - self._excess(beyond) if (beyond > 0.0).any() else value
+
+    def _excess(self, beyond: Array) -> float:
+        """What multipliers above the slacks' prices cost the bound; without a quadratic price there is no bound."""
+        over = beyond > _EXCEEDS * self._price
+        if np.any(over & (self._curve == 0.0)):
+            return np.inf
+        return float(np.sum(np.where(over, beyond**2 / (4.0 * np.where(self._curve > 0.0, self._curve, 1.0)), 0.0)))
+
+    def ask(self, question: Question) -> Below | None:
+        """The bound; None where the QP fails."""
+        problem, order, links, n_q = self._problem, self._order, self._problem.links, question.f.size
+        s, up, low = order.static.size, order.up, order.low
+        upper, lower = self._upper.copy(), self._lower.copy()
+        upper[: low.stop], lower[: low.stop] = order.sides(question)
+        upper[up] -= self._first.backoff
+        lower[low] += self._first.backoff
+        f = self._f.copy()
+        f[:n_q] = question.f
+        solved = self._program.solve(f, upper, lower)
+        if solved is None:
+            return None
+        variables, multipliers = solved
+        weights = np.maximum(-multipliers[self._cut], 0.0)
+        total = float(weights.sum())
+        if total <= 0.0:
+            return None
+        weights /= total
+        plus, minus = np.zeros(len(problem.rows)), np.zeros(len(problem.rows))
+        plus[order.static] = np.maximum(multipliers[:s], 0.0)
+        minus[order.static] = np.maximum(-multipliers[:s], 0.0)
+        plus[links], minus[links] = np.maximum(multipliers[up], 0.0), np.maximum(-multipliers[low], 0.0)
+        bound = self.bound(question, plus, minus, float(weights @ self._level), weights @ self._slope)
+        room = variables[n_q:-1] * self._unit + self._first.backoff
+        return Below(bound, weights, room, self._slope @ room - self._level)
+
+    def _set_up(self) -> QuadraticProgram:
+        problem, order, first = self._problem, self._order, self._first
+        n_q, n_l, k = problem.h.shape[0], problem.links.size, self._level.size
+        m = order.origin.size
+        least, self._cut = slice(m, m + n_l), slice(m + n_l, m + n_l + k)
+        size = n_q + n_l + 1
+        h = np.zeros((size, size))
+        h[:n_q, :n_q] = problem.h
+        h[range(n_q, size), range(n_q, size)] = _CURVATURE * self._cost_unit
+        a = np.zeros((m + n_l + k, size))
+        a[:m, :n_q] = problem.a[order.origin]
+        a[order.up, n_q:-1], a[order.low, n_q:-1] = np.diag(self._unit), -np.diag(self._unit)
+        a[least, n_q:-1] = np.eye(n_l)
+        a[self._cut, n_q:-1], a[self._cut, -1] = self._slope * self._unit / self._cost_unit, 1.0
+        self._f = np.zeros(size)
+        self._f[-1] = self._cost_unit
+        self._lower, self._upper = np.full(m + n_l + k, -OPEN), np.full(m + n_l + k, OPEN)
+        self._lower[least] = -first.backoff / self._unit
+        self._lower[self._cut] = (self._level - first.cost - self._slope @ first.backoff) / self._cost_unit
+        return QuadraticProgram(h, a, *order.softness(n_l + k), TOLERANCE)
