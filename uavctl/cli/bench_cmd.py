@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter, validators
@@ -9,45 +14,179 @@ from rich.console import Group, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from uavctl.bench import BenchResult, joint_states, run_bench
-from uavctl.build import build_design
+from uavctl.bench import DEFAULT_SIZES, BenchResult, run_bench
+from uavctl.bench.plot import bench_svg
+from uavctl.bench.run import Advance
+from uavctl.build import build_design, build_spec
 from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.errors import UsageError
+
+_REFRESH_S = 0.2
 
 
 def bench(
     *,
-    states: Annotated[int, Parameter(help="number of states", validator=validators.Number(gte=1))] = 20,
-    seed: Annotated[int, Parameter(help="seed of the states", validator=validators.Number(gte=0))] = 0,
+    states: Annotated[
+        int,
+        Parameter(
+            help="number of states; the slow methods answer the first of them", validator=validators.Number(gte=1)
+        ),
+    ] = DEFAULT_SIZES.states,
+    seed: Annotated[int, Parameter(help="seed of states and policies", validator=validators.Number(gte=0))] = 0,
+    plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
     common: Common = DEFAULTS,
 ) -> int:
     """Measure the speed of a decision on this machine, beside the problem as printed, in one run."""
     loaded = common.load()
+    if plot is not None and not plot.parent.is_dir():
+        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
     with located(loaded):
         design = build_design(loaded.config)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
-        task = progress.add_task("states", total=2 * states + joint_states(states))
-
-        def advance(what: str) -> None:
-            progress.update(task, advance=1, description=what)
-
-        result = run_bench(design, states, seed, advance)
+        loss = build_spec(loaded.config).link.outage(1)
+        with _progress() as advance:
+            result = run_bench(design, loss, seed, advance, replace(DEFAULT_SIZES, states=states))
+    if plot is not None:
+        plot.write_text(bench_svg(result, loaded.config.name), encoding="utf-8")
     common.show(result, lambda: bench_picture(result, loaded.config.name))
     return 0
 
 
+@contextmanager
+def _progress() -> Iterator[Advance]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # A thread that draws the bar would disturb what is measured.
+    with Progress(*columns, console=messages(), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("design", total=None)
+        drawn = 0.0
+
+        def advance(what: str, done: int, total: int | None) -> None:
+            nonlocal drawn
+            now = time.monotonic()
+            if done and done != total and now - drawn < _REFRESH_S:
+                return
+            drawn = now
+            progress.update(task, description=what, completed=done, total=total, refresh=True)
+
+        yield advance
+
+
 def bench_picture(result: BenchResult, name: str) -> RenderableType:
-    """The medians as a table."""
-    table = Table()
-    table.add_column("one decision")
-    table.add_column("median (ms)", justify="right")
-    table.add_column("against exact", justify="right")
-    table.add_column("what came of it")
+    """The figures as tables."""
+    axes = "1 independent axis" if result.components == 1 else f"{result.components} independent axes"
+    head = (
+        f"{name}: {axes}; {result.states} states, half uniform over the feasible {result.feasible_share:.0%} of the "
+        "box, half along closed loops"
+    )
+    answers = (_methods(result), _axis(result), _certificates(result), _gaps(result))
+    return Group(head, "", *answers, _growth(result), _resources(result))
+
+
+def _methods(result: BenchResult) -> Table:
+    table = Table(title="One decision for all axes", title_justify="left")
+    for heading in ("", "states", "median", "library is faster by", "what came of it"):
+        table.add_column(
+            heading, justify="right" if heading in ("states", "median", "library is faster by") else "left"
+        )
     joint = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"
-    cvxpy_ms = result.cvxpy_axis_ms * result.components
-    same = f"same cost to {result.cost_difference:.1e}"
-    table.add_row("as printed, joint, CVXPY", f"{result.printed_ms:.1f}", f"{result.ratio_printed_exact:.1f}", joint)
-    table.add_row("as printed, axis by axis, CVXPY", f"{cvxpy_ms:.1f}", f"{result.ratio_cvxpy_exact:.1f}", same)
-    table.add_row("exact, all axes", f"{result.exact_ms:.2f}", "1", "optimal")
-    table.add_row("exact, one axis", f"{result.exact_axis_ms:.2f}", "", "optimal")
-    return Group(f"{name}: {result.states} states, {result.components} independent axes", table)
+    same = "" if result.cost_difference is None else f"cost of the exact one to {result.cost_difference:.1e}"
+    library = result.library_us
+    rows = (
+        (
+            "as printed, jointly, CVXPY",
+            result.printed_states,
+            _ms(result.printed_ms),
+            result.ratio_printed_library,
+            joint,
+        ),
+        (
+            "as printed, axis by axis, CVXPY",
+            result.cvxpy_states,
+            _ms(result.cvxpy_ms),
+            result.ratio_cvxpy_library,
+            same,
+        ),
+        ("exact", result.exact_states, _ms(result.exact_ms), result.ratio_exact_library, ""),
+    )
+    for label, states, took, ratio, ending in rows:
+        table.add_row(label, str(states), took, f"{ratio:.0f} ×", ending)
+    table.add_row(
+        "policy library",
+        str(result.states),
+        _us(library.p50),
+        "",
+        f"p99 {_us(library.p99)}, at most {_us(library.max)}",
+    )
+    return table
+
+
+def _axis(result: BenchResult) -> str:
+    return (
+        f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}. "
+        f"The frozen policy's QP: DAQP {_us(result.qp_us.daqp)}, Clarabel {_us(result.qp_us.clarabel)}.\n"
+    )
+
+
+def _certificates(result: BenchResult) -> Table:
+    table = Table(title="The library's answers", title_justify="left")
+    for heading in ("method", "share", "median"):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    shares = result.shares
+    for method, share, took in (
+        ("frozen policy", shares.frozen, result.frozen_us),
+        ("mixture", shares.mixture, result.mixture_us),
+        ("exact program", shares.exact, result.fallback_us),
+    ):
+        table.add_row(method, f"{share:.1%}", _us(took))
+    return table
+
+
+def _gaps(result: BenchResult) -> str:
+    gap = result.gap
+    return (
+        f"Certified gap: median {gap.p50:.1e}, p99 {gap.p99:.1e}, at most {gap.max:.1e}; "
+        f"exact optima outside the certified bounds by at most {result.certificate_excess:.0e}.\n"
+    )
+
+
+def _growth(result: BenchResult) -> Table:
+    table = Table(title="Growth", title_justify="left")
+    for heading in ("", "frozen", "mixture"):
+        table.add_column(heading, justify="right" if heading else "left")
+    longer, more = result.growth_h, result.growth_axes
+    for steps, frozen, mixture in zip(longer.horizon, longer.frozen_us, longer.mixture_us, strict=True):
+        table.add_row(f"one axis, H = {steps}", _us(frozen), _us(mixture))
+    table.add_row(
+        "exponent of H (the longest three)",
+        _number(longer.frozen_exponent),
+        f"{_number(longer.mixture_exponent)} ({_number(longer.mixture_exponent_last)})",
+        end_section=True,
+    )
+    for count, frozen, mixture in zip(more.axes, more.frozen_us, more.mixture_us, strict=True):
+        table.add_row("1 axis" if count == 1 else f"{count} axes", _us(frozen), _us(mixture))
+    table.add_row("exponent of their number", _number(more.frozen_exponent), _number(more.mixture_exponent))
+    return table
+
+
+def _resources(result: BenchResult) -> str:
+    memory = result.memory_mb
+    return (
+        f"Library made in {result.library_s:.1f} s ({_sum(result.library_policies)} policies, "
+        f"{result.library_bytes / 1e3:.0f} kB), ready in {result.ready_s:.2f} s. "
+        f"Peak memory: {memory.before:.0f} MB before, {memory.library:.0f} with it, {memory.after:.0f} at the end."
+    )
+
+
+def _sum(policies: Sequence[int]) -> str:
+    return " + ".join(map(str, policies))
+
+
+def _ms(milliseconds: float) -> str:
+    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
+
+
+def _us(microseconds: float | None) -> str:
+    return "-" if microseconds is None else f"{microseconds:.0f} µs"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

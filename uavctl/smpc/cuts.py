@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 _CURVATURE = 1e-4
 # The QP is degenerate, and its answer only a guess of the multipliers: a finer tolerance makes it cycle.
 TOLERANCE = 1e-7
-_EXCEEDS = 1e-9  # share by which a multiplier may exceed a price by rounding
 
 
 class RowOrder:
@@ -103,8 +102,11 @@ class Cuts:
         self._unit = np.where(largest > 0.0, largest, 1.0)
         self._cost_unit = max(policy.cost for policy in policies)
         self._h_inverse = np.linalg.inv(problem.h)
-        self._soft = np.flatnonzero(np.isfinite(problem.price))
-        self._price, self._curve = problem.price[self._soft], problem.curve[self._soft]
+        # A multiplier above a price costs the bound by the slack's quadratic price; where there is none, it is cut.
+        curved = problem.curve > 0.0
+        self._slack = np.flatnonzero(curved)
+        self._price, self._per_curve = problem.price[self._slack], 0.25 / problem.curve[self._slack]
+        self._most = np.where(curved, np.inf, problem.price)
         above, below = np.isfinite(problem.upper), np.isfinite(problem.lower)
         self._above, self._below = above, below
         self._share = np.where(above & below, 0.5, np.where(above, 1.0, 0.0))[problem.links]
@@ -115,12 +117,15 @@ class Cuts:
 
         Args:
             question: The question.
-            plus: Multipliers >= 0 of the rows' upper sides (m,); of links, changed where the cut asks for more.
+            plus: Multipliers >= 0 of the rows' upper sides (m,); where a price or the cut asks for others, those are
+                taken.
             minus: Those of the lower sides (m,).
             level: D of the cut.
             slope: μ of the cut (n_l,).
         """
         problem, links = self._problem, self._problem.links
+        plus = np.minimum(plus, self._most)
+        minus = np.minimum(minus, self._most - plus)
         lacking = np.maximum(slope - plus[links] - minus[links], 0.0)
         plus[links] += self._share * lacking
         minus[links] += (1.0 - self._share) * lacking
@@ -130,15 +135,8 @@ class Cuts:
         value += float(net @ question.offset + total @ problem.backoff)
         value -= float(plus @ np.where(self._above, question.upper, 0.0))
         value += float(minus @ np.where(self._below, question.lower, 0.0))
-        beyond = total[self._soft] - self._price
-        return value - self._excess(beyond) if (beyond > 0.0).any() else value
-
-    def _excess(self, beyond: Array) -> float:
-        """What multipliers above the slacks' prices cost the bound; without a quadratic price there is no bound."""
-        over = beyond > _EXCEEDS * self._price
-        if np.any(over & (self._curve == 0.0)):
-            return np.inf
-        return float(np.sum(np.where(over, beyond**2 / (4.0 * np.where(self._curve > 0.0, self._curve, 1.0)), 0.0)))
+        beyond = np.maximum(total[self._slack] - self._price, 0.0)
+        return value - float(self._per_curve @ beyond**2)
 
     def ask(self, question: Question) -> Below | None:
         """The bound; None where the QP fails."""

@@ -89,11 +89,12 @@ class Frozen:
         scale = np.repeat([mixture.first.cost for mixture in mixtures], [len(problem.rows) for problem in problems])
         # A multiplier at a state row's price means slack, and slack is for the mixture to tell.
         state = np.concatenate([[row.kind is Kind.STATE for row in problem.rows] for problem in problems])
-        allowed = np.where(soft, price * np.where(state, 1.0 - 1e-9, 1.0 + 1e-9), np.inf)
+        allowed = np.where(state, price * (1.0 - 1e-9), np.inf)
         allowed[links] = _ZERO * scale[links]
         # A soft row that is pinned would not be left at its price: such a policy answers nothing.
         allowed[self._pins] = np.where(soft[self._pins], -1.0, slope[self._pins])
         self._allowed = allowed
+        self._most = np.where(soft & ~state, price, np.inf)  # the offset's multipliers; see `QuadraticProgram`
         sense = np.where(soft, SOFT, 0).astype(np.int32)
         sense[self._pins] = EQUAL
         self._programs = [
@@ -117,6 +118,8 @@ class Frozen:
             means.append(solved[0])
             multipliers.append(solved[1])
         q, net = np.concatenate(means), np.concatenate(multipliers)
+        np.minimum(net, self._most, out=net)
+        np.maximum(net, -self._most, out=net)
         fits = np.logical_and.reduceat(np.abs(net) <= self._allowed, self._row_starts).tolist()
         return FrozenAnswer(q, net, above, below, fits)
 

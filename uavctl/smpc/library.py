@@ -30,7 +30,7 @@ _ROUNDS = 100
 _SAMPLES = 300  # states tried in a round
 _TAKEN = 6  # policies taken in from it
 _QUIET = 4  # rounds in a row without one to take in, after which the library is complete
-_ENOUGH = 6e-5  # a certified gap that needs no further policy
+_ENOUGH = 8e-5  # a certified gap that needs no further policy
 
 
 @dataclass(frozen=True, eq=False)

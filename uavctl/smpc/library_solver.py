@@ -5,15 +5,13 @@ Every answer carries its certificate: the cost of the plan, a lower bound of the
 
 from __future__ import annotations
 
-from math import isfinite
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite, relative_gap
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook, relative_gap
 from uavctl.smpc.assemble import PartAnswer
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import PartSolver
@@ -27,6 +25,9 @@ from uavctl.smpc.plan_map import EXACT, MIXTURE, TOLERANCE, PlanMap, Share
 from uavctl.smpc.qp import OPEN
 
 Array = NDArray[np.float64]
+
+# Beyond, squares of numbers that follow from a question's may overflow.
+_ABSURD = 1e100
 
 _FIRST, _ALL = np.zeros(1, dtype=np.intp), np.ones(1)
 
@@ -62,9 +63,17 @@ class LibrarySolver:
 
         Numbers that are not finite give an answer FAILED; nothing is raised.
         """
-        if outlook.late >= len(self._variants) or not (outlook.nominal or finite(x, target, outlook)):
+        if outlook.late >= len(self._variants) or not (outlook.nominal or _sane(outlook)):
             return Answer.failed(seq, SolveStatus.FAILED, MIXTURE)
         return self._variants[outlook.late].solve(seq, x, target, outlook)
+
+
+def _sane(outlook: Outlook) -> bool:
+    """Whether all that is known ahead are numbers to calculate with."""
+    given = [] if outlook.limits is None else [outlook.limits]
+    if outlook.path is not None:
+        given += [outlook.path.states, outlook.path.inputs]
+    return all(bool((np.abs(values) < _ABSURD).all()) for values in given)
 
 
 class _Variant:
@@ -102,7 +111,7 @@ class _Variant:
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook) -> Answer:
         """See `LibrarySolver.solve`."""
         asked = np.concatenate([x, target])
-        if not isfinite(asked @ asked):  # also where squares overflow
+        if not np.abs(asked).max() < _ABSURD:  # NaN too
             return Answer.failed(seq, SolveStatus.FAILED, MIXTURE)
         p = self._of_question @ asked
         numbers = self._numbers(p, outlook)

@@ -32,7 +32,7 @@ _STEEPEST = 30.0
 _ACTIVE = 1e-6
 _HIGHEST = 4
 # A gap that a single policy may leave: fewer calls are worth more than a better plan there.
-_GOOD = 5e-5
+_GOOD = 8e-5
 # Programs for mixtures of up to so many policies are set up in advance.
 _MIXED = 12
 

@@ -29,6 +29,9 @@ _NOTHING = 1e-7
 # Where a row has one side only, the cheapest policy's back-off there is bounded by this many usual ones.
 _FAR = 1e3
 
+# What a policy may miss the terminal condition by, scaled to unit variances.
+_KEPT = 1e-6
+
 _ENDED_WELL = ("Solved", "AlmostSolved", "InsufficientProgress")
 
 
@@ -89,6 +92,15 @@ class Covariance:
     def cost(self, theta: Array) -> float:
         """J_cov of gains `theta`."""
         return float(0.5 * theta @ self.horizon.p @ theta + self.horizon.q @ theta + self.horizon.c_0)
+
+    def holds(self, theta: Array) -> bool:
+        """Whether gains `theta` meet the terminal condition, as far as rounding lets one tell."""
+        if self.equal.offset.size and np.abs(self.equal.at(theta)).max() > _KEPT:
+            return False
+        if not self.order:
+            return True
+        matrix = _matrix(self.triangle.at(theta), self.order)
+        return bool(np.linalg.eigvalsh(matrix)[0] >= -_KEPT)
 
     def policy(self, theta: Array, equal: Array, triangle: Array, heads: Array, tails: Sequence[Array]) -> Policy:
         """The policy of gains `theta`, with the cut of any multipliers (theory notes, C).
@@ -210,10 +222,12 @@ class PolicyProgram:
             return None
         dual = np.array(solution.z)[self._linear_rows :] * cov.scale
         equal, triangle, rest = np.split(dual, np.cumsum([cov.equal.offset.size, cov.triangle.offset.size]))
-        sizes = np.cumsum([noise.offset.size + 1 for noise in cov.noises])[:-1]
-        links = np.split(rest, sizes)
+        ends = np.cumsum([0, *(noise.offset.size + 1 for noise in cov.noises)]).tolist()
+        links = [rest[i:j] for i, j in pairwise(ends)]
         theta = np.array(solution.x)[self._theta]
         heads = np.array([link[0] for link in links])
+        if not cov.holds(theta):
+            return None
         return cov.policy(theta, equal, triangle, heads, [link[1:] for link in links])
 
 
@@ -227,23 +241,32 @@ def _with_unseen(row: Row) -> Affine:
 
 
 def _svec_weight(order: int) -> Array:
-    column = np.repeat(np.arange(order), np.arange(1, order + 1))
-    row = np.concatenate([np.arange(j + 1) for j in range(order)])
+    row, column = _places(order)
     return np.where(row == column, 1.0, np.sqrt(2.0))
 
 
 def _positive_part(svec: Array, order: int) -> Array:
     """Project a symmetric matrix, upper triangle column by column with off-diagonals times √2, on the semidefinite."""
+    values, vectors = np.linalg.eigh(_matrix(svec, order))
+    positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    row, column = _places(order)
+    projected: Array = _svec_weight(order) * positive[row, column]
+    return projected
+
+
+def _matrix(svec: Array, order: int) -> Array:
+    """The symmetric matrix of such a triangle."""
+    row, column = _places(order)
+    matrix = np.zeros((order, order))
+    matrix[row, column] = matrix[column, row] = svec / _svec_weight(order)
+    return matrix
+
+
+def _places(order: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of an upper triangle, column by column."""
     column = np.repeat(np.arange(order), np.arange(1, order + 1))
     row = np.concatenate([np.arange(j + 1) for j in range(order)])
-    weight = _svec_weight(order)
-    matrix = np.zeros((order, order))
-    matrix[row, column] = svec / weight
-    matrix[column, row] = svec / weight
-    values, vectors = np.linalg.eigh(matrix)
-    positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    projected: Array = weight * positive[row, column]
-    return projected
+    return row, column
 
 
 def _settings(max_iterations: int) -> clarabel.DefaultSettings:

@@ -1,0 +1,372 @@
+from __future__ import annotations
+
+import gc
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
+
+from uavctl.bench import BenchResult, Sizes, run, run_bench
+from uavctl.bench.frozen_qp import FrozenProgram, time_frozen_qp
+from uavctl.bench.growth import copies, few_policies, growth_with_axes, lengthened
+from uavctl.bench.plot import bench_svg
+from uavctl.bench.states import LOOP_STEPS, closed_loops, draw_states
+from uavctl.bench.timing import FROZEN, Case, exponent, timed
+from uavctl.cli import bench_cmd
+from uavctl.cli.app import run as command
+from uavctl.data import SolveStatus
+from uavctl.errors import UavctlError
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+from uavctl.smpc.components import decompose
+from uavctl.smpc.conic import ConicSolver
+from uavctl.smpc.design import Design
+from uavctl.smpc.horizon import horizon_of
+from uavctl.smpc.library import Library
+from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.smpc.meanqp import MeanProblem
+
+Array = NDArray[np.float64]
+
+WANTED = {
+    "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "library_us", "ratio_printed_library",
+    "ratio_exact_library", "growth_h", "growth_axes", "qp_us", "ratio_cvxpy_library", "shares", "gap", "library_s",
+    "library_bytes", "memory_mb", "ready_s", "frozen_us", "mixture_us",
+}  # fmt: skip
+SMALL = Sizes(states=12, printed=1, cvxpy=3, exact=6, runs=2, horizons=(5, 8, 12), policies=3, growth_states=30, axes=3)
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    return paper()
+
+
+@pytest.fixture(scope="module")
+def library(design: Design) -> Library:
+    """A few policies for each axis."""
+    parts = []
+    for component in decompose(design):
+        made = few_policies(copies(design, component, 1), 6, np.random.default_rng(1))
+        assert made is not None
+        parts.append(made[0].variants[0][0])
+    return Library(design.design_id, (tuple(parts),))
+
+
+@pytest.fixture(scope="module")
+def told() -> list[tuple[str, int, int | None]]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(design: Design, library: Library, told: list[tuple[str, int, int | None]]) -> BenchResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "make_library", lambda *_: library)
+        return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL)
+
+
+def test_one_run_has_all_figures(result: BenchResult) -> None:
+    found = msgspec.to_builtins(result)
+    assert found.keys() >= WANTED
+    assert found["library_us"].keys() == found["gap"].keys() == {"p50", "p99", "max"}
+    assert {"daqp", "clarabel"} <= found["qp_us"].keys()
+    assert (result.states, result.components) == (12, 2)
+    assert (result.printed_states, result.cvxpy_states, result.exact_states) == (1, 3, 6)
+    assert json.loads(msgspec.json.encode(result)) == json.loads(json.dumps(found, allow_nan=False))
+
+
+def test_ratios_are_of_the_medians_shown(result: BenchResult) -> None:
+    library_ms = result.library_us.p50 / 1e3
+    assert result.ratio_printed_library == pytest.approx(result.printed_ms / library_ms)
+    assert result.ratio_cvxpy_library == pytest.approx(2 * result.cvxpy_axis_ms / library_ms)
+    assert result.ratio_exact_library == pytest.approx(2 * result.exact_axis_ms / library_ms)
+    assert 0.0 < result.library_us.p50 <= result.library_us.p99 <= result.library_us.max
+
+
+def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
+    assert result.cost_difference is not None and result.cost_difference < 1e-6
+    assert result.certificate_excess < 1e-7
+    assert 0.0 <= result.gap.p50 <= result.gap.p99 <= result.gap.max <= 1e-3
+    shares = result.shares
+    assert shares.frozen + shares.mixture + shares.exact == pytest.approx(1.0)
+    for share, median in (
+        (shares.frozen, result.frozen_us), (shares.mixture, result.mixture_us), (shares.exact, result.fallback_us)
+    ):  # fmt: skip
+        assert (share > 0.0) == (median is not None)
+
+
+def test_growth_has_a_time_for_each_size(result: BenchResult) -> None:
+    # τ = 4 leaves no step of H = 5 that could feed anything back.
+    assert result.growth_h.horizon == [8, 12]
+    assert result.growth_h.gains == [7, 28]
+    assert result.growth_axes.axes == [1, 2, 3]
+    for growth in (result.growth_h, result.growth_axes):
+        assert all(us is not None and us > 0.0 for us in growth.frozen_us + growth.mixture_us)
+        assert growth.frozen_exponent is not None and np.isfinite(growth.frozen_exponent)
+        assert growth.mixture_exponent is not None and np.isfinite(growth.mixture_exponent)
+
+
+def test_the_library_is_weighed(result: BenchResult, library: Library) -> None:
+    parts = library.variants[0]
+    assert result.library_policies == [len(part.level) for part in parts] == [6, 6]
+    assert result.library_bytes == 8 * sum(part.theta.size + part.slope.size + 6 for part in parts)
+    assert 0.0 < result.memory_mb.before <= result.memory_mb.library <= result.memory_mb.after
+    assert 0.0 < result.ready_s < result.wall_s
+
+
+def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list[tuple[str, int, int | None]]) -> None:
+    last = {what: (done, total) for what, done, total in told}
+    assert last.pop("making the library") == (0, None)
+    assert {"states", "all methods in turns", "printed, jointly", "longer horizons", "more axes"} == last.keys()
+    assert all(done == total for done, total in last.values())
+    decisions = SMALL.runs * (result.states + result.exact_states) + result.cvxpy_states
+    assert last["all methods in turns"] == (decisions, decisions)
+
+
+# --- states ----------------------------------------------------------------------------------------------------------
+
+
+def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
+    exact = ConicSolver(design)
+    one, again = (draw_states(design, exact, 7, 0.3, 4, lambda _: None) for _ in range(2))
+    other = draw_states(design, exact, 7, 0.3, 5, lambda _: None)
+    assert np.array_equal(one.points, again.points)
+    assert not np.any(np.all(np.array(one.points) == np.array(other.points), axis=1))
+    assert len(one.points) == 7
+    assert 0.0 < one.feasible_share <= 1.0
+    for x in one.points[::2]:
+        answer = exact.solve(0, x, design.target)
+        assert answer.status is SolveStatus.OPTIMAL
+        assert answer.slack + answer.offset + answer.terminal_miss < 1e-6
+        assert np.all((x >= PAPER_LOWER) & (x <= PAPER_UPPER))
+    # A loop goes towards the target: its states are elsewhere than those of the box.
+    assert np.linalg.norm(one.points[1::2], axis=1).mean() < np.linalg.norm(one.points[::2], axis=1).mean()
+
+
+def test_a_box_without_a_feasible_state_ends_with_exit_code_1(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("uavctl.bench.states._MOST_MISSES", 3)
+    beyond = replace(design, target=np.array([60.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(UavctlError, match=r"no state was found .* \[sets\]") as caught:
+        draw_states(beyond, ConicSolver(beyond), 2, 0.3, 0, lambda _: None)
+    assert caught.value.exit_code == 1
+
+
+def undisturbed(design: Design) -> Design:
+    return replace(design, plant=replace(design.plant, w=np.zeros((2, 2))))
+
+
+@pytest.mark.parametrize(("loss", "stage"), [(0.0, 1), (1.0, 12)])
+def test_a_loop_asks_on_news_and_plays_the_plan_out_without(design: Design, loss: float, stage: int) -> None:
+    # Without disturbance the next question is where the plan says; without news, where the plan ends.
+    solver = ConicSolver(design)
+    rng = np.random.default_rng(0)
+    asked = closed_loops(undisturbed(design), solver, [START], 2, loss, rng, lambda _: None)
+    first = solver.solve(0, START, design.target)
+    assert asked[0] == pytest.approx(first.states[stage], abs=1e-9)
+    second = solver.solve(0, asked[0], design.target)
+    assert asked[1] == pytest.approx(second.states[stage], abs=1e-9)
+
+
+class Stub:
+    """Answers nothing, and notes what it was asked and whether garbage was collected meanwhile."""
+
+    def __init__(self) -> None:
+        self.asked: list[float] = []
+        self.collected: list[bool] = []
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        self.asked.append(float(x[0]))
+        self.collected.append(gc.isenabled())
+        return Answer.failed(seq, SolveStatus.FAILED, FROZEN)
+
+
+class Breaks(Stub):
+    """Breaks down once it is timed."""
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        if not gc.isenabled():
+            raise ArithmeticError
+        return super().solve(seq, x, target, outlook)
+
+
+def test_a_loop_without_plans_is_given_up(design: Design) -> None:
+    stub = Stub()
+    assert closed_loops(design, stub, [START], 3, 0.3, np.random.default_rng(0), lambda _: None) == []
+    assert 0 < len(stub.asked) < LOOP_STEPS
+
+
+# --- times -----------------------------------------------------------------------------------------------------------
+
+
+def test_cases_are_run_in_turns_without_garbage_collection() -> None:
+    stub, done = Stub(), list[int]()
+    cases = [Case(stub, [np.array([float(i)]) for i in points], np.zeros(1)) for points in ((1, 2), (), (3,))]
+    found = timed(cases, 2, done.append)
+    assert stub.asked == [1, 2, 3, *[1, 2, 3] * 2]  # warmed up, then two runs
+    assert stub.collected == [True] * 3 + [False] * 6
+    assert done == [1, 2, 3, 4, 5, 6]
+    assert gc.isenabled()
+    assert [each.us.shape for each in found] == [(2,), (0,), (1,)]
+    assert [len(each.answers) for each in found] == [2, 0, 1]
+    assert found[0].of(FROZEN).size == 0  # none has a plan
+
+
+def test_a_slow_case_is_spread_over_the_runs() -> None:
+    often, once = Stub(), Stub()
+    points = [np.array([float(i)]) for i in range(5)]
+    found = timed([Case(often, points[:1], np.zeros(1)), Case(once, points, np.zeros(1), once=True)], 2)
+    assert often.asked == [0, 0, 0]
+    assert once.asked == [0, 1, 2, 3, 4, 0, 2, 4, 1, 3]  # warmed up, then each state once
+    assert np.isfinite(found[1].us).all() and found[1].us.shape == (5,)
+    assert len(found[1].answers) == 5
+
+
+def test_garbage_is_collected_again_after_an_error() -> None:
+    with pytest.raises(ArithmeticError):
+        timed([Case(Breaks(), [np.zeros(1)], np.zeros(1))], 1)
+    assert gc.isenabled()
+
+
+def test_the_exponent_of_a_power_law_is_its_power() -> None:
+    assert exponent([8, 16, 40], [3.0 * n**2 for n in (8, 16, 40)]) == pytest.approx(2.0)
+    assert exponent([8, 16, 40], [8.0, None, 40.0]) == pytest.approx(1.0)
+    assert exponent([8, 16], [8.0, None]) is None
+
+
+# --- sizes -----------------------------------------------------------------------------------------------------------
+
+
+def test_copies_cost_what_the_one_costs_times_their_number(design: Design) -> None:
+    component = decompose(design)[0]
+    for count in (1, 3, 6):
+        many = copies(design, component, count)
+        assert len(decompose(many)) == many.plant.n_u == count
+        answer = ConicSolver(many).solve(0, np.tile(START[component.states], count), many.target)
+        assert answer.cost == pytest.approx(count * PAPER_COST_X, rel=1e-6)
+
+
+def test_a_longer_horizon_keeps_the_conditions_on_its_delays(design: Design) -> None:
+    one, tau = copies(design, decompose(design)[0], 1), 4
+    for steps in (8, 12, 40):
+        longer = lengthened(one, steps)
+        assert longer is not None
+        delays, free = longer.schedule.delays, steps - tau
+        assert len(delays) == longer.horizon == steps
+        assert all(delay >= t - free + 1 for t, delay in enumerate(delays) if t >= free)
+        assert all(delay <= tau + 1 for delay in delays)
+        assert any(t >= delay for t, delay in enumerate(delays[:free]))
+        assert longer.kappa_x.shape == (steps + 1,) and longer.kappa_u.shape == (steps,)
+    assert lengthened(one, tau + 2) is None
+
+
+def test_more_axes_than_states_are_dealt_out(design: Design, library: Library) -> None:
+    found = growth_with_axes(design, library, [design.target], 3, 1, lambda: None)
+    assert found.frozen_us[2] is not None
+    assert found.mixture_us == [None] * 3
+    assert found.mixture_exponent is None
+
+
+# --- the frozen policy's QP ------------------------------------------------------------------------------------------
+
+
+def test_both_solvers_find_the_optimum_that_the_library_answers(design: Design, library: Library) -> None:
+    component, part = decompose(design)[0], library.variants[0][0]
+    one = copies(design, component, 1)
+    solver = LibrarySolver(one, Library(one.design_id, ((part,),)), exact=False)
+    problem = MeanProblem(design, horizon_of(design, component))
+    both = FrozenProgram(design, component, part)
+    frozen = 0
+    for x in ([0.0, 0.0], [4.0, 1.0], [-2.0, 0.5], START[:2]):
+        whole = np.array([*x, 0.0, 0.0])
+        question = both.question(whole, design.target)
+        solved = both.daqp.solve(*question)
+        assert solved is not None
+        cost = both.cost(solved[0], *question)
+        assert both.cost(both.clarabel.solve(*question), *question) == pytest.approx(cost, rel=1e-7, abs=1e-6)
+        answer = solver.solve(0, np.array(x), one.target)
+        if answer.method == FROZEN:
+            frozen += 1
+            constant = problem.question(np.array(x), one.target).constant
+            assert cost + constant + part.policies(problem)[0].cost == pytest.approx(answer.cost, rel=1e-9)
+    assert frozen >= 2
+
+
+def test_qp_times_count_the_same_program(design: Design, library: Library) -> None:
+    found = time_frozen_qp(design, decompose(design)[0], library.variants[0][0], [START], 2)
+    assert (found.variables, found.rows) == (7, 24)
+    assert found.cost_difference < 1e-6
+    assert found.daqp > 0.0 and found.clarabel > 0.0
+
+
+# --- what people see -------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_is_an_svg_for_light_and_dark_pages(result: BenchResult) -> None:
+    svg = bench_svg(result, "paper")
+    root = ElementTree.fromstring(svg)
+    assert root.tag.endswith("svg")
+    assert "prefers-color-scheme:dark" in svg and "policy library" in svg
+    texts = {"".join(element.itertext()).strip() for element in root.iter() if element.tag.endswith("text")}
+    assert {"exact", "library", "mixture", "frozen", "H", "H²", "8", "12", "number of axes"} <= texts
+
+
+def test_the_picture_does_without_what_was_not_measured(result: BenchResult) -> None:
+    growth = msgspec.structs.replace(result.growth_h, mixture_us=[None, None], frozen_us=[None, 70.0])
+    nothing = msgspec.structs.replace(
+        growth, horizon=[], gains=[], mixture_us=[], frozen_us=[], mixture_exponent=None, mixture_exponent_last=None
+    )
+    for shown in (growth, nothing):
+        svg = bench_svg(msgspec.structs.replace(result, growth_h=shown), "paper")
+        assert svg.count("mixture") == 1  # of the axes
+
+
+@pytest.fixture
+def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, int, int]]:
+    """The command with its measurement replaced by one that was made; the arguments it was given."""
+    given: list[tuple[float, int, int]] = []
+
+    def fake(_design: Design, loss: float, seed: int, advance: run.Advance, sizes: Sizes) -> BenchResult:
+        for done in range(3):
+            advance("states", done, 2)
+        given.append((loss, seed, sizes.states))
+        return result
+
+    monkeypatch.setattr(bench_cmd, "run_bench", fake)
+    return given
+
+
+def test_the_command_writes_one_document_and_the_picture(
+    measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    plot = tmp_path / "bench.svg"
+    arguments = ["bench", "--config", "paper", "--states", "9", "--seed", "3", "--plot", str(plot), "--json"]
+    assert command(arguments) == 0
+    assert json.loads(capsys.readouterr().out).keys() >= WANTED
+    ((loss, seed, states),) = measured
+    assert loss == pytest.approx(0.3)
+    assert (seed, states) == (3, 9)
+    assert plot.read_text(encoding="utf-8").startswith("<svg")
+
+
+def test_the_command_shows_ratios_shares_and_growth(
+    measured: list[tuple[float, int, int]], result: BenchResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["bench", "--config", "paper"]) == 0
+    out = capsys.readouterr().out
+    assert f"{result.ratio_cvxpy_library:.0f} ×" in out
+    assert f"{result.shares.frozen:.1%}" in out
+    for words in ("as printed, jointly", "policy library", "H = 12", "3 axes", "Certified gap", "Peak memory"):
+        assert words in out
+    assert measured[0][2] == 1000
+
+
+def test_a_picture_that_cannot_be_written_is_refused_before_measuring(
+    measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert command(["bench", "--config", "paper", "--plot", str(tmp_path / "none" / "bench.svg")]) == 2
+    assert "there is no directory" in capsys.readouterr().err
+    assert measured == []
