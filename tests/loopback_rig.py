@@ -12,6 +12,7 @@ from uavctl.config.load import dump_config
 from uavctl.data import Header, Record, Sink
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design import Design, design_record
+from uavctl.smpc.library import Library
 
 R = TypeVar("R", bound=Record)
 
@@ -29,8 +30,8 @@ class Memory:
         return [record for _, _, record in self.entries if isinstance(record, kind)]
 
 
-def make_loop(config: Config, sink: Sink, design: Design | None = None) -> ControlLoop:
-    return ControlLoop(config, build_controller(config, design), sink, lambda: 0)
+def make_loop(config: Config, sink: Sink, design: Design | None = None, library: Library | None = None) -> ControlLoop:
+    return ControlLoop(config, build_controller(config, design, library), sink, lambda: 0)
 
 
 def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:

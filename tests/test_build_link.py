@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim.channel import Channel
 from uavctl.build import build_design, build_spec
-from uavctl.build_link import Packets, build_link, link_probability, packets_per_step
+from uavctl.build_link import Packets, build_link, packets_per_step, promised
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 
@@ -46,8 +46,8 @@ STEP_NS = 1_000_000_000
 )
 def test_the_link_s_probability_counts_samples_that_are_in_time(preset: str, overrides: list[str], p: float) -> None:
     config = load_config(preset, overrides)
-    assert link_probability(config) == pytest.approx(p, abs=1e-12)
-    assert 1.0 - build_spec(config).link.outage(1) >= link_probability(config) - 1e-15
+    assert promised(build_link(config)) == pytest.approx(p, abs=1e-12)
+    assert 1.0 - build_spec(config).link.outage(1) >= promised(build_link(config)) - 1e-15
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_what_a_design_for_the_whole_flight_counts_on_is_the_least_of_what_is_ah
 )
 def test_a_link_that_no_position_crosses_in_time_is_refused(overrides: list[str], key: str, figures: str) -> None:
     with pytest.raises(DesignError, match=figures) as caught:
-        link_probability(load_config("room", overrides))
+        build_link(load_config("room", overrides))
     assert caught.value.key == key
 
 

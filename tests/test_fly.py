@@ -16,13 +16,21 @@ import pytest
 from loopback_rig import make_loop
 
 from logs.reader import read, records
-from logs.replay import replay
+from logs.replay import recorded_library, replay
+from uavctl.build import build_design
 from uavctl.config import load_config
 from uavctl.config.load import parse
 from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
+from uavctl.library_store import decode, library_for
 
 SOURCE = Path(__file__).parent / "foreign_source.py"
 LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _library() -> None:
+    """The daemons find the policy library in the cache, so that their time limits are for flying."""
+    library_for(build_design(load_config("room")))
 
 
 def free_port() -> int:
@@ -105,7 +113,8 @@ def test_setpoints_go_on_in_the_pause_and_the_hand_over_ends_in_zero(flown: Flow
 def test_the_recording_replays_identically(flown: Flown) -> None:
     header = next(records(flown[3], Header))
     config = parse(header.config_toml, "recording").config
-    result = replay(read(flown[3]), lambda sink: make_loop(config, sink))
+    library = decode(recorded_library(flown[3]).data).library
+    result = replay(read(flown[3]), lambda sink: make_loop(config, sink, library=library))
     assert result.identical, result.first_difference
     assert result.decisions > 200
 

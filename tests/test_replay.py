@@ -48,7 +48,7 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None
 
 
 def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory) -> None:
-    other = load_config("paper", ["cost.input=[0.2, 0.1]"])
+    other = load_config("paper", ["cost.input=[0.2, 0.1]", "solver.method=exact"])
     result = replay(flown.entries, lambda sink: make_loop(other, sink))
     first = result.first_difference
     assert first is not None and first.topic == "/uavctl/plan"

@@ -74,7 +74,7 @@ def check_wheel() -> str:
         run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel])
         # -P and PYTHONPATH: the installed package, not the checkout beside the working directory.
         flight = ("loopback", "--config", "paper", "--duration", "20", "--json", "--out", str(folder / "flights"))
-        outside = {"PYTHONPATH": str(site)}
+        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": str(folder / "cache")}
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
             raise StageError(f"the wheel was not what was imported, but {where.strip()}")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.build_late import build_delayed_link, late_steps
-from uavctl.build_link import link_probability
+from uavctl.build_link import promised
 from uavctl.build_mission import build_mission, build_names
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -131,7 +131,9 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     """
     if config.solver.method == "library":
         found = library_for(design).library if library is None else library
-        return LibrarySolver(design, found, exact=config.solver.exact)
+        solver = LibrarySolver(design, found, exact=config.solver.exact)
+        solver.prepare()
+        return solver
     if config.solver.method == "exact":
         return ConicSolver(design)
     if design.late or design.estimate_cov.any():
@@ -158,7 +160,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
         solver=build_solver(design, config, library),
         mission=build_mission(config, design),
         names=build_names(design),
-        link=LinkEstimateParameters(promised=link_probability(config)),
+        link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
         late_steps=len(design.late),
         estimator=EstimatorParameters(
             position_std_m=estimator.position_std_m,

@@ -9,7 +9,7 @@ import numpy as np
 
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
-from uavctl.smpc.link import Arrivals, bernoulli, empirical, gilbert_elliott
+from uavctl.smpc.link import Arrivals, LinkModel, bernoulli, empirical, gilbert_elliott
 
 _ROUNDING = 1e-9
 
@@ -51,13 +51,8 @@ def build_link(config: Config) -> Arrivals:
     return bernoulli(1.0 - (1.0 - ahead) ** packets.in_time)
 
 
-def link_probability(config: Config) -> float:
-    """What the design counts on for p(k) at least: that at least one position of a Δt is there at its end.
-
-    Raises:
-        DesignError: No position can be counted on.
-    """
-    link = build_link(config)
+def promised(link: LinkModel) -> float:
+    """The least probability that a position is there at the end of the step in which it was captured."""
     return min(float(link.age(1)[1, 0]), 1.0 - link.outage(1))
 
 

@@ -169,6 +169,8 @@ class ControlLoop:
     def _record(self, out: StepOutput, at_ns: int) -> None:
         if out.estimate is not None:
             self._put("/uavctl/estimate", at_ns, out.estimate)
+        if out.link is not None:
+            self._put("/uavctl/link_estimate", at_ns, out.link)
         if out.plan is not None:
             self._put("/uavctl/plan", at_ns, out.plan)
         self._put("/uavctl/decision", at_ns, out.decision)

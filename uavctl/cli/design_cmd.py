@@ -3,35 +3,81 @@
 from __future__ import annotations
 
 import time
+from typing import Annotated
 
+import msgspec
+from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from uavctl.build import build_design
+from uavctl.cli import compare_cmd
 from uavctl.cli.common import DEFAULTS, Common, located
+from uavctl.cli.prepare import ready_library
+from uavctl.errors import UsageError
+from uavctl.library_store import StoredLibrary
 from uavctl.smpc.design import Design, design_record
 from uavctl.smpc.terminal import stationary_cost
 
 
-def design(*, common: Common = DEFAULTS) -> int:
-    """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
+def design(
+    *,
+    synthesize: Annotated[
+        bool,
+        Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
+    ] = False,
+    compare_risk: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="make the design under each risk allocation, and compare")
+    ] = False,
+    states: Annotated[
+        int, Parameter(help="seeded states in either comparison", validator=validators.Number(gte=1))
+    ] = 60,
+    common: Common = DEFAULTS,
+) -> int:
+    """Make a design and its policy library: schedule, terminal ingredients, Assumption 4 with figures."""
+    if synthesize and compare_risk:
+        raise UsageError("--synthesize and --compare-risk are two questions; ask one at a time")
+    if synthesize:
+        return compare_cmd.synthesize(common, states)
+    if compare_risk:
+        return compare_cmd.risk(common, states)
     loaded = common.load()
     start = time.perf_counter()
     with located(loaded):
         made = build_design(loaded.config)
-    document = design_document(made, time.perf_counter() - start)
-    common.show(document, lambda: design_picture(made, loaded.config.name))
+        stored = ready_library(loaded.config, made)
+    document = design_document(made, stored, time.perf_counter() - start)
+    common.show(document, lambda: design_picture(made, stored, loaded.config.name))
     return 0
 
 
-def design_document(made: Design, wall_s: float) -> dict[str, object]:
-    """The figures of a design, for --json."""
-    # Every decision is solved exactly: there is no library of policies whose gap could be bounded.
-    return {**design_record(made), "library_size": 0, "gap_max": None, "wall_s": wall_s}
+def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
+    """The figures of a design and its policy library, for --json; without a library these are 0 and null."""
+    return {
+        **design_record(made),
+        "library_size": 0 if stored is None else sum(stored.sizes),
+        "gap_max": None if stored is None else stored.check.worst_gap,
+        "library": None if stored is None else library_document(stored),
+        "wall_s": wall_s,
+    }
 
 
-def design_picture(made: Design, name: str) -> RenderableType:
-    """Assumption 4 and the schedule, as tables."""
+def library_document(stored: StoredLibrary) -> dict[str, object]:
+    """The figures of a policy library, for --json."""
+    return {
+        "library_id": stored.library_id,
+        "bytes": len(stored.data),
+        "file": None if stored.path is None else str(stored.path),
+        "cached": stored.cached,
+        "made_s": stored.made_s,
+        "components": [{"name": name, "policies": size} for name, size in zip(stored.names, stored.sizes, strict=True)],
+        "check": msgspec.to_builtins(stored.check),
+    }
+
+
+def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
+    """Assumption 4, the schedule and the policy library, as tables."""
     checks = Table(title=f"Assumption 4, design {made.design_id} of {name}", title_justify="left")
     for heading in ("item", "holds", "value", "limit", "of what"):
         checks.add_column(heading)
@@ -48,4 +94,26 @@ def design_picture(made: Design, name: str) -> RenderableType:
         f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
         f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
     )
-    return Group(checks, terminal, "Schedule: stage t counts on information that is d_t steps old.", schedule)
+    return Group(
+        checks,
+        terminal,
+        "Schedule: stage t counts on information that is d_t steps old.",
+        schedule,
+        *_library_picture(stored),
+    )
+
+
+def _library_picture(stored: StoredLibrary | None) -> list[RenderableType]:
+    if stored is None:
+        return []
+    table = Table(title=f"Policy library {stored.library_id}", title_justify="left")
+    for heading in ("", "policies"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, size in zip(stored.names, stored.sizes, strict=True):
+        table.add_row(name, str(size))
+    check = stored.check
+    shares = ", ".join(f"{count / check.states:.0%} {name}" for name, count in check.methods.items())
+    answers = f"Answers from {check.states} states, most of them anywhere in the limits: {shares}; worst gap "
+    where = "kept nowhere" if stored.path is None else f"{'from' if stored.cached else 'kept in'} {stored.path}"
+    facts = f"{len(stored.data):,} bytes, made in {stored.made_s:.1f} s, {where}."
+    return [table, Text(f"{answers}{check.worst_gap:.1e}."), Text(facts)]

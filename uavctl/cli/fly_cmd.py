@@ -11,9 +11,10 @@ from cyclopts import Parameter
 from logs.disk import check_room
 from logs.recorder import Recorder
 from logs.summary import render
-from uavctl.build import build_controller, build_design
+from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
 from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
+from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon import fly as run_daemon
@@ -46,17 +47,18 @@ def fly(
     config = loaded.config
     with located(loaded):
         design = build_design(config)
-        controller = build_controller(config, design)
-    connections = _connect(config)
     path = recording_path(out, config.name)
     check_room(path, config.log.free_bytes)
+    with located(loaded):
+        prepared = prepare(config, design)
+    connections = _connect(config)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     begun = time.perf_counter()
     with stop_on_signals() as stopped:
         recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
         try:
-            put_header(recorder, config, design, monotonic_ns())
-            loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+            put_header(recorder, prepared, monotonic_ns())
+            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
             with live_line(loop, recorder, duration, config.daemon.tick_s):
                 limit_s = config.fallback.brake_s + LANDING_S

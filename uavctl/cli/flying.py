@@ -22,19 +22,19 @@ from logs.journal import RecorderStatus
 from logs.reader import read
 from logs.report import write_report
 from logs.summary import FlightSummary, summarise
-from logs.topics import HEADER
+from logs.topics import HEADER, LIBRARY
 from uavctl import __version__
 from uavctl.cli.common import messages
-from uavctl.config import Config
+from uavctl.cli.prepare import Prepared
 from uavctl.config.load import dump_config
-from uavctl.data import Header, Record
+from uavctl.data import Header, PolicyLibrary, Record
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design import Design, design_record
+from uavctl.smpc.design import design_record
 
 REFRESH_S = 0.25
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
-_LIBRARIES = ("numpy", "scipy", "clarabel", "pymavlink", "msgspec", "mcap")
+_LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
 class Recording(Protocol):
@@ -60,8 +60,9 @@ def recording_path(out: Path | None, name: str) -> Path:
     return folder / "flight.mcap"
 
 
-def put_header(recorder: Recording, config: Config, design: Design, started_ns: int) -> None:
+def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None:
     """Begin a recording with what is needed to decide alike."""
+    config, design, library = prepared.config, prepared.design, prepared.library
     header = Header(
         started_ns=started_ns,
         started_utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -72,8 +73,12 @@ def put_header(recorder: Recording, config: Config, design: Design, started_ns: 
         design=design_record(design),
         versions=versions(),
         cpu=cpu(),
+        library_id=None if library is None else library.library_id,
     )
     recorder.put(HEADER, started_ns, header)
+    if library is not None:
+        record = PolicyLibrary(library_id=library.library_id, design_id=design.design_id, data=library.data)
+        recorder.put(LIBRARY, started_ns, record)
 
 
 def versions() -> dict[str, str]:

@@ -16,19 +16,22 @@ from logs.info import info as recording_info
 from logs.reader import header, read
 from logs.recover import RecoverResult
 from logs.recover import recover as restore
-from logs.replay import ReplayResult
+from logs.replay import ReplayResult, recorded_library
 from logs.replay import replay as replay_recording
 from logs.replay_tlog import ForeignReplay, replay_tlog
 from logs.report import picture, write_report
 from logs.summary import render, summarise
 from logs.tlog import read_tlog
 from uavctl.build import build_controller, build_design
-from uavctl.cli.common import DEFAULTS, Common, messages
+from uavctl.cli.common import DEFAULTS, Common, located, messages
 from uavctl.cli.flying import cpu, versions
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config
 from uavctl.config.load import parse
 from uavctl.data import Header, Sink
-from uavctl.errors import UsageError
+from uavctl.errors import LibraryError, RecordingError, UsageError
+from uavctl.flight.controller import Controller
+from uavctl.library_store import check_fits, decode
 from uavctl.loop import VEHICLE, ControlLoop
 
 RECOVERED_WITH_LOSS = 3
@@ -77,7 +80,8 @@ def replay(
     _warn_of_differences(recorded)
     config = parse(recorded.config_toml, f"{flight} (configuration)").config
     whole = recording_info(flight)
-    result = replay_recording(read(flight), _loop_maker(config), tolerance, finished=whole.finished)
+    make_loop = _loop_maker(config, _recorded_controller(flight, config))
+    result = replay_recording(read(flight), make_loop, tolerance, finished=whole.finished)
     if whole.missing or whole.dropped:
         text = (
             f"{whole.missing + whole.dropped} records are missing in the recording: what came after cannot be compared"
@@ -112,16 +116,37 @@ def report(
     return 0
 
 
-def _loop_maker(config: Config) -> Callable[[Sink], ControlLoop]:
-    controller = build_controller(config, build_design(config))
+def _recorded_controller(flight: Path, config: Config) -> Controller:
+    """The controller of a recording: with the policy library that it carries, whatever the cache holds.
+
+    Raises:
+        RecordingError: It carries none, or one that does not fit.
+    """
+    design = build_design(config)
+    if config.solver.method != "library":
+        return build_controller(config, design)
+    try:
+        library = decode(recorded_library(flight).data).library
+        check_fits(library, design)
+    except LibraryError as error:
+        raise RecordingError(
+            f"{flight}: {error.reason}; replay it with the version that recorded it (`uavctl log info` tells)"
+        ) from error
+    return build_controller(config, design, library)
+
+
+def _loop_maker(config: Config, controller: Controller) -> Callable[[Sink], ControlLoop]:
     return lambda sink: ControlLoop(config, controller, sink, lambda: 0)
 
 
 def _replay_foreign(flight: Path, common: Common) -> int:
-    config = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load().config
+    loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
+    config = loaded.config
+    with located(loaded):
+        make_loop = _loop_maker(config, prepare(config, build_design(config)).controller)
     packets = ((packet.at_ns, packet.data) for packet in read_tlog(flight) if not packet.outgoing)
     tick_ns = round(config.daemon.tick_s * 1e9)
-    result = replay_tlog(packets, _loop_maker(config), link=VEHICLE, tick_ns=tick_ns)
+    result = replay_tlog(packets, make_loop, link=VEHICLE, tick_ns=tick_ns)
     if not result.positions:
         raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
     common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
@@ -208,6 +233,8 @@ def _info_table(found: RecordingInfo) -> Table:
     caption = [state, f"{found.dropped} dropped, {found.missing} missing", *found.damage]
     if found.origin is not None:
         caption.append(f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})")
+    if found.library is not None:
+        caption.append(f"policy library {found.library.library_id}, {found.library.bytes:,} bytes")
     table.caption = escape("\n".join(caption))
     return table
 

@@ -21,17 +21,16 @@ from logs.recorder import Recorder, SyncRecorder
 from logs.summary import FlightSummary, render
 from sim.server import Ready, serve_in_child
 from sim.world import World
-from uavctl.build import build_controller, build_design
+from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, Common, located, messages
 from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
+from uavctl.cli.prepare import Prepared, prepare
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon import fly
 from uavctl.data import Outgoing, Sink, Truth
 from uavctl.errors import UavctlError, UsageError
-from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design import Design
 from uavctl.transport import open_connection
 
 START_LIMIT_S = 20.0
@@ -58,10 +57,11 @@ def loopback(
         raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
     with located(loaded):
         design = build_design(config)
-        controller = build_controller(config, design)
     path = recording_path(out, config.name)
     check_room(path, config.log.free_bytes)
-    summary = (_real_time if udp else _lockstep)(config, controller, design, path)
+    with located(loaded):
+        prepared = prepare(config, design)
+    summary = (_real_time if udp else _lockstep)(prepared, path)
     common.show(summary, lambda: render(summary))
     return 0 if summary.steps and not summary.recorder_dropped else 1
 
@@ -84,12 +84,13 @@ class _InterruptedError(Exception):
     """The operator asked for the end of a flight in virtual time."""
 
 
-def _lockstep(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
+def _lockstep(prepared: Prepared, path: Path) -> FlightSummary:
+    config = prepared.config
     recorder = SyncRecorder(path, config.log.chunk_bytes, config.log.queue)
     begun = time.perf_counter()
     try:
-        put_header(recorder, config, design, started_ns=0)
-        loop = _Timed(ControlLoop(config, controller, recorder, time.perf_counter_ns))
+        put_header(recorder, prepared, started_ns=0)
+        loop = _Timed(ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns))
         with (
             suppress(_InterruptedError),
             stop_on_signals() as stopped,
@@ -114,7 +115,8 @@ def _lockstep(config: Config, controller: Controller, design: Design, path: Path
     return conclude(path, wall_s, status)
 
 
-def _real_time(config: Config, controller: Controller, design: Design, path: Path) -> FlightSummary:
+def _real_time(prepared: Prepared, path: Path) -> FlightSummary:
+    config = prepared.config
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     urls = {"vehicle": config.daemon.vehicle, "mocap": config.daemon.mocap}
     with ExitStack() as stack:
@@ -124,8 +126,8 @@ def _real_time(config: Config, controller: Controller, design: Design, path: Pat
             stack.callback(connection.close)
         recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
         try:
-            put_header(recorder, config, design, monotonic_ns())
-            loop = ControlLoop(config, controller, recorder, time.perf_counter_ns)
+            put_header(recorder, prepared, monotonic_ns())
+            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             stack.enter_context(_simulator(config, recorder))
             stack.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
             begun = time.perf_counter()

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
@@ -14,10 +15,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from uavctl.build import build_design, build_solver
+from uavctl.build_mission import build_names
 from uavctl.cli.common import DEFAULTS, Common, located
+from uavctl.cli.prepare import ready_library
 from uavctl.config import Config
 from uavctl.data import SolveStatus
 from uavctl.errors import UsageError
+from uavctl.naming import tell_all
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.design import Design
 
@@ -28,7 +32,7 @@ def solve(
         str, Parameter(allow_leading_hyphen=True, help="state now, axis by axis, as in 35,-2,-20,-4", metavar="X,V,...")
     ],
     method: Annotated[
-        Literal["printed", "exact"] | None,
+        Literal["library", "exact", "printed"] | None,
         Parameter(
             help="overrides solver.method; `printed` knows no lower bound: cost_lower and gap are null in --json"
         ),
@@ -39,8 +43,9 @@ def solve(
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
     with located(loaded):
         design = build_design(loaded.config)
-        solver = build_solver(design, loaded.config)
-    x = parse_state(state, design.plant.n_x)
+        x = parse_state(state, design.plant.n_x)
+        stored = ready_library(loaded.config, design)
+        solver = build_solver(design, loaded.config, None if stored is None else stored.library)
     start = time.perf_counter()
     answer = solver.solve(0, x, design.target)
     solve_us = (time.perf_counter() - start) * 1e6
@@ -77,6 +82,7 @@ def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
         "slack": answer.slack,
         "offset": answer.offset,
         "terminal_miss": answer.terminal_miss,
+        "gave_way": msgspec.to_builtins(answer.gave_way),
         "reference": answer.reference.tolist(),
         "method": answer.method,
         "iterations": answer.iterations,
@@ -90,12 +96,13 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
     if not answer.inputs.size:
         hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
         if config.solver.method == "printed":
-            hint = "the printed problem has hard limits; `--method exact` softens those of the state"
+            hint = "the printed problem has hard limits; `library` and `exact` soften those of the state"
         return f"{head}; no plan: {hint}"
     bound = "no lower bound known"
     if math.isfinite(answer.gap):
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
+    gave_way = [tell_all(build_names(design), answer.gave_way)] if answer.gave_way else []
     plan = Table()
     names = state_names(design.plant.n_x, design.plant.axes)
     for heading in ("t", *names, *(f"u_{axis[0]}" for axis in design.plant.axes), "back-off x", "back-off u"):
@@ -106,7 +113,9 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
         plan.add_row(
             str(t), *_figures(state), *_figures(inputs), *blank, _largest(answer.backoff_x[t]), _largest(of_inputs)
         )
-    return Group(head, facts, "Predicted means, inputs, and the largest back-off from a limit, stage by stage:", plan)
+    return Group(
+        head, facts, *gave_way, "Predicted means, inputs, and the largest back-off from a limit, stage by stage:", plan
+    )
 
 
 def state_names(n_x: int, axes: Sequence[str]) -> list[str]:

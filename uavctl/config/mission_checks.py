@@ -125,10 +125,10 @@ def _increasing(key: str, times_s: Floats) -> Iterator[Problem]:
 def solver(given: SolverConfig, told: MissionConfig) -> Iterator[Problem]:
     """The printed problem knows no trajectory."""
     if given.method == "printed" and told.trajectory.times_s:
-        yield Problem("solver.method", '"printed" follows no trajectory', 'use "exact"')
+        yield Problem("solver.method", '"printed" follows no trajectory', 'use "library" or "exact"')
 
 
 def solver_fences(given: SolverConfig, told: Sequence[FenceConfig]) -> Iterator[Problem]:
     """Nor does it know moving limits."""
     if given.method == "printed" and told:
-        yield Problem("solver.method", '"printed" knows no limits that move', 'use "exact"')
+        yield Problem("solver.method", '"printed" knows no limits that move', 'use "library" or "exact"')

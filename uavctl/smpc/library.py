@@ -25,7 +25,8 @@ from uavctl.smpc.region import Region
 Array = NDArray[np.float64]
 
 MOST_POLICIES = 160
-_FOR_OUTLOOKS = 40  # of them for questions with limits of their own, or a path
+MOST_LATE = 60  # for a position that is late: the rare case
+_FOR_OUTLOOKS = 0.25  # share of them for questions with limits of their own, or a path
 _ROUNDS = 100
 _SAMPLES = 300  # states tried in a round
 _TAKEN = 6  # policies taken in from it
@@ -91,13 +92,13 @@ def make_library(design: Design, seed: int = 0, advance: Callable[[str, int, flo
                 if advance is not None:
                     advance(name, count, worst)
 
-            parts.append(_grow(variant, component, rng, told))
+            parts.append(_grow(variant, component, rng, told, most=MOST_LATE if late else MOST_POLICIES))
         variants.append(tuple(parts))
     return Library(design.design_id, tuple(variants))
 
 
 def _grow(
-    design: Design, component: Component, rng: np.random.Generator, told: Callable[[int, float], None]
+    design: Design, component: Component, rng: np.random.Generator, told: Callable[[int, float], None], *, most: int
 ) -> PartLibrary:
     problem = MeanProblem(design, horizon_of(design, component))
     program = PolicyProgram(problem, design.max_iterations)
@@ -106,8 +107,8 @@ def _grow(
         raise DesignError("smpc.k_tau", "no policy meets the terminal condition", "check the design with `design`")
     policies = [first]
     region = Region(design, component)
-    for most, ahead in ((MOST_POLICIES - _FOR_OUTLOOKS, False), (MOST_POLICIES, True)):
-        _fill(problem, program, policies, region, rng, most=most, ahead=ahead, told=told)
+    for share, ahead in ((1.0 - _FOR_OUTLOOKS, False), (1.0, True)):
+        _fill(problem, program, policies, region, rng, most=round(share * most), ahead=ahead, told=told)
     return PartLibrary(
         theta=np.array([policy.theta for policy in policies]),
         level=np.array([policy.level for policy in policies]),

@@ -58,6 +58,11 @@ class LibrarySolver:
         variants = zip((design, *design.late), library.variants, strict=True)
         self._variants = tuple(_Variant(variant, parts, exact=exact) for variant, parts in variants)
 
+    def prepare(self) -> None:
+        """Build the exact programs now, rather than in the first decision that asks for one."""
+        for variant in self._variants:
+            variant.prepare()
+
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
 
@@ -107,6 +112,11 @@ class _Variant:
         upper = np.concatenate([problem.upper for problem in problems])
         lower = np.concatenate([problem.lower for problem in problems])
         self._upper, self._lower = np.where(np.isfinite(upper), upper, OPEN), np.where(np.isfinite(lower), lower, -OPEN)
+
+    def prepare(self) -> None:
+        """See `LibrarySolver.prepare`."""
+        for i in range(len(self._components) if self._exact else 0):
+            self._solver(i)
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook) -> Answer:
         """See `LibrarySolver.solve`."""
