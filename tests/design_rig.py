@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.smpc.design import DesignSpec
+from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope
 
@@ -64,7 +65,7 @@ def spec(name: str, **changes: Any) -> DesignSpec:
         delta_u=smpc["delta_u"],
         delta_tau=smpc["delta_tau"],
         k_tau=np.array(smpc["k_tau"]),
-        link_p=np.full(smpc["horizon"], 1.0 - table["link"]["loss"]),
+        link=bernoulli(np.array([1.0 - table["link"]["loss"]])),
         target_m=tuple(table["target"]["position_m"]),
         rule="fixed",
         delays=table["schedule"]["delays"],

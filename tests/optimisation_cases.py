@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope
 
@@ -60,7 +61,7 @@ def paper_spec(**changes: Any) -> DesignSpec:
         delta_u=0.9,
         delta_tau=0.99,
         k_tau=kron(TWO, [[-0.058, -1.172]]),
-        link_p=np.full(12, 0.7),
+        link=bernoulli(np.array([0.7])),
         target_m=(0.0, 0.0, 0.0),
         rule="fixed",
         delays=5,
@@ -87,7 +88,7 @@ def coupled() -> Design:
         horizon=5,
         tau=1,
         delays=2,
-        link_p=np.full(12, 0.95),
+        link=bernoulli(np.array([0.95])),
     )
 
 

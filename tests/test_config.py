@@ -247,7 +247,8 @@ def test_the_reference_page_is_up_to_date_and_complete() -> None:
 
 
 def config_source() -> str:
-    return (ROOT / "uavctl" / "config" / "types.py").read_text(encoding="utf-8")
+    files = sorted((ROOT / "uavctl" / "config").glob("*.py"))
+    return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
 def test_a_configuration_cannot_be_changed() -> None:

@@ -15,6 +15,7 @@ from scipy.stats import chi2, norm
 from uavctl.errors import DesignError
 from uavctl.smpc import design as design_module
 from uavctl.smpc.design import Design, design_record, make_design
+from uavctl.smpc.link import bernoulli
 from uavctl.smpc.risk import kappa
 from uavctl.smpc.sets import Polytope
 
@@ -165,7 +166,7 @@ def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPat
         ("room", {"target_m": (1.5, 1.0, -0.1)}, "target.position_m", r"Assumption 4\.3 fails.*limit 0\.1"),
         ("paper", {"k_tau": -np.eye(2, 4)}, "smpc.k_tau", r"Assumption 4\.2"),
         ("paper", {"delta_x": 0.99}, "smpc.delta_x", r"0\.99 is out of reach.*0\.9831"),
-        ("paper", {"link_p": np.full(12, 0.4)}, "smpc.delta_x", r"0\.95 is out of reach"),
+        ("paper", {"link": bernoulli(np.array([0.4]))}, "smpc.delta_x", r"0\.95 is out of reach"),
         ("paper", {"delays": 3}, "schedule.delays", r"d_11 = 3 is below 4"),
     ],
 )

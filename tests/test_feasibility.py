@@ -16,10 +16,11 @@ from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, make_design
 from uavctl.smpc.feasibility import check_schedule, optimal_cost
 from uavctl.smpc.horizon import Horizon
+from uavctl.smpc.link import bernoulli
 from uavctl.smpc.reduction import terminal_bound
 from uavctl.smpc.sets import Polytope
 
-GOOD_LINK = np.full(12, 0.8)
+GOOD_LINK = bernoulli(np.array([0.8]))
 
 
 def test_the_papers_schedule_leaves_a_margin() -> None:
@@ -44,7 +45,7 @@ def test_margin_is_reached_and_no_gain_goes_beyond_it() -> None:
 
 
 def test_longer_delays_leave_less_margin() -> None:
-    shorter, longer = (check_schedule(paper(delays=delay, link_p=GOOD_LINK)) for delay in (4, 5))
+    shorter, longer = (check_schedule(paper(delays=delay, link=GOOD_LINK)) for delay in (4, 5))
     assert shorter > longer + 0.1
     assert longer > 0
 
@@ -52,7 +53,7 @@ def test_longer_delays_leave_less_margin() -> None:
 @pytest.mark.parametrize("delays", [6, [5] * 11 + [6], [8] * 12], ids=str)
 def test_schedule_slower_than_the_terminal_law_is_refused(delays: int | list[int]) -> None:
     with pytest.raises(DesignError, match=r"schedule\.delays: the schedule is slower than the terminal law") as refused:
-        check_schedule(paper(delays=delays, link_p=GOOD_LINK))
+        check_schedule(paper(delays=delays, link=GOOD_LINK))
     assert refused.value.key == "schedule.delays"
 
 

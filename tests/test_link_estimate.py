@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import beta, binom, chi2_contingency, norm
 
+from uavctl.data import LinkEstimate
 from uavctl.flight.link_estimate import (
     LinkBelief,
-    LinkEstimate,
     LinkEstimateParameters,
     burst_statistic,
     observe,

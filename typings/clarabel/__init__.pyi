@@ -45,6 +45,8 @@ class DefaultSettings:
     tol_gap_abs: float
     tol_gap_rel: float
     tol_feas: float
+    static_regularization_constant: float
+    max_step_fraction: float
     def __init__(self) -> None: ...
 
 class DefaultSolution:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from uavctl.errors import DesignError
 from uavctl.smpc.design import Design
+from uavctl.smpc.equilibria import equilibria
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -29,7 +30,7 @@ class Component:
         states: Indices of its states in the plant's.
         inputs: Indices of its inputs.
         disturbances: Indices of its disturbances.
-        coordinates: (n_y, n_x): y of the equilibrium that a state belongs to, its positions.
+        coordinates: (n_y, n_x): y of the equilibrium that a state belongs to, its positions where they can be held.
         rows_x: Indices of its rows in the state set.
         rows_u: Indices of its rows in the input set.
         a: A (n_x, n_x); b: B (n_x, n_u); e: E (n_x, n_w); w: W (n_w, n_w).
@@ -45,7 +46,8 @@ class Component:
         sigma_xi: The same of ξ = (x_{H-τ} … x_H).
         sigma_z: The same of z = (x_{H-τ}, u_{H-τ} … u_{H-1}).
         p_xi: Terminal weight of ξ.
-        x_eq: Equilibrium states (n_x, n_y): x_s = x_eq y, with y the positions.
+        held: Indices of the states whose values y is (n_y,).
+        x_eq: Equilibrium states (n_x, n_y): x_s = x_eq y.
         u_eq: Equilibrium inputs (n_u, n_y).
     """
 
@@ -71,6 +73,7 @@ class Component:
     sigma_xi: Array
     sigma_z: Array
     p_xi: Array
+    held: Index
     x_eq: Array
     u_eq: Array
 
@@ -79,7 +82,7 @@ def decompose(design: Design) -> tuple[Component, ...]:
     """Connected components of a design, in the order of their first state.
 
     Raises:
-        DesignError: A state is connected to no input, or positions do not determine the equilibrium.
+        DesignError: A state is connected to no input.
     """
     plant = design.plant
     n_x, n_u, n_w = plant.n_x, plant.n_u, plant.n_w
@@ -108,11 +111,7 @@ def decompose(design: Design) -> tuple[Component, ...]:
 
 
 def whole(design: Design) -> Component:
-    """The design as one component, whatever it decomposes into.
-
-    Raises:
-        DesignError: Positions do not determine the equilibrium.
-    """
+    """The design as one component, whatever it decomposes into."""
     plant = design.plant
     return _component(design, np.arange(plant.n_x), np.arange(plant.n_u), np.arange(plant.n_w))
 
@@ -133,21 +132,21 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
     stack = np.concatenate([i * plant.n_x + states for i in range(terminal.tau + 1)])
     z = np.concatenate([states, *(plant.n_x + i * plant.n_u + inputs for i in range(terminal.tau))])
     a, b = plant.a[np.ix_(states, states)], plant.b[np.ix_(states, inputs)]
-    positions = np.flatnonzero(np.isin(states, plant.position_index))
-    x_eq, u_eq = _equilibria(a, b, positions)
+    q_x, q_u = design.q_x[np.ix_(states, states)], design.q_u[np.ix_(inputs, inputs)]
+    rest = equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
     return Component(
         states=states,
         inputs=inputs,
         disturbances=disturbances,
-        coordinates=np.eye(len(states))[positions],
+        coordinates=rest.coordinates,
         rows_x=rows_x,
         rows_u=rows_u,
         a=a,
         b=b,
         e=plant.e[np.ix_(states, disturbances)],
         w=plant.w[np.ix_(disturbances, disturbances)],
-        q_x=design.q_x[np.ix_(states, states)],
-        q_u=design.q_u[np.ix_(inputs, inputs)],
+        q_x=q_x,
+        q_u=q_u,
         c_x=design.state_set.c[np.ix_(rows_x, states)],
         b_x=design.state_set.b[rows_x],
         c_u=design.input_set.c[np.ix_(rows_u, inputs)],
@@ -158,30 +157,11 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
         sigma_xi=terminal.sigma_xi[np.ix_(stack, stack)],
         sigma_z=terminal.sigma_z[np.ix_(z, z)],
         p_xi=terminal.p_xi[np.ix_(stack, stack)],
-        x_eq=x_eq,
-        u_eq=u_eq,
+        held=rest.held,
+        x_eq=rest.x_eq,
+        u_eq=rest.u_eq,
     )
 
 
 def _finite_rows(c: Array, b: Array) -> Index:
     return np.flatnonzero(np.any(c != 0, axis=1) & np.isfinite(b))
-
-
-def _equilibria(a: Array, b: Array, positions: Index) -> tuple[Array, Array]:
-    """(x_eq, u_eq) with columns in ker [I - A, -B], scaled so that the positions of x_eq y are y."""
-    n_x = a.shape[0]
-    kernel = np.hstack([np.eye(n_x) - a, -b])
-    _, singular, right = np.linalg.svd(kernel)
-    rank = int(np.sum(singular > 1e-10 * singular[0]))
-    basis = right[rank:].T
-    at_positions = basis[positions]
-    if at_positions.shape[0] != at_positions.shape[1] or np.linalg.cond(at_positions) > 1e8:
-        raise DesignError(
-            "plant.position_index",
-            "the positions do not determine the plant's equilibrium",
-            "give each axis one position state and one input",
-        )
-    basis = np.linalg.solve(at_positions.T, basis.T).T
-    basis[np.abs(basis) < 1e-12 * np.max(np.abs(basis))] = 0.0  # rounding of the decomposition
-    basis[positions] = np.eye(len(positions))
-    return basis[:n_x], basis[n_x:]

@@ -4,6 +4,10 @@ x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The
 rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the entries
 of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
 
+Disturbances that the state does not show apart, as under an E or a W without full column rank, are not fed back apart
+either: M_{t,r} = Θ_{t,r} T with T w the part of w that E w determines, in units of its standard deviation. Feedback of
+the rest would only add variance. Where nothing is redundant T = I, and θ are entries of M.
+
 A plan that is based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean
 starts at the prediction x̂(k) under the inputs that were flown, and what acted on it meanwhile is not known yet.
 """
@@ -15,10 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.linalg import block_diag, qr
 
 from uavctl.errors import DesignError
 from uavctl.smpc.components import Component
 from uavctl.smpc.design import Design
+from uavctl.smpc.scaling import RANK_TOLERANCE, equilibrated
 from uavctl.smpc.schedule import Schedule
 
 Array = NDArray[np.float64]
@@ -46,7 +52,11 @@ class Horizon:
         tau: Delay τ of the terminal law.
         free: N = H - τ, the number of stages with a free mean input.
         past: Disturbances before k that are not known at k [steps].
-        gains: (t, r, input, disturbance) of each entry of θ.
+        gains: (t, r, input, row of `feedback`) of each entry of θ.
+        feedback: T (n_f, n_w): M_{t,r} = Θ_{t,r} T. The identity where no disturbance is redundant.
+        drive: Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank.
+        input_stages: Stages whose input limits are not implied by the terminal condition: N, but H where B has not full
+            column rank, because (19c) then says nothing about what the state does not feel.
         phi: Φ_t (H+1, n_x, n_x).
         gamma: Γ_t (H+1, n_x, N n_u).
         gamma_eq: Γ^eq_t (H+1, n_x, n_y).
@@ -67,30 +77,40 @@ class Horizon:
         self.tau = tau
         self.free = steps - tau
         self.past = past
-        n_u, self._n_w = component.b.shape[1], component.e.shape[1]
+        n_u = component.b.shape[1]
+        self._spread, self.feedback, self._root_w = _shown(component.e, component.w)
+        self._n_w = self._spread.shape[1]
+        fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # nothing to feed back otherwise
+        self.drive = _felt(component.b)
+        self.input_stages = self.free if len(self.drive) == n_u else steps
         self.gains = tuple(
             (t, r, i, j)
             for t in range(steps)
             for r in _fed_back(t, int(schedule.delays[t]), self.free, past)
             for i in range(n_u)
-            for j in np.flatnonzero(np.diagonal(component.w)).tolist()  # nothing to feed back otherwise
+            for j in fed_back
         )
         powers = [np.eye(component.a.shape[0])]
         for _ in range(steps + past):
             powers.append(component.a @ powers[-1])
         self.phi = np.array(powers[: steps + 1])
         self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
-        self._spread = component.e @ _root(component.w)
-        self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i E W^½
-        # θ multiplies w, not ω = W^-½ w: each gain acts on a row of W^½.
-        self._root_w = _root(component.w)
+        self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i S
         self.gamma, self.gamma_eq = self._means()
         self.p, self.q, self.c_0 = self._covariance_cost()
 
     @property
     def width(self) -> int:
-        """(past + H) n_w, the number of disturbance entries over the horizon."""
+        """Number of disturbance entries ω over the horizon, (past + H) n_w where none is redundant."""
         return (self.past + self.steps) * int(self._n_w)
+
+    @property
+    def sigma_z(self) -> Array:
+        """Σ_z of z = (x_N, u_N … u_{H-1}), of the inputs what the state feels."""
+        n_x = self.component.a.shape[0]
+        select = block_diag(np.eye(n_x), *[self.drive] * self.tau)
+        sigma: Array = select @ self.component.sigma_z @ select.T
+        return sigma
 
     @property
     def n_theta(self) -> int:
@@ -111,12 +131,11 @@ class Horizon:
         return self._affine(np.zeros((c.shape[0], self.past + self.steps, self._n_w)), {t: c})
 
     def terminal_noise(self) -> Affine:
-        """z = (x_N, u_N … u_{H-1}) as coefficients of the past + N older disturbances, row by row."""
-        n_x, n_u = self.component.b.shape
-        parts = [self.state_noise(self.free, np.eye(n_x))]
-        parts += [self.input_noise(t, np.eye(n_u)) for t in range(self.free, self.steps)]
+        """z of `sigma_z` as coefficients of the past + N older disturbances, row by row."""
+        parts = [self.state_noise(self.free, np.eye(self.component.a.shape[0]))]
+        parts += [self.input_noise(t, self.drive) for t in range(self.free, self.steps)]
         stacked = _stack(parts)
-        columns = np.arange(stacked.offset.size) % self.width
+        columns = np.tile(np.arange(self.width), stacked.offset.size // max(1, self.width))
         # No gain acts on the newer ones, nor do they reach z.
         old = np.flatnonzero(columns < (self.past + self.free) * self._n_w)
         return Affine(stacked.offset[old], stacked.matrix[old])
@@ -178,6 +197,45 @@ def _fed_back(t: int, delay: int, free: int, past: int) -> range:
             f"use at least {t - free + 1} there",
         )
     return range(-past, max(-past, min(t - delay + 1, free)))
+
+
+def _shown(e: Array, w: Array) -> tuple[Array, Array, Array]:
+    """(S, T, R): E w = S ω for ω ~ N(0, I), what is fed back is T w, and T w = R ω.
+
+    T = I, S = E R and R Rᵀ = W unless some of the disturbances cannot be told apart from the state.
+    """
+    root = _cholesky(w)
+    spread = e @ root
+    size = np.linalg.norm(spread, axis=1)
+    size = np.where(size > 0.0, size, 1.0)
+    left, singular, _ = np.linalg.svd(spread / size[:, None], full_matrices=False)
+    rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
+    if rank == np.count_nonzero(np.diagonal(w)):
+        return spread, np.eye(len(w)), root
+    left, singular = left[:, :rank], singular[:rank]
+    inverse = (left / singular).T / size
+    told: Array = inverse @ e
+    told[np.abs(told) < RANK_TOLERANCE * (np.abs(inverse) @ np.abs(e))] = 0.0
+    return size[:, None] * left * singular, told, np.eye(rank)
+
+
+def _felt(b: Array) -> Array:
+    """Rows of B, as many as its rank, that tell what of an input the state feels: the identity if that is all of it."""
+    unit_x, unit_u = equilibrated(b)
+    scaled = b * np.outer(unit_x, unit_u)
+    _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
+    rank = int(np.sum(np.abs(np.diagonal(triangle)) > RANK_TOLERANCE))
+    return np.eye(b.shape[1]) if rank == b.shape[1] else b[np.sort(order[:rank])]
+
+
+def _cholesky(w: Array) -> Array:
+    """Lower triangular L with L Lᵀ = W, positive semi-definite; other units of w scale its rows only."""
+    lower = np.zeros_like(w)
+    for j in range(len(w)):
+        rest = w[j:, j] - lower[j:, :j] @ lower[j, :j]
+        if rest[0] > RANK_TOLERANCE * w[j, j]:
+            lower[j:, j] = rest / np.sqrt(rest[0])
+    return lower
 
 
 def _root(matrix: Array) -> Array:

@@ -227,7 +227,7 @@ class MeanProblem:
         part, horizon = self.horizon.component, self.horizon
         return [
             _row(Kind.INPUT, t, c, sides, horizon.input_noise(t, c[None]), float(self.design.kappa_u[t]), 0.0)
-            for t in range(horizon.free)
+            for t in range(horizon.input_stages)
             for c, sides in _directions(part.c_u)
         ]
 
@@ -269,7 +269,8 @@ class MeanProblem:
         if row.kind is Kind.OFFSET:
             return row.c @ y, -row.c @ self._to_target
         if row.kind is Kind.INPUT:
-            return row.c @ self._input(row.t), row.c @ part.u_eq @ self._here
+            w = self._input(row.t) if row.t < self.horizon.free else part.u_eq @ y
+            return row.c @ w, row.c @ part.u_eq @ self._here
         if row.kind is Kind.STATE:
             w, p = self._mean(row.t)
             return row.c @ w, row.c @ p + row.c @ part.x_eq @ self._here

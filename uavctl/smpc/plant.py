@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, sqrtm
+from scipy.linalg import block_diag
 
 from uavctl.data import Vec3
 from uavctl.errors import DesignError
+from uavctl.smpc.sampling import balanced_units, exponential, logarithm
 
 Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
 _ROUNDING = 1e-12
+_DRIFT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,8 @@ class Plant:
         axes: Axes of local NED that it moves in.
         position_index: State index of each axis' position.
         velocity_index: State index of each axis' velocity.
-        accel_per_input: Acceleration setpoint per unit of input, each axis [m/s² per unit].
+        accel_per_input: Acceleration setpoint per unit of input [m/s² per unit]: a number an axis (n_axes,) where each
+            axis has its own input, in the axes' order; else a map (n_axes, n_u).
 
     Raises:
         DesignError: Shapes do not fit, W is no covariance, or A has no real logarithm.
@@ -46,12 +48,14 @@ class Plant:
     position_index: tuple[int, ...]
     velocity_index: tuple[int, ...]
     accel_per_input: Array
-    _generator: Array = field(init=False, repr=False)
+    _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
+    _generator: Array = field(init=False, repr=False)  # in these units
 
     def __post_init__(self) -> None:
         for name in ("a", "b", "e", "w", "accel_per_input"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         _check(self)
+        object.__setattr__(self, "_units", _frozen(balanced_units(self.a, self.b, self.e)))
         object.__setattr__(self, "_generator", _frozen(_logarithm(self) / self.dt_s))
 
     @property
@@ -82,38 +86,64 @@ class Plant:
             return self.a, self.b, self.e
         if not 0.0 <= dt_s < self.dt_s:
             raise ValueError(f"{dt_s} s is not within a step of {self.dt_s} s")
-        lifted = _exponential(self._generator * dt_s)[: self.n_x]
+        lifted = (exponential(self._generator * dt_s) * (self._units[:, None] / self._units))[: self.n_x]
         a, b, e = np.split(lifted, [self.n_x, self.n_x + self.n_u], axis=1)
         return a, b, e
 
+    @property
+    def accel_map(self) -> Array:
+        """Acceleration setpoint per unit of each input (n_axes, n_u) [m/s² per unit]."""
+        return np.diag(self.accel_per_input) if self.accel_per_input.ndim == 1 else self.accel_per_input
+
     def to_accel(self, u: Array) -> Vec3:
         """Acceleration setpoint [m/s²] of an input (n_u,); 0 in the axes that the plant has not."""
-        accel = dict(zip(self.axes, (float(x) for x in self.accel_per_input * u), strict=True))
+        accel = dict(zip(self.axes, (self.accel_map @ u).tolist(), strict=True))
         north, east, down = (accel.get(axis, 0.0) for axis in AXES)
         return north, east, down
 
     def to_input(self, accel: Vec3) -> Array:
-        """Input (n_u,) of an acceleration setpoint [m/s²]."""
-        wanted: Array = np.array([accel[AXES.index(axis)] for axis in self.axes]) / self.accel_per_input
-        return wanted
+        """Input (n_u,) of an acceleration setpoint [m/s²]: the smallest of those nearest to it.
+
+        Only where each axis has its own input is it the one input that asks for this acceleration.
+        """
+        wanted: Array = np.array([accel[AXES.index(axis)] for axis in self.axes])
+        if self.accel_per_input.ndim == 1:
+            return wanted / self.accel_per_input
+        nearest: Array = np.linalg.pinv(self.accel_per_input) @ wanted
+        return nearest
 
     def equilibrium(self, position_m: Vec3) -> Array:
         """State (n_x,) at rest at a position [m].
 
         Raises:
-            DesignError: The plant cannot rest there.
+            DesignError: The plant cannot rest there; the axes that it cannot hold by themselves are named.
         """
-        free = [i for i in range(self.n_x) if i not in self.position_index]
-        state = np.zeros(self.n_x)
-        for axis, index in zip(self.axes, self.position_index, strict=True):
-            state[index] = position_m[AXES.index(axis)]
-        drift = np.eye(self.n_x) - self.a
-        rest, *_ = np.linalg.lstsq(np.hstack([drift[:, free], -self.b]), -drift @ state, rcond=None)
-        state[free] = np.where(np.abs(rest[: len(free)]) < 1e-12, 0.0, rest[: len(free)])
-        miss = float(np.abs(drift @ state - self.b @ rest[len(free) :]).max())
-        if miss > 1e-9 * max(1.0, float(np.abs(state).max())):
-            raise DesignError("target.position_m", f"the plant cannot rest there (drift {miss:.3g} a step)", "move it")
+        positions = np.array([position_m[AXES.index(axis)] for axis in self.axes])
+        state, drift = self._rest(positions)
+        if drift > _DRIFT:
+            alone = np.diag(np.where(positions == 0.0, 1.0, positions))
+            adrift = [axis for axis, one in zip(self.axes, alone, strict=True) if self._rest(one)[1] > _DRIFT]
+            raise DesignError(
+                "target.position_m",
+                f"the plant cannot rest there (drift {drift:.3g} of the way a step): no input holds {', '.join(adrift)}"
+                " by itself",
+                "move it to a place where the plant can rest, or add an input",
+            )
         return state
+
+    def _rest(self, positions: Array) -> tuple[Array, float]:
+        """State (n_x,) that rests best at the positions (n_axes,), and its drift in a step as a share of it."""
+        held, free = list(self.position_index), [i for i in range(self.n_x) if i not in self.position_index]
+        unit_x, unit_u = self._units[: self.n_x], self._units[self.n_x : self.n_x + self.n_u]
+        drift = (np.eye(self.n_x) - self.a) / unit_x[:, None]
+        pull = -drift[:, held] @ positions
+        rest, *_ = np.linalg.lstsq(np.hstack([drift[:, free] * unit_x[free], -self.b / unit_x[:, None] * unit_u]), pull)
+        rest[np.abs(rest) < _ROUNDING * np.abs(positions / unit_x[held]).max()] = 0.0
+        state = np.zeros(self.n_x)
+        state[held], state[free] = positions, rest[: len(free)] * unit_x[free]
+        miss = drift @ state - self.b / unit_x[:, None] @ (rest[len(free) :] * unit_u)
+        size = max(float(np.abs(state / unit_x).max()), float(np.finfo(np.float64).tiny))
+        return state, float(np.abs(miss).max()) / size
 
 
 def drag_lag(
@@ -149,7 +179,7 @@ def drag_lag(
         lifted[0, 1] = 1.0
         lifted[1, 1:] = [-drag, 1.0, 0.0, 1.0]
         lifted[2, 2:4] = [-1.0 / lag, reach / lag]
-        parts.append(_exponential(lifted * dt_s)[:3])
+        parts.append(exponential(lifted * dt_s)[:3])
     return Plant(
         a=block_diag(*(part[:, :3] for part in parts)),
         b=block_diag(*(part[:, 3:4] for part in parts)),
@@ -169,14 +199,17 @@ def steps_to_reach(plant: Plant) -> int:
     Raises:
         DesignError: No number of steps does.
     """
+    unit_x = plant._units[: plant.n_x]
     reach = np.zeros((plant.n_x, 0))
     for steps in range(1, plant.n_x + 1):
         reach = np.hstack([plant.b, plant.a @ reach])
-        if np.linalg.matrix_rank(reach) == plant.n_x:
+        size = np.abs(reach / unit_x[:, None]).max(axis=0)
+        scaled = reach / unit_x[:, None] / np.where(size > 0.0, size, 1.0)
+        if np.linalg.matrix_rank(scaled) == plant.n_x:
             return steps
     raise DesignError(
         "plant.b",
-        f"the inputs reach {int(np.linalg.matrix_rank(reach))} of {plant.n_x} states only",
+        f"the inputs reach {int(np.linalg.matrix_rank(scaled))} of {plant.n_x} states only",
         "leave out the states that no input moves, or add an input",
     )
 
@@ -195,7 +228,7 @@ def _check(plant: Plant) -> None:
             raise DesignError(f"plant.{name}", f"entry {bad[0].tolist()} is not finite", "give finite numbers")
     if not 0.0 < plant.dt_s < np.inf:
         raise DesignError("plant.dt_s", f"{plant.dt_s:g} s is no step", "give a time above 0")
-    if np.any(plant.accel_per_input == 0.0):
+    if plant.accel_per_input.ndim == 1 and np.any(plant.accel_per_input == 0.0):
         raise DesignError(
             "plant.accel_per_input", "is 0 for an axis, which nothing could steer", "give a number other than 0"
         )
@@ -215,14 +248,16 @@ def _check(plant: Plant) -> None:
 def _check_shapes(plant: Plant) -> None:
     n_x, n_axes = len(plant.a), len(plant.axes)
     n_w = plant.e.shape[-1] if plant.e.ndim else 0
-    wanted = {"a": (n_x, n_x), "b": (n_x, n_axes), "e": (n_x, n_w), "w": (n_w, n_w), "accel_per_input": (n_axes,)}
+    n_u = plant.b.shape[-1] if plant.accel_per_input.ndim == 2 and plant.b.ndim else n_axes
+    accel = (n_axes,) if plant.accel_per_input.ndim == 1 else (n_axes, n_u)
+    wanted = {"a": (n_x, n_x), "b": (n_x, n_u), "e": (n_x, n_w), "w": (n_w, n_w), "accel_per_input": accel}
     for name, shape in wanted.items():
         given = getattr(plant, name).shape
         if given != shape:
             raise DesignError(
                 f"plant.{name}",
                 f"shape {given} is not {shape}",
-                f"A has {n_x} rows, there are {n_axes} axes and {n_w} disturbances",
+                f"A has {n_x} rows, there are {n_axes} axes, {n_u} inputs and {n_w} disturbances",
             )
     if not n_axes or list(plant.axes) != [axis for axis in AXES if axis in plant.axes]:
         raise DesignError("plant.axes", f"{list(plant.axes)} are no axes", f"give some of {list(AXES)}, in this order")
@@ -236,42 +271,8 @@ def _check_shapes(plant: Plant) -> None:
             )
 
 
-def _exponential(matrix: Array) -> Array:
-    """Matrix exponential by scaling, series and squaring.
-
-    scipy's `expm` divides differences of nearly equal diagonal entries of a triangular matrix (SciPy 1.17: an error
-    of 0.05 for drags of 1e-15), and plants with an integrator and little drag are just that.
-    """
-    norm = float(np.abs(matrix).sum(axis=1).max())
-    halvings = max(0, math.ceil(math.log2(max(norm, 0.25) / 0.25)))
-    scaled = matrix / 2.0**halvings
-    term = result = np.eye(len(matrix))
-    for order in range(1, 15):  # 0.25^15 / 15! is below 1e-21
-        term = term @ scaled / order
-        result = result + term
-    for _ in range(halvings):
-        result = result @ result
-    return result
-
-
-def _principal_logarithm(matrix: Array) -> Array:
-    """Matrix logarithm by square roots and series; scipy's `logm` judges itself by its `expm` and warns in vain."""
-    identity = np.eye(len(matrix))
-    root, halvings = matrix, 0
-    while np.abs(root - identity).sum(axis=1).max() > 0.1 and halvings < 60:
-        root, halvings = np.real(sqrtm(root)), halvings + 1
-    # log R = 2 artanh Z with Z = (R + I)⁻¹ (R - I); |Z| <= 0.053, so that |Z|^17 is below 1e-21
-    z = np.linalg.solve(root + identity, root - identity)
-    square = z @ z
-    power = total = z
-    for order in range(3, 17, 2):
-        power = power @ square
-        total = total + power / order
-    return np.asarray(2.0 ** (halvings + 1) * total, dtype=np.float64)
-
-
 def _logarithm(plant: Plant) -> Array:
-    """Real logarithm of [[A, B, E], [0, I]]."""
+    """Real logarithm of [[A, B, E], [0, I]], in the plant's balanced units."""
     eigenvalues = np.linalg.eigvals(plant.a)
     size = float(np.abs(eigenvalues).max())
     # The principal logarithm is real where no eigenvalue is 0 or negative.
@@ -285,7 +286,8 @@ def _logarithm(plant: Plant) -> Array:
         raise refused
     lifted = np.eye(plant.n_x + plant.n_u + plant.n_w)
     lifted[: plant.n_x] = np.hstack([plant.a, plant.b, plant.e])
-    generator = _principal_logarithm(lifted)
-    if np.abs(_exponential(generator) - lifted).max() > 1e-9 * max(1.0, float(np.abs(lifted).max())):
+    lifted *= plant._units / plant._units[:, None]
+    generator = logarithm(lifted)
+    if np.abs(exponential(generator) - lifted).max() > 1e-9 * max(1.0, float(np.abs(lifted).max())):
         raise refused
     return _frozen(generator)

@@ -7,7 +7,6 @@ vehicle far from the origin is computed as well as one at the origin.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -18,54 +17,15 @@ from uavctl.smpc.components import Component
 from uavctl.smpc.cones import ConicProgram, Expression, ProgramBuilder, join
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import Affine, Horizon
+from uavctl.smpc.layout import Layout, Pair, pairs_of
+from uavctl.smpc.origin import RestingPoint
 from uavctl.smpc.reduction import terminal_bound
+from uavctl.smpc.scaling import Scale, Sizes
 
 Array = NDArray[np.float64]
 
 # A reference outside its limits is the last thing to give way: it costs this many times a missed reference.
 _OUTSIDE = 1000.0
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Rows of one set with the same direction up to sign: c z <= upper, -c z <= lower."""
-
-    c: tuple[float, ...]
-    sides: tuple[tuple[float, int], ...]  # (sign, row)
-
-
-def pairs_of(c: Array) -> tuple[Pair, ...]:
-    """Group rows by direction; a pair shares its back-off and its slack."""
-    groups: dict[tuple[float, ...], list[tuple[float, int]]] = {}
-    for i, row in enumerate(c):
-        sign = 1.0 if row[np.flatnonzero(row)[0]] > 0 else -1.0
-        groups.setdefault(tuple((sign * row).tolist()), []).append((sign, i))
-    return tuple(Pair(direction, tuple(sides)) for direction, sides in groups.items())
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where each kind of variable sits."""
-
-    v: slice
-    theta: slice
-    y: slice
-    offset: slice
-    slack: slice
-    miss: slice
-    outside: slice
-    backoff: slice
-
-    @property
-    def size(self) -> int:
-        """Number of variables."""
-        return int(self.backoff.stop)
-
-    @classmethod
-    def of(cls, v: int, theta: int, y: int, slack: int, miss: int, outside: int, backoff: int) -> Layout:
-        """Lay the given numbers of variables out one after another."""
-        ends = np.cumsum([0, v, theta, y, y, slack, miss, outside, backoff]).tolist()
-        return cls(*(slice(i, j) for i, j in pairwise(ends)))
 
 
 class Program:
@@ -77,7 +37,8 @@ class Program:
         soft_terminal: Allow x̄_N to miss x_s, and x_s to be outside its limits, at `terminal_weight`.
 
     In the hard form the rows of stages t >= N are not written out: their means are x_s and u_s, and Cov(x_t) <= Σ_x,
-    Cov(u_t) <= K Σ_x Kᵀ by the terminal condition, so the terminal rows with the largest κ imply them.
+    Cov(u_t) <= K Σ_x Kᵀ by the terminal condition, so the terminal rows with the largest κ imply them. Where B has not
+    full column rank the latter is not so, and the input rows of these stages are written out.
     """
 
     def __init__(self, design: Design, horizon: Horizon, *, soft_terminal: bool) -> None:
@@ -87,6 +48,8 @@ class Program:
         self._pairs_u = pairs_of(self.part.c_u)
         n_x, n_y = self.part.x_eq.shape
         self._placed = np.any(self.part.c_x @ self.part.x_eq != 0, axis=1)  # rows of x_s that y moves
+        self._sizes = _sizes(self.part, horizon.free)
+        self._backoff_sizes: list[float] = []
         self.layout = Layout.of(
             v=horizon.gamma.shape[2],
             theta=horizon.n_theta,
@@ -104,13 +67,20 @@ class Program:
         self._x, self._to_target, self._here, self._limits, self._path_x, self._path_u = given
         self._v = self._builder.variable(self.layout.v)
         self._y = self._builder.variable(self.layout.y)
-        self._next_backoff = self.layout.backoff.start
         self._add_cost()
         self._add_reference()
         self._add_terminal(soft_terminal=soft_terminal)
         self._add_state_rows()
         self._add_input_rows()
-        self.conic: ConicProgram = self._builder.build(design.max_iterations)
+        backoff = terminal_backoff_x(design, self.part)[self._placed]
+        origin = RestingPoint(
+            horizon, self.layout, self._pairs_x, self._last, self._placed, backoff, self._sizes.state[self.part.held]
+        )
+        cost = self._sizes.cost
+        if soft_terminal:  # its prices are far above the stage costs: between the two
+            cost = float(np.sqrt(cost * design.terminal_weight * self._sizes.state.max()))
+        scale = Scale(self._variable_sizes(), cost)
+        self.conic: ConicProgram = self._builder.build(design.max_iterations, scale, origin)
 
     def parameters(self, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Array:
         """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's outlook."""
@@ -140,8 +110,28 @@ class Program:
 
     def _count_backoffs(self) -> int:
         noises = [self._noise_x(t, pair) for t in range(1, self._last + 1) for pair in self._pairs_x]
-        noises += [self._noise_u(t, pair) for t in range(self.horizon.free) for pair in self._pairs_u]
+        noises += [self._noise_u(t, pair) for t in range(self.horizon.input_stages) for pair in self._pairs_u]
         return sum(noise.matrix.nnz > 0 for noise in noises)
+
+    def _variable_sizes(self) -> Array:
+        """Natural size of each variable, in its unit."""
+        sizes, horizon, part = self._sizes, self.horizon, self.part
+        fed_back = np.sqrt(np.einsum("ij,jk,ik->i", horizon.feedback, part.w, horizon.feedback))
+        y = sizes.state[part.held]
+        miss = sizes.state if self.layout.miss.stop > self.layout.miss.start else np.zeros(0)
+        outside = (np.abs(part.c_x) @ sizes.state)[self._placed][: self.layout.outside.stop - self.layout.outside.start]
+        return np.concatenate(
+            [
+                np.tile(sizes.input, horizon.free),
+                [sizes.input_std[i] / fed_back[j] for _, _, i, j in horizon.gains],
+                y,
+                y,
+                np.tile([np.abs(pair.c) @ sizes.state for pair in self._pairs_x], self._last),
+                miss,
+                outside,
+                self._backoff_sizes,
+            ]
+        )
 
     def _add_cost(self) -> None:
         horizon, part, design, layout = self.horizon, self.part, self.design, self.layout
@@ -211,16 +201,21 @@ class Program:
                 k = self.layout.slack.start + (t - 1) * len(self._pairs_x) + i
                 give = self._builder.variable(slice(k, k + 1))
                 unseen = float(np.array(pair.c) @ self.part.estimate_cov @ np.array(pair.c))
-                backoff = self._backoff(self._noise_x(t, pair), float(self.design.kappa_x[t]), unseen)
+                size = float(np.abs(pair.c) @ self._sizes.state_std)
+                backoff = self._backoff(self._noise_x(t, pair), float(self.design.kappa_x[t]), size, unseen)
                 self._add_pair(pair, mean, give - backoff, _part(self._limits, t - 1, self.part.b_x.size))
 
     def _add_input_rows(self) -> None:
-        n_u = self.part.b.shape[1]
+        n_u, std = self.part.b.shape[1], self._sizes.input_std
         here = self.part.u_eq @ self._here
-        for t in range(self.horizon.free):
-            mean = self._builder.variable(slice(t * n_u, (t + 1) * n_u)) + here
+        for t in range(self.horizon.input_stages):
+            moved = self.part.u_eq @ self._y
+            if t < self.horizon.free:
+                moved = self._builder.variable(slice(t * n_u, (t + 1) * n_u))
+            mean = moved + here
             for pair in self._pairs_u:
-                backoff = self._backoff(self._noise_u(t, pair), float(self.design.kappa_u[t]))
+                size = float(np.abs(pair.c) @ std)
+                backoff = self._backoff(self._noise_u(t, pair), float(self.design.kappa_u[t]), size)
                 self._add_pair(pair, mean, -1.0 * backoff, self._constant(self.part.b_u))
 
     def _add_pair(self, pair: Pair, mean: Expression, room: Expression, limits: Expression) -> None:
@@ -228,14 +223,15 @@ class Program:
         for sign, row in pair.sides:
             self._builder.nonnegative(room - sign * value + np.eye(limits.const.size)[row : row + 1] @ limits)
 
-    def _backoff(self, noise: Affine, kappa: float, unseen: float = 0.0) -> Expression:
-        """κ (‖noise(θ)‖² + unseen)^½ (1,): a constant, or a variable with its second-order cone."""
+    def _backoff(self, noise: Affine, kappa: float, size: float, unseen: float = 0.0) -> Expression:
+        """κ (‖noise(θ)‖² + unseen)^½ (1,): a constant, or a variable of natural `size` with its second-order cone."""
         moved = np.diff(noise.matrix.indptr) > 0
         constant = float(np.sqrt(np.sum(noise.offset[~moved] ** 2) + unseen))
         if not moved.any():
             return self._constant(np.array([kappa * constant]))
-        scaled = self._builder.variable(slice(self._next_backoff, self._next_backoff + 1))
-        self._next_backoff += 1
+        k = self.layout.backoff.start + len(self._backoff_sizes)
+        self._backoff_sizes.append(size)
+        scaled = self._builder.variable(slice(k, k + 1))
         parts = [scaled, self._affine(Affine(noise.offset[moved], noise.matrix[moved]))]
         if constant > 0.0:
             parts.append(self._constant(np.array([constant])))
@@ -251,6 +247,10 @@ class Program:
         expression = self._constant(affine.offset)
         expression.var[:, self.layout.theta] = affine.matrix.toarray()
         return expression
+
+
+def _sizes(part: Component, free: int) -> Sizes:
+    return Sizes.of(part.a, part.b, part.q_x, part.q_u, part.c_u, part.b_u, part.sigma_x, part.k, free)
 
 
 def terminal_backoff_x(design: Design, part: Component) -> Array:

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from uavctl.smpc.horizon import Affine, Horizon
+from uavctl.smpc.scaling import RANK_TOLERANCE
 
 Array = NDArray[np.float64]
 
-# Eigenvalues below this share of a unit variance count as an empty direction.
-RANK_TOLERANCE = 1e-10
+# A deviation whose variance RANK_TOLERANCE calls empty.
+_EMPTY = float(np.sqrt(RANK_TOLERANCE))
 
 
 @dataclass(frozen=True, eq=False)
 class TerminalBound:
-    """I - Y Yᵀ ⪰ 0 with Y (rows, columns), row by row affine in θ, and `fixed` = 0.
+    """I - Y Yᵀ ⪰ 0 with Y (rows, columns), row by row affine in θ, and `fixed` = 0, linearly independent.
 
     `least` is the least eigenvalue of R, scaled to unit variances; below zero, no θ meets (19c).
     """
@@ -55,11 +56,11 @@ def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> Terminal
         horizon: The component's prediction.
         move_constants: Move constant columns to the right side; without, R = Σ_z as it stands.
     """
-    sigma = horizon.component.sigma_z
+    sigma = horizon.sigma_z
     z = horizon.terminal_noise()
     n_z = sigma.shape[0]
     n_columns = z.offset.size // n_z
-    column = np.arange(z.offset.size) % n_columns
+    column = np.tile(np.arange(n_columns), n_z)
     acted = np.zeros(n_columns, dtype=bool)
     acted[column[np.diff(z.matrix.indptr) > 0]] = True
     kept = acted if move_constants else np.ones(n_columns, dtype=bool)
@@ -76,7 +77,7 @@ def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> Terminal
         y=_times(whiten, rest, int(kept.sum())),
         rows=whiten.shape[0],
         columns=int(kept.sum()),
-        fixed=_times(outside, rest, int(kept.sum())),
+        fixed=_independent(_times(outside, rest, int(kept.sum())), _effect(rest, np.repeat(scale, kept.sum()))),
         least=float(values[0]),
     )
 
@@ -85,3 +86,21 @@ def _times(matrix: Array, z: Affine, columns: int) -> Affine:
     """matrix · Z for Z stored row by row."""
     wide = sparse.kron(sparse.csr_array(matrix), sparse.eye_array(columns), format="csr")
     return Affine(np.asarray(wide @ z.offset), sparse.csr_array(wide @ z.matrix))
+
+
+def _effect(z: Affine, std: Array) -> Array:
+    """Largest effect of each gain on an entry of z, in standard deviations; 1 for gains without any."""
+    largest = np.abs(z.matrix.toarray() / std[:, None]).max(axis=0, initial=0.0)
+    return np.where(largest > 0.0, largest, 1.0)
+
+
+def _independent(rows: Affine, effect: Array) -> Affine:
+    """Linearly independent equations with the same solutions; what no gain moves is left out unless it is not 0."""
+    left, singular, right = np.linalg.svd(rows.matrix.toarray() / effect)
+    rank = int(np.sum(singular > _EMPTY))
+    along, beside = left[:, :rank].T @ rows.offset, left[:, rank:].T @ rows.offset
+    contradiction = beside[np.abs(beside) > _EMPTY]
+    return Affine(
+        np.concatenate([along / singular[:rank], contradiction]),
+        sparse.csr_array(np.vstack([right[:rank] * effect, np.zeros((contradiction.size, effect.size))])),
+    )
