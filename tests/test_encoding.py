@@ -37,6 +37,7 @@ def values(kind: object) -> st.SearchStrategy[object]:
         float: st.floats() | st.sampled_from([math.nan, math.inf, -math.inf, -0.0, 5e-324]),
         int: st.integers(-(2**63), 2**63 - 1),
         bool: st.booleans(),
+        bytes: st.binary(max_size=8),
         str: st.text(max_size=5) | st.sampled_from(["NaN", "Infinity", "-Infinity", "null", 'x"NaN"']),
         type(None): st.none(),
         object: st.recursive(

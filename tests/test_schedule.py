@@ -196,9 +196,9 @@ def test_the_product_never_exceeds_the_joint_probability_of_independent_losses(
 @hypothesis_given(st.floats(0.75, 1.0), st.floats(0.75, 1.0), st.booleans())
 def test_a_better_link_never_asks_for_more(p: float, other: float, joint: bool) -> None:
     worse, better = (fixed(demand(p=one, joint=joint), 5) for one in sorted((p, other)))
-    assert np.all(better.alpha >= worse.alpha)
+    assert np.all(better.alpha >= worse.alpha - 1e-12)
     assert np.all(better.gamma_x <= worse.gamma_x + 1e-12)
-    assert np.all(better.gamma_u <= worse.gamma_u)
+    assert np.all(better.gamma_u <= worse.gamma_u + 1e-12)
 
 
 def test_bursts_of_the_same_mean_loss_ask_for_more() -> None:

@@ -102,13 +102,15 @@ class Cuts:
         self._unit = np.where(largest > 0.0, largest, 1.0)
         self._cost_unit = max(policy.cost for policy in policies)
         self._h_inverse = np.linalg.inv(problem.h)
-        # A multiplier above a price costs the bound by the slack's quadratic price; where there is none, it is cut.
+        self._a = problem.a[order.origin]
+        # A multiplier above a price costs the bound by the slack's quadratic price, and both sides of a row share one
+        # slack; where there is no quadratic price, the multiplier is cut.
         curved = problem.curve > 0.0
-        self._slack = np.flatnonzero(curved)
-        self._price, self._per_curve = problem.price[self._slack], 0.25 / problem.curve[self._slack]
-        self._most = np.where(curved, np.inf, problem.price)
+        slack = np.flatnonzero(curved)
+        self._pairing = (slack[:, None] == order.origin).astype(np.float64)
+        self._price, self._per_curve = problem.price[slack], 0.25 / problem.curve[slack]
+        self._most = np.where(curved, np.inf, problem.price)[order.origin]
         above, below = np.isfinite(problem.upper), np.isfinite(problem.lower)
-        self._above, self._below = above, below
         self._share = np.where(above & below, 0.5, np.where(above, 1.0, 0.0))[problem.links]
         self._program = self._set_up()
 
@@ -123,27 +125,39 @@ class Cuts:
             level: D of the cut.
             slope: μ of the cut (n_l,).
         """
-        problem, links = self._problem, self._problem.links
-        plus = np.minimum(plus, self._most)
-        minus = np.minimum(minus, self._most - plus)
-        lacking = np.maximum(slope - plus[links] - minus[links], 0.0)
-        plus[links] += self._share * lacking
-        minus[links] += (1.0 - self._share) * lacking
-        net, total = plus - minus, plus + minus
-        g = question.f + net @ problem.a
-        value = question.constant + level - 0.5 * float(g @ self._h_inverse @ g)
-        value += float(net @ question.offset + total @ problem.backoff)
-        value -= float(plus @ np.where(self._above, question.upper, 0.0))
-        value += float(minus @ np.where(self._below, question.lower, 0.0))
-        beyond = np.maximum(total[self._slack] - self._price, 0.0)
-        return value - float(self._per_curve @ beyond**2)
+        order = self._order
+        plus, minus = plus[order.origin], minus[order.origin]
+        plus[order.low] = minus[order.up] = 0.0
+        return self._value(question, order.sides(question), plus, minus, level, slope)
+
+    def _value(
+        self, question: Question, sides: tuple[Array, Array], plus: Array, minus: Array, level: float, slope: Array
+    ) -> float:
+        """The same for rows in order; `plus` and `minus` are changed to multipliers that bound something."""
+        up, low = self._order.up, self._order.low
+        np.minimum(plus, self._most, out=plus)
+        np.minimum(minus, self._most - plus, out=minus)
+        lacking = slope - plus[up] - minus[low]
+        if (lacking > 0.0).any():
+            lacking = np.maximum(lacking, 0.0)
+            plus[up] += self._share * lacking
+            minus[low] += (1.0 - self._share) * lacking
+        g = question.f + (plus - minus) @ self._a
+        value = question.constant + level - 0.5 * float(g @ (self._h_inverse @ g))
+        value -= float(plus @ sides[0] - minus @ sides[1])
+        beyond = self._pairing @ (plus + minus) - self._price
+        if (beyond > 0.0).any():
+            value -= float(self._per_curve @ np.maximum(beyond, 0.0) ** 2)
+        return value
 
     def ask(self, question: Question) -> Below | None:
         """The bound; None where the QP fails."""
-        problem, order, links, n_q = self._problem, self._order, self._problem.links, question.f.size
-        s, up, low = order.static.size, order.up, order.low
+        order, n_q = self._order, question.f.size
+        up, low = order.up, order.low
+        m = low.stop
+        sides = order.sides(question)
         upper, lower = self._upper.copy(), self._lower.copy()
-        upper[: low.stop], lower[: low.stop] = order.sides(question)
+        upper[:m], lower[:m] = sides
         upper[up] -= self._first.backoff
         lower[low] += self._first.backoff
         f = self._f.copy()
@@ -157,11 +171,9 @@ class Cuts:
         if total <= 0.0:
             return None
         weights /= total
-        plus, minus = np.zeros(len(problem.rows)), np.zeros(len(problem.rows))
-        plus[order.static] = np.maximum(multipliers[:s], 0.0)
-        minus[order.static] = np.maximum(-multipliers[:s], 0.0)
-        plus[links], minus[links] = np.maximum(multipliers[up], 0.0), np.maximum(-multipliers[low], 0.0)
-        bound = self.bound(question, plus, minus, float(weights @ self._level), weights @ self._slope)
+        plus = np.maximum(multipliers[:m], 0.0)
+        minus = plus - multipliers[:m]
+        bound = self._value(question, sides, plus, minus, float(weights @ self._level), weights @ self._slope)
         room = variables[n_q:-1] * self._unit + self._first.backoff
         return Below(bound, weights, room, self._slope @ room - self._level)
 

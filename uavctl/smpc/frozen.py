@@ -33,17 +33,21 @@ class Numbers:
 
     Attributes:
         f: Linear terms (Σ n_q,).
-        constant: Constants of the costs (components,).
+        residual: What is left of the cost's residuals at q = 0 (Σ n_r,): its square is the cost's constant.
         offset: What the question adds to the rows (Σ m,).
         upper: Right sides without back-offs (Σ m,), OPEN where there is none.
         lower: Left sides without back-offs.
+        above: Right sides with the frozen policies' back-offs and the offset taken off, the middle for pinned rows.
+        below: Left sides alike.
     """
 
     f: Array
-    constant: Array
+    residual: Array
     offset: Array
     upper: Array
     lower: Array
+    above: Array
+    below: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +57,11 @@ class FrozenAnswer:
     Attributes:
         q: Means (Σ n_q,).
         multipliers: Of the rows (Σ m,), positive at an upper side.
-        above: Right sides with back-offs, the middle for pinned rows (Σ m,).
-        below: Left sides with back-offs.
         accepted: Which components meet the KKT conditions.
     """
 
     q: Array
     multipliers: Array
-    above: Array
-    below: Array
     accepted: list[bool]
 
 
@@ -104,15 +104,17 @@ class Frozen:
         self._parts = [_Certifier([mixture]) for mixture in mixtures]
         self._whole = _Certifier(mixtures)
 
+    def sides(self, upper: Array, lower: Array) -> tuple[Array, Array]:
+        """Sides (Σ m,) with the frozen policies' back-offs; pinned rows are in the middle of both."""
+        above, below, pins = upper - self._backoff, lower + self._backoff, self._pins
+        above[pins] = below[pins] = 0.5 * (above[pins] + below[pins])
+        return above, below
+
     def solve(self, numbers: Numbers) -> FrozenAnswer | None:
         """Solve all components; None where a QP has no optimum."""
-        upper, lower = numbers.upper - numbers.offset, numbers.lower - numbers.offset
-        above, below, pins = upper - self._backoff, lower + self._backoff, self._pins
-        if pins.size:
-            above[pins] = below[pins] = 0.5 * (above[pins] + below[pins])
         means, multipliers = [], []
         for program, mean, rows in zip(self._programs, self.means, self.rows, strict=True):
-            solved = program.solve(numbers.f[mean], above[rows], below[rows])
+            solved = program.solve(numbers.f[mean], numbers.above[rows], numbers.below[rows])
             if solved is None:
                 return None
             means.append(solved[0])
@@ -121,26 +123,26 @@ class Frozen:
         np.minimum(net, self._most, out=net)
         np.maximum(net, -self._most, out=net)
         fits = np.logical_and.reduceat(np.abs(net) <= self._allowed, self._row_starts).tolist()
-        return FrozenAnswer(q, net, above, below, fits)
+        return FrozenAnswer(q, net, fits)
 
     def certify(self, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:
         """Cost and lower bound of all components together."""
-        constant = float(numbers.constant.sum())
+        constant = float(numbers.residual @ numbers.residual)
         return self._whole(
-            constant, numbers.f, numbers.offset, answer.q, answer.multipliers, answer.above, answer.below
+            constant, numbers.f, numbers.offset, answer.q, answer.multipliers, numbers.above, numbers.below
         )
 
-    def certify_part(self, i: int, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:
-        """Cost and lower bound of one component."""
+    def certify_part(self, i: int, constant: float, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:
+        """Cost and lower bound of one component, with its cost's constant."""
         rows, means = self.rows[i], self.means[i]
         return self._parts[i](
-            float(numbers.constant[i]),
+            constant,
             numbers.f[means],
             numbers.offset[rows],
             answer.q[means],
             answer.multipliers[rows],
-            answer.above[rows],
-            answer.below[rows],
+            numbers.above[rows],
+            numbers.below[rows],
         )
 
 
@@ -152,24 +154,27 @@ class _Certifier:
 
     def __init__(self, mixtures: Sequence[Mixture]) -> None:
         problems = [mixture.problem for mixture in mixtures]
-        self._a = block_diag(*(problem.a for problem in problems))
-        self._h = 0.5 * block_diag(*(problem.h for problem in problems))
+        a = block_diag(*(problem.a for problem in problems))
+        half = 0.5 * block_diag(*(problem.h for problem in problems))
         self._h_inverse = 0.5 * block_diag(*(np.linalg.inv(problem.h) for problem in problems))
         self._covariance = float(sum(mixture.first.cost for mixture in mixtures))
         self._level = float(sum(mixture.first.level - mixture.first.slope @ _room(mixture) for mixture in mixtures))
         kinds = np.concatenate([[row.kind for row in problem.rows] for problem in problems])
         self._off = np.flatnonzero(kinds == Kind.OFFSET)
-        self._a_off = self._a[self._off]
+        self._size = half.shape[0]
+        self._of_q = np.vstack([half, a[self._off]])
+        self._of_rows = np.ascontiguousarray(a.T)
         self._price = np.concatenate([problem.price for problem in problems])[self._off]
 
     def __call__(
         self, constant: float, f: Array, offset: Array, q: Array, net: Array, above: Array, below: Array
     ) -> tuple[float, float]:
-        plus = np.maximum(net, 0.0)
-        g = f + net @ self._a
+        plus, n_q = np.maximum(net, 0.0), self._size
+        g = f + self._of_rows @ net
         lower = constant + self._level - float(g @ (self._h_inverse @ g) + plus @ above + (net - plus) @ below)
-        off_target = np.abs(self._a_off @ q + offset[self._off])
-        cost = constant + self._covariance + float(q @ (self._h @ q + f) + self._price @ off_target)
+        of_q = self._of_q @ q
+        off_target = np.abs(of_q[n_q:] + offset[self._off])
+        cost = constant + self._covariance + float(q @ (of_q[:n_q] + f) + self._price @ off_target)
         return cost, lower
 
 

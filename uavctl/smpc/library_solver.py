@@ -27,7 +27,7 @@ from uavctl.smpc.qp import OPEN
 Array = NDArray[np.float64]
 
 # Beyond, squares of numbers that follow from a question's may overflow.
-_ABSURD = 1e100
+_ABSURD = 1e150
 
 _FIRST, _ALL = np.zeros(1, dtype=np.intp), np.ones(1)
 
@@ -103,15 +103,15 @@ class _Variant:
                 unit = np.eye(2 * n_x)[column]
                 self._of_question[rows, column] = problem.parameters(unit[:n_x][part.states], unit[n_x:][part.states])
         linear = block_diag(*(problem.linear for problem in problems))
-        self._linear = np.vstack([linear, block_diag(*(problem.r for problem in problems))])
-        self._split = linear.shape[0]
-        self._residual = block_diag(*(problem.residual_p for problem in problems))
-        self._residual_starts = np.array(
-            [s.start for s in slices([problem.residual_p.shape[0] for problem in problems])]
-        )
+        offset = block_diag(*(problem.r for problem in problems))
+        residual = block_diag(*(problem.residual_p for problem in problems))
+        self._of_p = np.vstack([linear, offset, residual])
+        self._f, self._offset, self._residual = slices([part.shape[0] for part in (linear, offset, residual)])
+        self._residuals = slices([problem.residual_p.shape[0] for problem in problems])
         upper = np.concatenate([problem.upper for problem in problems])
         lower = np.concatenate([problem.lower for problem in problems])
         self._upper, self._lower = np.where(np.isfinite(upper), upper, OPEN), np.where(np.isfinite(lower), lower, -OPEN)
+        self._above, self._below = self._frozen.sides(self._upper, self._lower)
 
     def prepare(self) -> None:
         """See `LibrarySolver.prepare`."""
@@ -121,7 +121,7 @@ class _Variant:
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook) -> Answer:
         """See `LibrarySolver.solve`."""
         asked = np.concatenate([x, target])
-        if not np.abs(asked).max() < _ABSURD:  # NaN too
+        if not np.vdot(asked, asked) < _ABSURD:  # NaN too; vdot does not warn where squares overflow
             return Answer.failed(seq, SolveStatus.FAILED, MIXTURE)
         p = self._of_question @ asked
         numbers = self._numbers(p, outlook)
@@ -141,24 +141,42 @@ class _Variant:
 
     def _numbers(self, p: Array, outlook: Outlook) -> Numbers:
         if outlook.limits is None and outlook.path is None:
-            linear, residual = self._linear @ p, self._residual @ p
-            constant = np.add.reduceat(residual * residual, self._residual_starts)
-            return Numbers(linear[: self._split], constant, linear[self._split :], self._upper, self._lower)
-        questions = [
-            problem.question_of(p[rows], outlook) for rows, problem in zip(self._p, self._problems, strict=True)
-        ]
+            all_of_p = self._of_p @ p
+            offset = all_of_p[self._offset]
+            return Numbers(
+                f=all_of_p[self._f],
+                residual=all_of_p[self._residual],
+                offset=offset,
+                upper=self._upper,
+                lower=self._lower,
+                above=self._above - offset,
+                below=self._below - offset,
+            )
+        parts = list(zip(self._problems, self._p, strict=True))
+        questions = [problem.question_of(p[rows], outlook) for problem, rows in parts]
+        offset = np.concatenate([question.offset for question in questions])
+        upper = np.minimum(np.concatenate([question.upper for question in questions]), OPEN)
+        lower = np.maximum(np.concatenate([question.lower for question in questions]), -OPEN)
+        above, below = self._frozen.sides(upper, lower)
         return Numbers(
             f=np.concatenate([question.f for question in questions]),
-            constant=np.array([question.constant for question in questions]),
-            offset=np.concatenate([question.offset for question in questions]),
-            upper=np.minimum(np.concatenate([question.upper for question in questions]), OPEN),
-            lower=np.maximum(np.concatenate([question.lower for question in questions]), -OPEN),
+            residual=np.concatenate([problem.residual(p[rows], outlook) for problem, rows in parts]),
+            offset=offset,
+            upper=upper,
+            lower=lower,
+            above=above - offset,
+            below=below - offset,
         )
+
+    def _constant(self, i: int, numbers: Numbers) -> float:
+        """Constant of a component's cost."""
+        residual = numbers.residual[self._residuals[i]]
+        return float(residual @ residual)
 
     def _frozen_share(self, i: int, numbers: Numbers, frozen: FrozenAnswer | None) -> Share | None:
         if frozen is None or not frozen.accepted[i]:
             return None
-        cost, lower = self._frozen.certify_part(i, numbers, frozen)
+        cost, lower = self._frozen.certify_part(i, self._constant(i, numbers), numbers, frozen)
         share = Share(frozen.q[self._frozen.means[i]], _FIRST, _ALL, cost, lower, 0.0)
         return share if share.certified else None
 
@@ -166,7 +184,7 @@ class _Variant:
         rows, means = self._frozen.rows[i], self._frozen.means[i]
         question = Question(
             numbers.f[means],
-            float(numbers.constant[i]),
+            self._constant(i, numbers),
             numbers.offset[rows],
             numbers.upper[rows],
             numbers.lower[rows],

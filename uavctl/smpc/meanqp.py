@@ -122,7 +122,6 @@ class MeanProblem:
         self.residual_q, self.residual_p = self._residuals()
         self.h = 2.0 * self.residual_q.T @ self.residual_q
         self.linear = 2.0 * self.residual_q.T @ self.residual_p
-        self._c = 2.0 * self.residual_p.T @ self.residual_p
         self.rows = (*self._input_rows(), *self._state_rows(), *self._reference_rows(), *self._offset_rows())
         self.links = np.array([i for i, row in enumerate(self.rows) if row.noise is not None], dtype=np.intp)
         kinds = np.array([row.kind for row in self.rows])
@@ -145,14 +144,19 @@ class MeanProblem:
 
     def cost(self, p: Array, outlook: Outlook) -> tuple[Array, float]:
         """Linear term f (n_q,) and constant c of the cost."""
+        residual = self.residual(p, outlook)
+        return 2.0 * self.residual_q.T @ residual, float(residual @ residual)
+
+    def residual(self, p: Array, outlook: Outlook) -> Array:
+        """The cost's residuals at q = 0 (n_r,)."""
         if outlook.path is None:
-            return self.linear @ p, 0.5 * float(p @ self._c @ p)
+            return np.asarray(self.residual_p @ p)
         part, free = self.horizon.component, self.horizon.free
         path = (outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs])
         roots = (_factor(part.q_x), _factor(part.q_u))
         wanted = np.concatenate([(values @ root.T).ravel() for values, root in zip(path, roots, strict=True)])
-        residual = self.residual_p @ p - wanted
-        return 2.0 * self.residual_q.T @ residual, float(residual @ residual)
+        residual: Array = self.residual_p @ p - wanted
+        return residual
 
     def sides(self, outlook: Outlook) -> tuple[Array, Array]:
         """Upper and lower limits (m,) of every row, without back-offs."""

@@ -13,6 +13,7 @@ from uavctl.smpc.answer import Answer, Outlook, relative_gap
 from uavctl.smpc.assemble import KEPT, WORSE, PartAnswer, gave_way, inside
 from uavctl.smpc.components import Component
 from uavctl.smpc.design import Design
+from uavctl.smpc.frozen import slices
 from uavctl.smpc.horizon import Affine
 from uavctl.smpc.mixture import Mixture
 
@@ -65,51 +66,50 @@ class PlanMap:
         self._shape_u, self._shape_x = (steps, plant.n_u), (steps + 1, plant.n_x)
         self._of_x, self._of_u = _prediction(plant.a, plant.b, steps)
         self._tables = [_backoffs(design, mixture) for mixture in mixtures]
-        self._low, self._high, self._oblique = _box(design)
+        low, high, self._oblique = _box(design)
+        self._low, self._high = np.tile(low, steps), np.tile(high, steps)
         self._plan = self._plan_matrix()
+        self._inputs, self._states, self._reference = slices([steps * plant.n_u, (steps + 1) * plant.n_x, plant.n_x])
+        self._off = slice(self._reference.stop, self._plan.shape[0])
         self._backoff_x, self._backoff_u = self._collect([table[0] for table in self._tables])
         self._backoff_x.flags.writeable = self._backoff_u.flags.writeable = False  # every frozen answer has these
 
     def frozen(self, seq: int, x: Array, p: Array, q: Array, cost: float, lower: float) -> Answer:
         """Answer under every component's first policy, with no state row left; p (Σ n_p,) as the QPs have it."""
-        return self._answer(
-            seq, FROZEN, x, np.concatenate([q, p]), (self._backoff_x, self._backoff_u), cost, lower, 0.0
-        )
+        asked = np.concatenate([q, p, x])
+        return self._answer(seq, FROZEN, asked, (self._backoff_x, self._backoff_u), cost, lower, 0.0)
 
     def mixed(self, seq: int, x: Array, p: Array, shares: Sequence[Share], outlook: Outlook) -> Answer:
         """Answer of which every component's share is from its library."""
         tables = zip(self._tables, shares, strict=True)
         backoffs = self._collect([share.weights @ table[share.policies] for table, share in tables])
         cost, lower = sum(share.cost for share in shares), sum(share.lower for share in shares)
-        qp = np.concatenate([*(share.q for share in shares), p])
-        answer = self._answer(seq, MIXTURE, x, qp, backoffs, cost, lower, sum(share.slack for share in shares))
+        asked = np.concatenate([*(share.q for share in shares), p, x])
+        answer = self._answer(seq, MIXTURE, asked, backoffs, cost, lower, sum(share.slack for share in shares))
         return self._told(answer, outlook)
 
     def _answer(
         self,
         seq: int,
         method: str,
-        x: Array,
-        qp: Array,
+        asked: Array,
         backoffs: tuple[Array, Array],
         cost: float,
         lower: float,
         slack: float,
     ) -> Answer:
-        plan = self._plan @ qp
-        n_u, n_x = self._shape_u[0] * self._shape_u[1], self._shape_x[1]
-        inputs = self._clipped(plan[:n_u].reshape(self._shape_u))
+        plan = self._plan @ asked
         return Answer(
             seq=seq,
             status=SolveStatus.OPTIMAL,
             method=method,
-            inputs=inputs,
-            states=(self._of_x @ x + self._of_u @ inputs.ravel()).reshape(self._shape_x),
+            inputs=self._clipped(plan[self._inputs]),
+            states=plan[self._states].reshape(self._shape_x),
             backoff_x=backoffs[0],
             backoff_u=backoffs[1],
-            reference=plan[n_u : n_u + n_x],
+            reference=plan[self._reference],
             slack=slack,
-            offset=float(np.abs(plan[n_u + n_x :]).sum()),
+            offset=sum(map(abs, plan[self._off].tolist())),
             terminal_miss=0.0,
             cost=cost,
             cost_lower=lower,
@@ -153,7 +153,7 @@ class PlanMap:
         for where, part in parts:
             inputs[:, where.inputs] = part.inputs
             reference[where.states] = part.reference
-        inputs = self._clipped(inputs)
+        inputs = self._clipped(inputs.ravel())
         backoff_x = np.zeros((self._shape_x[0], design.state_set.b.size))
         backoff_u = np.zeros((self._shape_u[0], design.input_set.b.size))
         for where, part in parts:
@@ -185,13 +185,14 @@ class PlanMap:
         return replace(answer, gave_way=gave_way(self._design, answer, self._components, outlook))
 
     def _clipped(self, inputs: Array) -> Array:
-        """Inputs cut back to their limits; the QPs' tolerance is all that is cut."""
+        """Inputs (H n_u,) cut back to their limits, as (H, n_u); the QPs' tolerance is all that is cut."""
         if self._oblique:
-            return inside(inputs, self._design.input_set.c, self._design.input_set.b)[0]
-        return np.minimum(np.maximum(inputs, self._low), self._high)
+            return inside(inputs.reshape(self._shape_u), self._design.input_set.c, self._design.input_set.b)[0]
+        return np.minimum(np.maximum(inputs, self._low), self._high).reshape(self._shape_u)
 
     def _plan_matrix(self) -> Array:
-        """(q, p) of all components -> inputs, reference, offsets."""
+        """(q, p) of all components and x -> inputs, states, reference, offsets."""
+        n_x = self._shape_x[1]
         problems = [mixture.problem for mixture in self._mixtures]
         n_q, n_p = sum(p.h.shape[0] for p in problems), sum(p.n_p for p in problems)
         columns = np.zeros((self._shape_u[0] * self._shape_u[1] + self._shape_x[1], n_q + n_p))
@@ -212,7 +213,10 @@ class PlanMap:
             rows[:, where] = np.hstack([problem.a, problem.r])[len(problem.rows) - problem.n_y :]  # the last rows
             offsets.append(rows)
             at_q, at_p = at_q + size_q, at_p + problem.n_p
-        return np.vstack([columns, *offsets])
+        inputs, reference = np.vsplit(columns, [self._shape_u[0] * self._shape_u[1]])
+        of_x = np.zeros((len(inputs) + len(self._of_x) + n_x + sum(map(len, offsets)), n_x))
+        of_x[len(inputs) : len(inputs) + len(self._of_x)] = self._of_x
+        return np.hstack([np.vstack([inputs, self._of_u @ inputs, reference, *offsets]), of_x])
 
     def _collect(self, rows: Sequence[Array]) -> tuple[Array, Array]:
         """Tables of back-offs of the whole plant from those of its components; not to be written to."""

@@ -70,7 +70,7 @@ class QuadraticProgram:
 
     def _read(self) -> tuple[Array, Array] | None:
         z, value, flag, info = self._solve()
-        # NaN comes back as solved; the square's overflow counts as no number either.
-        if flag not in _OPTIMAL or not isfinite(value) or not isfinite(z @ z):
+        # NaN comes back as solved; the square's overflow counts as no number either (and vdot does not warn of it).
+        if flag not in _OPTIMAL or not isfinite(value) or not isfinite(np.vdot(z, z)):
             return None
         return z, info["lam"]
