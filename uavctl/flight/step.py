@@ -94,7 +94,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     setpoint, applied = _setpoint(choice.state, tick, inp.at_ns, controller)
     acting = np.zeros(controller.plant.n_u) if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
-    alarms = state.link_alarms if link is None else _alarms(link)
+    alarms = state.link_alarms if link is None else _alarms(link, state.link_alarms)
     after = replace(
         choice.state,
         link=belief,
@@ -154,9 +154,13 @@ def _link(
     return belief, report(belief, controller.link, at_ns)
 
 
-def _alarms(link: LinkEstimate) -> tuple[str, ...]:
-    holds = {"link-bursts": link.bursts, "link-below-promise": link.below_promise}
-    return tuple(code for code, on in holds.items() if on)
+def _alarms(link: LinkEstimate, told: tuple[str, ...]) -> tuple[str, ...]:
+    """What holds of the link; what was told holds until the estimate is on the good side, or it would be told often."""
+    holds = {
+        "link-bursts": (link.bursts, link.burst_statistic > 0.0),
+        "link-below-promise": (link.below_promise, link.arrival_mean < link.promised),
+    }
+    return tuple(code for code, (on, still) in holds.items() if on or (still and code in told))
 
 
 def _link_events(alarms: tuple[str, ...], told: tuple[str, ...], link: LinkEstimate | None) -> tuple[Event, ...]:

@@ -73,12 +73,14 @@ class Below:
         weights: Weights of the cuts (K,), of sum 1.
         room: What the bound leaves to each link's back-off (n_l,).
         height: How far the bound's φ is above each cut (K,).
+        sides: Sides of the rows in order.
     """
 
     bound: float
     weights: Array
     room: Array
     height: Array
+    sides: tuple[Array, Array]
 
 
 class Cuts:
@@ -175,7 +177,7 @@ class Cuts:
         minus = plus - multipliers[:m]
         bound = self._value(question, sides, plus, minus, float(weights @ self._level), weights @ self._slope)
         room = variables[n_q:-1] * self._unit + self._first.backoff
-        return Below(bound, weights, room, self._slope @ room - self._level)
+        return Below(bound, weights, room, self._slope @ room - self._level, sides)
 
     def _set_up(self) -> QuadraticProgram:
         problem, order, first = self._problem, self._order, self._first

@@ -70,13 +70,19 @@ class Library:
     variants: tuple[tuple[PartLibrary, ...], ...]
 
 
-def make_library(design: Design, seed: int = 0, advance: Callable[[str, int, float], None] | None = None) -> Library:
+def make_library(
+    design: Design,
+    seed: int = 0,
+    advance: Callable[[str, int, float], None] | None = None,
+    most: int = MOST_POLICIES,
+) -> Library:
     """Grow the library of a design; the same design and seed give the same library.
 
     Args:
         design: The design.
         seed: Of the sampled states.
         advance: Told the component, the number of its policies and the worst gap of each round.
+        most: Most policies of a component, for fresh positions.
 
     Raises:
         DesignError: A component has no policy at all.
@@ -92,7 +98,7 @@ def make_library(design: Design, seed: int = 0, advance: Callable[[str, int, flo
                 if advance is not None:
                     advance(name, count, worst)
 
-            parts.append(_grow(variant, component, rng, told, most=MOST_LATE if late else MOST_POLICIES))
+            parts.append(_grow(variant, component, rng, told, most=min(MOST_LATE, most) if late else most))
         variants.append(tuple(parts))
     return Library(design.design_id, tuple(variants))
 

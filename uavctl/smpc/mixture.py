@@ -32,7 +32,7 @@ _STEEPEST = 30.0
 _ACTIVE = 1e-6
 _HIGHEST = 4
 # A gap that a single policy may leave: fewer calls are worth more than a better plan there.
-_GOOD = 8e-5
+_GOOD = 1e-4
 # Programs for mixtures of up to so many policies are set up in advance.
 _MIXED = 12
 
@@ -91,7 +91,8 @@ class Mixture:
         self._linear = self.theta @ horizon.q
         soft = np.isfinite(problem.price)
         self._price = np.where(soft, problem.price, 0.0)
-        self._state = np.array([row.kind is Kind.STATE for row in problem.rows])
+        self._of_q = np.vstack([0.5 * problem.h, problem.a])
+        self._states = np.flatnonzero([row.kind is Kind.STATE for row in problem.rows])
         self._order = RowOrder(problem)
         self.cuts = Cuts(problem, policies, self._order)
         self._choice = self._choice_program()
@@ -111,7 +112,7 @@ class Mixture:
         alone = self._alone(question, below.bound, int(np.argmax(below.weights)))
         if alone is not None and relative_gap(alone.cost, below.bound) <= _GOOD:
             return below.bound, alone
-        mixed = self._mix(question, below.bound, self._choose(below))
+        mixed = self._mix(question, below, self._choose(below))
         if mixed is None or (alone is not None and alone.cost <= mixed.cost):
             return below.bound, alone
         return below.bound, mixed
@@ -119,11 +120,15 @@ class Mixture:
     def cost_of(self, question: Question, q: Array, backoff: Array, covariance: float) -> tuple[float, float]:
         """Cost of a mean q under back-offs (m,) and a covariance cost, and the sum of its state slacks."""
         problem = self.problem
-        value = problem.a @ q + question.offset
-        beyond = np.maximum(np.maximum(value + backoff - question.upper, question.lower + backoff - value), 0.0)
-        mean = question.constant + float(q @ (0.5 * (problem.h @ q) + question.f))
-        cost = mean + covariance + float(self._price @ beyond + problem.curve @ beyond**2)
-        return cost, float(beyond[self._state].sum())
+        n_q = question.f.size
+        of_q = self._of_q @ q
+        value = of_q[n_q:] + question.offset
+        beyond = np.maximum(np.maximum(value - question.upper, question.lower - value) + backoff, 0.0)
+        cost = question.constant + covariance + float(q @ (of_q[:n_q] + question.f) + self._price @ beyond)
+        slack = beyond[self._states]
+        if slack.any():
+            cost += float(problem.curve[self._states] @ slack**2)
+        return cost, float(slack.sum())
 
     def _choice_program(self) -> QuadraticProgram:
         """Dual of min Σλ_k J_k s.t. Σλ_k β_k <= room: variables are the prices of the back-offs, and ϑ."""
@@ -159,7 +164,7 @@ class Mixture:
         cost, slack = self.cost_of(question, solved[0], backoff, float(self.cost[k]))
         return Mixed(solved[0], np.array([k]), _ALL, backoff, float(self.cost[k]), cost, bound, slack)
 
-    def _mix(self, question: Question, bound: float, chosen: NDArray[np.intp]) -> Mixed | None:
+    def _mix(self, question: Question, below: Below, chosen: NDArray[np.intp]) -> Mixed | None:
         """The mean and the weights of the chosen policies together; the last one's weight is what the others leave."""
         problem, order = self.problem, self._order
         n_q, k = question.f.size, chosen.size - 1
@@ -173,7 +178,7 @@ class Mixture:
         backoff = (self.backoff[others] - self.backoff[last]).T
         a[order.up, n_q:], a[order.low, n_q:] = backoff, -backoff
         upper, lower = mixer.upper.copy(), mixer.lower.copy()
-        upper[: order.low.stop], lower[: order.low.stop] = order.sides(question)
+        upper[: order.low.stop], lower[: order.low.stop] = below.sides
         upper[order.up] -= self.backoff[last]
         lower[order.low] += self.backoff[last]
         solved = mixer.program.solve_anew(h, f, a, upper, lower)
@@ -188,7 +193,7 @@ class Mixture:
         full[problem.links] = weights @ self.backoff[chosen]
         covariance = float(weights @ (0.5 * (hessian @ weights) + self._linear[chosen])) + problem.horizon.c_0
         cost, slack = self.cost_of(question, values[:n_q], full, covariance)
-        return Mixed(values[:n_q], chosen, weights, full, covariance, cost, bound, slack)
+        return Mixed(values[:n_q], chosen, weights, full, covariance, cost, below.bound, slack)
 
     def _mixer(self, k: int) -> _Mixer:
         """Program of a mixture of k + 1 policies, with all that no question changes."""
