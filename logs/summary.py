@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from enum import StrEnum
 from itertools import pairwise
 
@@ -67,6 +68,8 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     rejected: int  # samples that it refused
     solves: int
     failed_solves: int  # ended otherwise than optimal
+    methods: dict[str, int]  # plans by how they were found
+    largest_gap: float | None  # of a plan's cost above its certified lower bound, relative; None without a plan
     missed_ticks: int
     max_age_s: float  # largest age of the newest sample at a flown tick
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
@@ -119,6 +122,8 @@ def summarise(
         rejected=sum(d.rejected for d in flight.decisions),
         solves=len(solves),
         failed_solves=sum(status is not SolveStatus.OPTIMAL for status in solves),
+        methods=dict(sorted(Counter(plan.method for plan in flight.plans).items())),
+        largest_gap=max((plan.gap for plan in flight.plans if np.isfinite(plan.gap)), default=None),
         missed_ticks=sum(d.missed_ticks for d in flight.decisions),
         max_age_s=max((e.age_s for e in flight.estimates if e.at_ns in flown_ns), default=0.0),
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
@@ -126,6 +131,14 @@ def summarise(
         recorder_dropped=recorder_dropped,
         ended=_ending(flight),
     )
+
+
+def _methods(s: FlightSummary) -> str:
+    """How plans were found, and how far from the optimum the worst is certified to be."""
+    if not s.methods:
+        return "none"
+    certified = "" if s.largest_gap is None else f"; certified gap at most {max(s.largest_gap, 0.0):.1e} of the cost"
+    return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
 
 
 def position_error_m(flight: FlightData) -> Floats:
@@ -189,6 +202,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
         ("State outside limits", f"{count(s.state_violations, 'step')}{_share(s.state_violations, s.steps)}{seen}"),
         ("Input outside limits", f"{count(s.input_violations, 'step')}{_share(s.input_violations, s.steps)}"),
         ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
+        ("Plans found", _methods(s)),
         ("Cost", f"{s.cost:.6g}{seen}"),
         ("Distance from target", _distance(s)),
         ("Decision time", _times(s.decision_us)),
