@@ -88,7 +88,7 @@ def _state_limits(flight: FlightData, s: FlightSummary) -> str:
         return f"The {whose} state stayed inside its limits at every step."
     share = 100 * s.state_violations / s.steps
     return (
-        f"The {whose} state was outside its limits at {s.state_violations} of {count(s.steps, 'step')} ({share:.2g} %)"
+        f"The {whose} state was outside its limits at {s.state_violations} of {count(s.steps, 'step')} ({share:.3g} %)"
         f"{_worst(flight)}."
     )
 
@@ -101,7 +101,9 @@ def _worst(flight: FlightData) -> str:
     beyond = np.nan_to_num(np.maximum(lower - states, states - upper), nan=0.0, neginf=0.0)
     _, index = np.unravel_index(int(beyond.argmax()), beyond.shape)
     most = float(beyond.max())
-    return f", at worst {most:.2g} beyond a limit of {flight.design.state_name(int(index))}" if most > 0 else ""
+    design = flight.design
+    unit = " m" if index in design.position_index else " m/s" if index in design.velocity_index else ""
+    return f", at worst {most:.2g}{unit} beyond a limit of {design.state_name(int(index))}" if most > 0 else ""
 
 
 def _input_limits(flight: FlightData, s: FlightSummary) -> str:

@@ -268,7 +268,9 @@ def _flown(one: Case, i: int, ask: Asked, answer: Answer) -> Array:
     table = one.backoffs[i]
     if same(table[0]):
         return np.asarray(mixture.theta[0])
-    _, mixed = mixture.bounds(one.question(i, ask.x, ask.target, ask.outlook))
+    variant = one.solver._variants[ask.outlook.late]
+    p = variant._of_question @ np.concatenate([ask.x, ask.target])
+    mixed = variant._mixed_share(i, p, variant._numbers(p, ask.outlook))
     if mixed is not None and same(mixed.weights @ table[mixed.policies]):
         return np.asarray(mixed.weights @ mixture.theta[mixed.policies])
     theta = exact_gains(one, i, ask)

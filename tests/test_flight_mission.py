@@ -181,7 +181,7 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
     summary = summarise(fenced, wall_s=1.0)
     assert summary.state_violations == np.count_nonzero(beyond > 0) > 5
     (sentence,) = [text for text in story(fenced, summary) if "was outside its limits" in text]
-    assert f"at worst {beyond.max():.2g} beyond a limit of north position" in sentence
+    assert f"at worst {beyond.max():.2g} m beyond a limit of north position" in sentence
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import optimisation_cases as cases
 import pytest
 from design_rig import one_axis, paper_plant, spec
 from library_rig import PRESETS, bounds, case
 
+from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
 from uavctl.smpc import library as maker
 from uavctl.smpc.components import decompose
+from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
 from uavctl.smpc.late import with_late
 from uavctl.smpc.library import Library, make_library
@@ -55,15 +58,16 @@ def content(library: Library) -> list[bytes]:
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight policies, five for a late position, do for how a library is made."""
-    monkeypatch.setattr(maker, "MOST_POLICIES", 8)
+    """Five policies for a late position do for how a library is made."""
     monkeypatch.setattr(maker, "MOST_LATE", 5)
 
 
 @pytest.mark.usefixtures("few")
 def test_the_same_design_and_seed_give_the_same_bytes_and_another_seed_others() -> None:
     design = small(late=1)
-    first, again, other = make_library(design, 3), make_library(small(late=1), 3), make_library(design, 4)
+    first, again, other = (
+        make_library(one, seed, most=8) for one, seed in ((design, 3), (small(late=1), 3), (design, 4))
+    )
     assert content(first) == content(again)
     assert content(first) != content(other)
     assert first.design_id == design.design_id
@@ -73,7 +77,7 @@ def test_the_same_design_and_seed_give_the_same_bytes_and_another_seed_others() 
 def test_there_is_a_library_for_every_age_and_component_and_progress_is_told() -> None:
     design = small(late=2)
     heard: list[tuple[str, int, float]] = []
-    library = make_library(design, advance=lambda name, count, worst: heard.append((name, count, worst)))
+    library = make_library(design, advance=lambda name, count, worst: heard.append((name, count, worst)), most=8)
     assert [len(parts) for parts in library.variants] == [1, 1, 1]
     assert [part.theta.shape[0] for parts in library.variants for part in parts] == [8, 5, 5]
     names = list(dict.fromkeys(name for name, _, _ in heard))
@@ -138,3 +142,29 @@ def test_states_are_drawn_all_over_the_box_and_around_the_target(name: str) -> N
             assert part.a @ target + part.b @ part.u_eq @ part.coordinates @ target == pytest.approx(target, abs=1e-9)
             assert np.all(target >= lower[part.states] - 1e-9)
             assert np.all(target <= upper[part.states] + 1e-9)
+
+
+@pytest.mark.parametrize(
+    "design",
+    [
+        cases.paper(plant=cases.paper_plant(w=np.zeros((2, 2)))),
+        cases.paper(plant=cases.paper_plant(w=np.diag([0.6, 0.0]))),
+        cases.paper(state_set=Polytope.from_box([-np.inf, -20.0, -40.0, -20.0], [50.0, 7.0, 40.0, np.inf])),
+        cases.paper(input_set=Polytope.from_box([-np.inf, -7.5], [7.5, 7.5])),
+        cases.coupled(),
+    ],
+    ids=["no disturbance", "one axis undisturbed", "open limits", "open input", "coupled"],
+)
+def test_unusual_designs_have_libraries_whose_certificates_hold(design: Design) -> None:
+    solver, exact = LibrarySolver(design, make_library(design, most=12), exact=False), ConicSolver(design)
+    rng, certified = np.random.default_rng(5), 0
+    for _ in range(25):
+        x = rng.uniform([-20.0, -5.0, -20.0, -5.0], [35.0, 5.0, 18.0, 5.0])
+        answer, optimum = solver.solve(0, x, design.target), exact.solve(0, x, design.target)
+        assert answer.status is SolveStatus.OPTIMAL
+        size = max(1.0, abs(optimum.cost))
+        assert answer.cost_lower <= optimum.cost + 1e-6 * size
+        assert optimum.cost_lower <= answer.cost + 1e-6 * size
+        assert not np.isnan(answer.gap)
+        certified += answer.gap < 1e-2
+    assert certified >= 5  # a dozen policies

@@ -56,26 +56,31 @@ def test_a_mixture_is_a_plan_that_keeps_its_rows_and_costs_what_it_says(name: st
     for ask, i, _, _ in optima(name):
         problem = one.problems[i]
         question = one.question(i, ask.x, ask.target, ask.outlook)
-        _, mixed = one.mixtures[i].bounds(question)
-        assert mixed is not None
-        assert mixed.weights.min() >= 0.0
-        assert mixed.weights.sum() == pytest.approx(1.0, abs=1e-12)
-        mixed_any += mixed.weights.max() < 0.999
-        policies = [one.policies[i][k] for k in mixed.policies]
-        backoff = problem.backoff.copy()
-        backoff[problem.links] = mixed.weights @ [policy.backoff for policy in policies]
-        assert mixed.backoff == pytest.approx(backoff, rel=1e-12, abs=1e-12)
-        theta, horizon = mixed.weights @ [policy.theta for policy in policies], problem.horizon
-        covariance = 0.5 * theta @ horizon.p @ theta + horizon.q @ theta + horizon.c_0
-        assert mixed.covariance == pytest.approx(covariance, rel=1e-9)
-        value = problem.a @ mixed.q + question.offset
-        over = np.maximum(value + backoff - question.upper, question.lower + backoff - value)
-        soft = np.isfinite(problem.price)
-        assert over[~soft].max() < 1e-6
-        beyond = np.maximum(over[soft], 0.0)
-        mean = question.constant + mixed.q @ (0.5 * problem.h @ mixed.q + question.f)
-        mean += problem.price[soft] @ beyond + problem.curve[soft] @ beyond**2
-        assert mixed.cost == pytest.approx(mean + covariance, rel=1e-9)
+        _, alone_or_mixed = one.mixtures[i].bounds(question)
+        below = one.mixtures[i].cuts.ask(question)
+        assert alone_or_mixed is not None
+        assert below is not None
+        # The mixture of the policies worth mixing too, where one policy alone would have done.
+        mixture = one.mixtures[i]._mix(question, below, one.mixtures[i]._choose(below))
+        for mixed in (alone_or_mixed, *([] if mixture is None else [mixture])):
+            assert mixed.weights.min() >= 0.0
+            assert mixed.weights.sum() == pytest.approx(1.0, abs=1e-12)
+            mixed_any += mixed.weights.max() < 0.999
+            policies = [one.policies[i][k] for k in mixed.policies]
+            backoff = problem.backoff.copy()
+            backoff[problem.links] = mixed.weights @ [policy.backoff for policy in policies]
+            assert mixed.backoff == pytest.approx(backoff, rel=1e-12, abs=1e-12)
+            theta, horizon = mixed.weights @ [policy.theta for policy in policies], problem.horizon
+            covariance = 0.5 * theta @ horizon.p @ theta + horizon.q @ theta + horizon.c_0
+            assert mixed.covariance == pytest.approx(covariance, rel=1e-9)
+            value = problem.a @ mixed.q + question.offset
+            over = np.maximum(value + backoff - question.upper, question.lower + backoff - value)
+            soft = np.isfinite(problem.price)
+            assert over[~soft].max() < 1e-6
+            beyond = np.maximum(over[soft], 0.0)
+            mean = question.constant + mixed.q @ (0.5 * problem.h @ mixed.q + question.f)
+            mean += problem.price[soft] @ beyond + problem.curve[soft] @ beyond**2
+            assert mixed.cost == pytest.approx(mean + covariance, rel=1e-9)
     assert mixed_any > 5
 
 

@@ -80,7 +80,7 @@ class Answer:
         cost: Objective: cost (18) and all penalties.
         cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method
             knows none.
-        gap: (cost - cost_lower) / max(1, |cost|); inf if no lower bound is known.
+        gap: (cost - cost_lower) / |cost|, see `relative_gap`; inf if no lower bound is known.
         iterations: Interior-point iterations, summed over all programs that were run.
     """
 
@@ -131,9 +131,13 @@ class Answer:
         )
 
 
+# Costs below are zero but for rounding: those of a plant without disturbance, at rest in its target.
+LEAST_COST = 1e-6
+
+
 def relative_gap(cost: float, cost_lower: float) -> float:
-    """Gap of an answer relative to its cost, or absolute where the cost is below 1."""
-    return (cost - cost_lower) / max(1.0, abs(cost))
+    """Gap of an answer relative to its cost; a cost below LEAST_COST counts as that."""
+    return (cost - cost_lower) / max(LEAST_COST, abs(cost))
 
 
 class Solver(Protocol):

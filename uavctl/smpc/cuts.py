@@ -102,7 +102,7 @@ class Cuts:
         self._first = policies[0]
         largest = np.max([policy.backoff for policy in policies], axis=0)
         self._unit = np.where(largest > 0.0, largest, 1.0)
-        self._cost_unit = max(policy.cost for policy in policies)
+        self._cost_unit = max(policy.cost for policy in policies) or 1.0
         self._h_inverse = np.linalg.inv(problem.h)
         self._a = problem.a[order.origin]
         # A multiplier above a price costs the bound by the slack's quadratic price, and both sides of a row share one

@@ -155,8 +155,8 @@ class _Variant:
         parts = list(zip(self._problems, self._p, strict=True))
         questions = [problem.question_of(p[rows], outlook) for problem, rows in parts]
         offset = np.concatenate([question.offset for question in questions])
-        upper = np.minimum(np.concatenate([question.upper for question in questions]), OPEN)
-        lower = np.maximum(np.concatenate([question.lower for question in questions]), -OPEN)
+        upper = np.concatenate([question.upper for question in questions])
+        lower = np.concatenate([question.lower for question in questions])
         above, below = self._frozen.sides(upper, lower)
         return Numbers(
             f=np.concatenate([question.f for question in questions]),

@@ -19,6 +19,7 @@ from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import Affine, Horizon
 from uavctl.smpc.layout import pairs_of
 from uavctl.smpc.program import terminal_backoff_u, terminal_backoff_x
+from uavctl.smpc.qp import OPEN
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -72,8 +73,8 @@ class Question:
         f: Linear term of the cost (n_q,).
         constant: Its constant.
         offset: What p adds to every row, R p (m,).
-        upper: Right sides (m,), without back-offs.
-        lower: Left sides (m,), without back-offs.
+        upper: Right sides (m,), without back-offs, OPEN where there is none.
+        lower: Left sides (m,) alike.
         p: Parameters (n_p,).
     """
 
@@ -181,7 +182,7 @@ class MeanProblem:
         """The same for parameters p (n_p,)."""
         f, constant = self.cost(p, outlook)
         upper, lower = self.sides(outlook)
-        return Question(f, constant, self.r @ p, upper, lower, p)
+        return Question(f, constant, self.r @ p, np.minimum(upper, OPEN), np.maximum(lower, -OPEN), p)
 
     def inputs(self, w: Array, here: Array) -> Array:
         """Absolute mean inputs (H, n_u) of w = (v, y)."""

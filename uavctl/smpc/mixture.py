@@ -138,7 +138,7 @@ class Mixture:
         a = np.zeros((n_l + k, n_l + 1))
         a[:n_l, :n_l] = np.eye(n_l)
         a[n_l:, :n_l], a[n_l:, -1] = -self.backoff / self._unit, 1.0
-        dearer = (self.cost - self.cost.min()) / self.cost.max()
+        dearer = (self.cost - self.cost.min()) / (self.cost.max() or 1.0)
         self._choice_upper = np.concatenate([np.full(n_l, _STEEPEST), dearer])
         self._choice_lower = np.concatenate([np.zeros(n_l), np.full(k, -OPEN)])
         rest = np.zeros(n_l + k)

@@ -25,7 +25,6 @@ class Region:
 
     def __init__(self, design: Design, component: Component) -> None:
         self._part, self._design = component, design
-        n_x = component.a.shape[0]
         around = _SPREAD * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
         home = design.target[component.states]
         self._lower, self._upper = home - around, home + around
@@ -34,7 +33,8 @@ class Region:
             if used.size == 1:
                 (self._upper if row[used[0]] > 0 else self._lower)[used[0]] = side / row[used[0]]
         self._home = component.coordinates @ home
-        self._root = np.linalg.cholesky(component.sigma_x + 1e-12 * np.trace(component.sigma_x) * np.eye(n_x))
+        values, vectors = np.linalg.eigh(component.sigma_x)
+        self._root = vectors * np.sqrt(np.maximum(values, 0.0))
         self._y_lower, self._y_upper = self._reach(design, component)
 
     def _reach(self, design: Design, component: Component) -> tuple[Array, Array]:

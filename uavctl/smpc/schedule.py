@@ -181,14 +181,14 @@ def _likelihoods(demand: Demand, delays: tuple[int, ...]) -> Schedule:
         raise DesignError(
             "smpc.delta_x" if most == demand.delta_x else "smpc.delta_u",
             f"{most} is out of reach: the feedback of stage {worst} is usable with probability {alpha[worst]:.4f}",
-            "lower it, take longer schedule.delays, or improve link.loss",
+            "lower it, take longer schedule.delays (of at most smpc.tau + 1), or improve the link",
         )
     if usable[-1] <= demand.delta_x + _STRICT:
         raise DesignError(
             "smpc.delta_x",
             f"{demand.delta_x} is out of reach: the feedback of all stages is usable with probability "
             f"{usable[-1]:.4f} only",
-            "lower it, take longer schedule.delays, or improve link.loss",
+            "lower it, take longer schedule.delays (of at most smpc.tau + 1), or improve the link",
         )
     gamma_x = np.where(np.arange(demand.horizon + 1) == 0, 1.0, demand.delta_x / usable)
     return Schedule(delays=delays, alpha=alpha, gamma_x=gamma_x, gamma_u=demand.delta_u / alpha)
