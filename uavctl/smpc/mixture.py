@@ -30,7 +30,7 @@ _CURVATURE = 1e-6
 _STEEPEST = 30.0
 # Multipliers below this do not choose a policy; and so many policies with the highest cuts are mixed in any case.
 _ACTIVE = 1e-6
-_HIGHEST = 4
+_HIGHEST = 6
 # A gap that a single policy may leave: fewer calls are worth more than a better plan there.
 _GOOD = 1e-4
 # Programs for mixtures of up to so many policies are set up in advance.
@@ -109,13 +109,14 @@ class Mixture:
         below = self.cuts.ask(question)
         if below is None:
             return -np.inf, None
-        alone = self._alone(question, below.bound, int(np.argmax(below.weights)))
-        if alone is not None and relative_gap(alone.cost, below.bound) <= _GOOD:
-            return below.bound, alone
-        mixed = self._mix(question, below, self._choose(below))
-        if mixed is None or (alone is not None and alone.cost <= mixed.cost):
-            return below.bound, alone
-        return below.bound, mixed
+        best = self._alone(question, below.bound, int(np.argmax(below.weights)))
+        for choose in (self._highest, self._choose):
+            if best is not None and relative_gap(best.cost, below.bound) <= _GOOD:
+                break
+            mixed = self._mix(question, below, choose(below))
+            if best is None or (mixed is not None and mixed.cost < best.cost):
+                best = mixed
+        return below.bound, best
 
     def cost_of(self, question: Question, q: Array, backoff: Array, covariance: float) -> tuple[float, float]:
         """Cost of a mean q under back-offs (m,) and a covariance cost, and the sum of its state slacks."""
@@ -144,10 +145,16 @@ class Mixture:
         rest = np.zeros(n_l + k)
         return QuadraticProgram(_CURVATURE * np.eye(n_l + 1), a, rest.astype(np.int32), rest, rest, TOLERANCE)
 
-    def _choose(self, below: Below) -> NDArray[np.intp]:
-        """Policies worth mixing: with the highest cuts, and those that fit the room at the least cost."""
+    def _highest(self, below: Below) -> NDArray[np.intp]:
+        """Policies with the highest cuts: nearly always enough to mix."""
         chosen = below.weights > _ACTIVE
         chosen[np.argsort(below.height, kind="stable")[:_HIGHEST]] = True
+        return np.flatnonzero(chosen)
+
+    def _choose(self, below: Below) -> NDArray[np.intp]:
+        """Policies worth mixing: with the highest cuts, and those that fit the room at the least cost."""
+        chosen = np.zeros(below.weights.size, dtype=bool)
+        chosen[self._highest(below)] = True
         f = np.append(below.room / self._unit, -1.0)
         solved = self._choice.solve(f, self._choice_upper, self._choice_lower)
         if solved is not None:
