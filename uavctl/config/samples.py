@@ -13,7 +13,7 @@ from uavctl.config.problem import Problem
 from uavctl.config.section import Floats
 
 _TOLD = 5  # bad rows that are told one by one
-_TODO = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
+_WANTED = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
 _WITHOUT, _WITH = 4, 7  # columns
 
 
@@ -83,7 +83,7 @@ def _three(values: Floats) -> tuple[float, float, float]:
 def _wrong(cells: list[str], width: int) -> Iterator[str]:
     """What is wrong with a row, if anything."""
     if len(cells) not in (_WITHOUT, _WITH):
-        yield f"has {len(cells)} columns; {_TODO}"
+        yield f"has {len(cells)} columns; {_WANTED}"
     elif len(cells) != width:
         yield f"has {len(cells)} columns, the first row has {width}"
     for cell in cells:

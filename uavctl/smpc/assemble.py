@@ -23,7 +23,7 @@ INPUT_TOLERANCE = 1e-6
 KEPT = 1e-6
 
 # The worst of several components' endings is the plan's: the later in this list, the worse.
-WORSE = (
+_ORDER = (
     SolveStatus.OPTIMAL,
     SolveStatus.INACCURATE,
     SolveStatus.ITERATION_LIMIT,
@@ -64,7 +64,7 @@ def assemble(
     outlook: Outlook = NOMINAL,
 ) -> Answer:
     """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
-    status = max((part.status for _, part in parts), key=WORSE.index)
+    status = max((part.status for _, part in parts), key=_ORDER.index)
     iterations = sum(part.iterations for _, part in parts)
     if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
         return Answer.failed(seq, status, method, iterations)
@@ -95,9 +95,14 @@ def assemble(
         gap=relative_gap(cost, cost_lower),
         iterations=iterations,
     )
+    return told(design, answer, [component for component, _ in parts], outlook)
+
+
+def told(design: Design, answer: Answer, components: Sequence[Component], outlook: Outlook) -> Answer:
+    """The answer with the names of what gave way, if anything did."""
     if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
         return answer
-    return replace(answer, gave_way=gave_way(design, answer, [component for component, _ in parts], outlook))
+    return replace(answer, gave_way=gave_way(design, answer, components, outlook))
 
 
 def gave_way(design: Design, answer: Answer, components: Sequence[Component], outlook: Outlook) -> tuple[GaveWay, ...]:

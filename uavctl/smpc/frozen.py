@@ -147,7 +147,7 @@ class Frozen:
 
 
 class _Certifier:
-    """Cost of a frozen mean that keeps every state row, and the Lagrangian's value (see `Mixture.bound`).
+    """Cost of a frozen mean that keeps every state row, and the Lagrangian's value (see `Cuts.bound`).
 
     Of a pinned row both sides have a multiplier: their difference is the QP's, their sum the policy's.
     """

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, relative_gap
-from uavctl.smpc.assemble import PartAnswer
+from uavctl.smpc.assemble import PartAnswer, assemble
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import PartSolver
 from uavctl.smpc.design import Design
@@ -207,7 +207,7 @@ class _Variant:
                 if part is None or exact.status is SolveStatus.OPTIMAL:
                     part, method = exact, EXACT
             parts.append((component, part or PartAnswer.failed(SolveStatus.INFEASIBLE)))
-        return self._plans.assemble(seq, method, x, parts, outlook)
+        return assemble(self._design, seq, method, x, parts, outlook)
 
     def _solver(self, i: int) -> PartSolver:
         """The exact program of a component; built when it is first asked for."""

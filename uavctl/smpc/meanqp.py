@@ -18,7 +18,7 @@ from uavctl.smpc.answer import NOMINAL, Outlook
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import Affine, Horizon
 from uavctl.smpc.layout import pairs_of
-from uavctl.smpc.program import terminal_backoff_u, terminal_backoff_x
+from uavctl.smpc.program import factor, terminal_backoff_u, terminal_backoff_x
 from uavctl.smpc.qp import OPEN
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ class MeanProblem:
             return np.asarray(self.residual_p @ p)
         part, free = self.horizon.component, self.horizon.free
         path = (outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs])
-        roots = (_factor(part.q_x), _factor(part.q_u))
+        roots = (factor(part.q_x), factor(part.q_u))
         wanted = np.concatenate([(values @ root.T).ravel() for values, root in zip(path, roots, strict=True)])
         residual: Array = self.residual_p @ p - wanted
         return residual
@@ -217,7 +217,7 @@ class MeanProblem:
         part = self.horizon.component
         y = np.eye(self.n_v + self.n_y)[self.n_v :]
         of_w, of_p = [], []
-        root_x, root_u = _factor(part.q_x), _factor(part.q_u)
+        root_x, root_u = factor(part.q_x), factor(part.q_u)
         for t in range(self.horizon.free):
             w, p = self._mean(t)
             of_w.append(root_x @ (w - part.x_eq @ y))
@@ -310,10 +310,3 @@ def _row(kind: Kind, t: int, c: Array, sides: tuple[int, int], noise: Affine, ka
     if noise.matrix.nnz:
         return Row(kind, t, c, *sides, 0.0, noise, kappa, unseen)
     return Row(kind, t, c, *sides, kappa * float(np.sqrt(noise.offset @ noise.offset + unseen)))
-
-
-def _factor(matrix: Array) -> Array:
-    """R with RᵀR = matrix, positive semi-definite."""
-    values, vectors = np.linalg.eigh(matrix)
-    factor: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    return factor

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer, Outlook, relative_gap
-from uavctl.smpc.assemble import KEPT, WORSE, PartAnswer, gave_way, inside
+from uavctl.smpc.assemble import PartAnswer, inside, told
 from uavctl.smpc.components import Component
 from uavctl.smpc.design import Design
 from uavctl.smpc.frozen import slices
@@ -86,7 +86,7 @@ class PlanMap:
         cost, lower = sum(share.cost for share in shares), sum(share.lower for share in shares)
         asked = np.concatenate([*(share.q for share in shares), p, x])
         answer = self._answer(seq, MIXTURE, asked, backoffs, cost, lower, sum(share.slack for share in shares))
-        return self._told(answer, outlook)
+        return told(self._design, answer, self._components, outlook)
 
     def _answer(
         self,
@@ -129,7 +129,7 @@ class PlanMap:
         return PartAnswer(
             status=SolveStatus.OPTIMAL,
             iterations=0,
-            inputs=problem.inputs(w, here),
+            inputs=inside(problem.inputs(w, here), part.c_u, part.b_u)[0],
             backoff_x=table[:split].reshape(steps + 1, part.rows_x.size),
             backoff_u=table[split:].reshape(steps, part.rows_u.size),
             reference=part.x_eq @ (w[problem.n_v :] + here),
@@ -139,50 +139,6 @@ class PlanMap:
             cost=share.cost,
             cost_lower=share.lower,
         )
-
-    def assemble(
-        self, seq: int, method: str, x: Array, parts: Sequence[tuple[Component, PartAnswer]], outlook: Outlook
-    ) -> Answer:
-        """Answer for the whole plant; without a plan if a component has none."""
-        status = max((part.status for _, part in parts), key=WORSE.index)
-        iterations = sum(part.iterations for _, part in parts)
-        if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
-            return Answer.failed(seq, status, method, iterations)
-        design = self._design
-        inputs, reference = np.zeros(self._shape_u), np.zeros(self._shape_x[1])
-        for where, part in parts:
-            inputs[:, where.inputs] = part.inputs
-            reference[where.states] = part.reference
-        inputs = self._clipped(inputs.ravel())
-        backoff_x = np.zeros((self._shape_x[0], design.state_set.b.size))
-        backoff_u = np.zeros((self._shape_u[0], design.input_set.b.size))
-        for where, part in parts:
-            backoff_x[:, where.rows_x], backoff_u[:, where.rows_u] = part.backoff_x, part.backoff_u
-        cost, lower = sum(part.cost for _, part in parts), sum(part.cost_lower for _, part in parts)
-        answer = Answer(
-            seq=seq,
-            status=status,
-            method=method,
-            inputs=inputs,
-            states=(self._of_x @ x + self._of_u @ inputs.ravel()).reshape(self._shape_x),
-            backoff_x=backoff_x,
-            backoff_u=backoff_u,
-            reference=reference,
-            slack=sum(part.slack for _, part in parts),
-            offset=sum(part.offset for _, part in parts),
-            terminal_miss=sum(part.terminal_miss for _, part in parts),
-            cost=cost,
-            cost_lower=lower,
-            gap=relative_gap(cost, lower),
-            iterations=iterations,
-        )
-        return self._told(answer, outlook)
-
-    def _told(self, answer: Answer, outlook: Outlook) -> Answer:
-        """The answer with the names of what gave way."""
-        if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
-            return answer
-        return replace(answer, gave_way=gave_way(self._design, answer, self._components, outlook))
 
     def _clipped(self, inputs: Array) -> Array:
         """Inputs (H n_u,) cut back to their limits, as (H, n_u); the QPs' tolerance is all that is cut."""

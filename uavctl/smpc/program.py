@@ -135,7 +135,7 @@ class Program:
 
     def _add_cost(self) -> None:
         horizon, part, design, layout = self.horizon, self.part, self.design, self.layout
-        state, control = _factor(part.q_x), _factor(part.q_u)
+        state, control = factor(part.q_x), factor(part.q_u)
         x_s, u_s = part.x_eq @ self._y, part.u_eq @ self._y
         n_u = part.b.shape[1]
         n_x = part.a.shape[0]
@@ -147,7 +147,7 @@ class Program:
             for t in range(horizon.free, horizon.steps):
                 self._builder.square(state @ (self._mean(t) - x_s))
             xi = [self._mean(t) - x_s for t in range(horizon.free, horizon.steps + 1)]
-            self._builder.square(_factor(part.p_xi) @ join(*xi))
+            self._builder.square(factor(part.p_xi) @ join(*xi))
         self._builder.quadratic(layout.theta, horizon.p, horizon.q, horizon.c_0)
         for where, linear, square in (
             (layout.offset, design.offset_weight, 0.0),
@@ -273,8 +273,8 @@ def _part(stacked: Expression, i: int, size: int) -> Expression:
     return Expression(stacked.var[rows], stacked.par[rows], stacked.const[rows])
 
 
-def _factor(matrix: Array) -> Array:
+def factor(matrix: Array) -> Array:
     """R with RᵀR = matrix, positive semi-definite."""
     values, vectors = np.linalg.eigh(matrix)
-    factor: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    return factor
+    root: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return root
