@@ -1,0 +1,1 @@
+"""Campaigns: many runs of many controllers on the same noise and the same losses."""

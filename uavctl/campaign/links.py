@@ -1,0 +1,83 @@
+"""What the link of a configuration does to the positions of many runs: which one is the newest in each step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.config.link import LinkConfig
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+
+_ROUNDING = 1e-9
+
+
+def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
+    """Capture step of the newest position that is known at the beginning of each step.
+
+    One position is captured a step, at its beginning; the first one is known at once, as in the paper.
+
+    Args:
+        link: The link; losses of every model, delay, jitter and blackouts act.
+        dt_s: Δt [s].
+        chances: Uniform draws (N, T+1, 3), see `Chances.link`.
+
+    Returns:
+        Steps (N, T).
+    """
+    steps = chances.shape[1] - 1
+    lost = _lost(link, dt_s, chances[:, :steps])
+    under_way_s = link.delay_s + link.jitter_s * chances[:, :steps, 2]
+    late = np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
+    captured = np.arange(steps)
+    known = np.where(lost, steps, captured + late)  # the step that knows it first
+    known[:, 0] = 0
+    found = np.zeros(lost.shape, dtype=np.intp)
+    runs = np.arange(lost.shape[0])
+    for step in captured:
+        first = known[:, step]
+        (there,) = np.nonzero(first < steps)
+        found[runs[there], first[there]] = np.maximum(found[runs[there], first[there]], step)
+    return np.maximum.accumulate(found, axis=1)
+
+
+def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
+    """Which positions (N, T) never arrive."""
+    steps = chances.shape[1]
+    at_s = np.arange(steps) * dt_s
+    dark = np.any([(begin <= at_s) & (at_s <= end) for begin, end in link.blackout] or [np.zeros(steps, bool)], axis=0)
+    if link.model == "gilbert-elliott":
+        lost = _bursts(link, chances)
+    elif link.model == "empirical":
+        lost = _gaps(link, chances)
+    elif link.probability:
+        arrives = np.array(link.probability)[np.minimum(np.arange(steps), len(link.probability) - 1)]
+        lost = chances[:, :, 1] >= arrives
+    else:
+        lost = chances[:, :, 1] < link.loss
+    return np.asarray(lost | dark, dtype=np.bool_)
+
+
+def _bursts(link: LinkConfig, chances: Array) -> Flags:
+    """Gilbert and Elliott's channel: good before the first packet, a step of the chain before each."""
+    lost = np.zeros(chances.shape[:2], dtype=np.bool_)
+    bad = np.zeros(chances.shape[0], dtype=np.bool_)
+    for k in range(chances.shape[1]):
+        step, draw = chances[:, k, 0], chances[:, k, 1]
+        bad = np.where(bad, step >= link.burst_leave, step < link.burst_enter)
+        lost[:, k] = draw < np.where(bad, link.burst_loss, link.loss)
+    return lost
+
+
+def _gaps(link: LinkConfig, chances: Array) -> Flags:
+    """Runs of losses as measured: one is drawn before the first packet, and after each that arrives."""
+    runs = np.cumsum(link.gaps)
+    lost = np.zeros(chances.shape[:2], dtype=np.bool_)
+    to_lose = np.full(chances.shape[0], -1, dtype=np.intp)
+    for k in range(chances.shape[1]):
+        drawn = np.searchsorted(runs, chances[:, k, 0] * runs[-1], side="right")
+        to_lose = np.where(to_lose < 0, drawn, to_lose) - 1
+        lost[:, k] = to_lose >= 0
+    return lost

@@ -1,0 +1,160 @@
+"""The SMPC for many runs: re-plan on news, play out on silence, brake where the plan has run out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.data import SolveStatus
+from uavctl.smpc.answer import Answer, Outlook, Solver
+from uavctl.smpc.batch import News, predict
+from uavctl.smpc.design import Design
+from uavctl.smpc.plant import Plant
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """Answers to M questions.
+
+    Attributes:
+        solved: Whether there is a plan (M,).
+        inputs: Mean inputs (M, H, n_u); zero where there is none.
+        slack: Sum of the state rows' slacks (M,).
+        cost: Cost of the plan (M,), inf where there is none.
+        gap: Certified relative gap (M,), inf where none is known.
+    """
+
+    solved: Flags
+    inputs: Array
+    slack: Array
+    cost: Array
+    gap: Array
+
+
+class Decider(Protocol):
+    """Answers many questions towards one target."""
+
+    def decide(self, x: Array, late: int) -> Decisions:
+        """Plans from states (M, n_x), predicted from positions `late` steps old."""
+        ...
+
+
+class OneByOne:
+    """Decisions by a solver, one after the other: what flies. The slow, exact side of every faster one."""
+
+    def __init__(self, solver: Solver, target: Array, shape: tuple[int, int]) -> None:
+        """Args: the solver; the target (n_x,); (H, n_u)."""
+        self._solver, self._target, self._shape = solver, target, shape
+
+    def decide(self, x: Array, late: int) -> Decisions:
+        """See `Decider`."""
+        outlook = Outlook(late=late)
+        answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(x)]
+        return gathered(answers, self._shape)
+
+
+def gathered(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
+    """Answers of a solver side by side."""
+    solved = np.array([answer.status is SolveStatus.OPTIMAL for answer in answers], dtype=np.bool_)
+    inputs = np.zeros((len(answers), *shape))
+    for i in np.flatnonzero(solved):
+        inputs[i] = answers[i].inputs
+    slack, cost, gap = (
+        np.array([getattr(answer, name) for answer in answers]).reshape(-1) for name in ("slack", "cost", "gap")
+    )
+    return Decisions(solved, inputs, slack, cost, gap)
+
+
+@dataclass(eq=False)
+class Tally:
+    """What the controller met, by run (N,).
+
+    Attributes:
+        decisions: Plans asked for.
+        infeasible: Those that were not found.
+        slack_used: Plans that leave a state row.
+        fallbacks: Steps in which no plan was left and it braked.
+        largest_gap: Largest certified gap of a plan.
+    """
+
+    decisions: NDArray[np.intp]
+    infeasible: NDArray[np.intp]
+    slack_used: NDArray[np.intp]
+    fallbacks: NDArray[np.intp]
+    largest_gap: Array
+
+    @classmethod
+    def zero(cls, runs: int) -> Self:
+        """Nothing met yet."""
+        decisions, infeasible, slack_used, fallbacks = np.zeros((4, runs), dtype=np.intp)
+        return cls(decisions, infeasible, slack_used, fallbacks, np.zeros(runs))
+
+
+class BatchSmpc:
+    """The SMPC as the flight core flies it, for N runs.
+
+    A position that is newer than the plan's makes a new plan, if it is less than H steps old; without one, the plan is
+    played out; where it has run out, the predicted velocity is braked until a plan is there again.
+
+    Args:
+        design: The design.
+        decider: Who plans.
+        plant: The plant that is predicted with; the design's own may be an estimator's.
+        brake_gain_1ps: Deceleration per predicted speed once no plan is left [1/s].
+    """
+
+    def __init__(self, design: Design, decider: Decider, plant: Plant, brake_gain_1ps: float) -> None:
+        self._design, self._decider, self._plant = design, decider, plant
+        self._brake = brake_gain_1ps
+        self._input_of_accel = np.linalg.pinv(plant.accel_map)
+        self._slack = 1e-6  # below: the QPs' rounding
+        self.begin(0)
+
+    def begin(self, runs: int) -> None:
+        """See `BatchController`."""
+        steps, n_u = self._design.horizon, self._design.plant.n_u
+        self._plans = np.zeros((runs, steps, n_u))
+        self._made = np.full(runs, -steps, dtype=np.intp)  # step of the plan's first input
+        self._captured = np.full(runs, -1, dtype=np.intp)
+        self.tally = Tally.zero(runs)
+
+    def act(self, news: News) -> Array:
+        """See `BatchController`."""
+        steps, age = self._design.horizon, news.age
+        x = predict(self._plant, news)
+        fresh = (news.newest > self._captured) & (age < steps) & np.isfinite(x).all(axis=1)
+        late = np.minimum(age, len(self._design.late))
+        for j in np.unique(late[fresh]):
+            self._replan(news, x, np.flatnonzero(fresh & (late == j)), int(j))
+        index = news.step - self._made
+        playing = (index < steps) & (age < steps)
+        self._made[~playing] = -steps
+        asked = np.zeros((x.shape[0], self._design.plant.n_u))
+        (who,) = np.nonzero(playing)
+        asked[who] = self._plans[who, index[who]]
+        (lost,) = np.nonzero(~playing)
+        asked[lost] = self._braking(x[lost])
+        self.tally.fallbacks[lost] += 1
+        return asked
+
+    def _replan(self, news: News, x: Array, who: NDArray[np.intp], late: int) -> None:
+        answers = self._decider.decide(x[who], late)
+        found = who[answers.solved]
+        self._plans[found] = answers.inputs[answers.solved]
+        self._made[found] = news.step
+        self._captured[found] = news.newest[found]
+        tally = self.tally
+        tally.decisions[who] += 1
+        tally.infeasible[who] += ~answers.solved
+        tally.slack_used[who] += answers.solved & (answers.slack > self._slack)
+        tally.largest_gap[found] = np.maximum(tally.largest_gap[found], answers.gap[answers.solved])
+
+    def _braking(self, x: Array) -> Array:
+        """Inputs that brake the predicted velocities (M, n_x)."""
+        return -self._brake * x[:, list(self._plant.velocity_index)] @ self._input_of_accel.T
