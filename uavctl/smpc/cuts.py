@@ -43,6 +43,8 @@ class RowOrder:
         s, n_l = self.static.size, links.size
         self.up, self.low = slice(s, s + n_l), slice(s + n_l, s + 2 * n_l)
         self._soft = np.isfinite(problem.price[self.origin])
+        self._above, self._below = problem.backoff[self.origin], problem.backoff[self.origin]
+        self._above[self.low], self._below[self.up] = -OPEN, -OPEN
 
     def softness(self, others: int) -> tuple[NDArray[np.int32], Array, Array]:
         """Sense, price and curve of these rows and `others` more that are hard."""
@@ -56,12 +58,8 @@ class RowOrder:
 
     def sides(self, question: Question) -> tuple[Array, Array]:
         """Right and left sides: of static rows with their back-offs, of links without."""
-        backoff = self._problem.backoff
-        upper = (question.upper - question.offset - backoff)[self.origin]
-        lower = (question.lower - question.offset + backoff)[self.origin]
-        upper[self.low] = OPEN
-        lower[self.up] = -OPEN
-        return upper, lower
+        upper, lower = question.upper - question.offset, question.lower - question.offset
+        return upper[self.origin] - self._above, lower[self.origin] + self._below
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +70,12 @@ class Below:
         bound: Lower bound of the optimum.
         weights: Weights of the cuts (K,), of sum 1.
         room: What the bound leaves to each link's back-off (n_l,).
-        height: How far the bound's φ is above each cut (K,).
         sides: Sides of the rows in order.
     """
 
     bound: float
     weights: Array
     room: Array
-    height: Array
     sides: tuple[Array, Array]
 
 
@@ -114,6 +110,7 @@ class Cuts:
         self._most = np.where(curved, np.inf, problem.price)[order.origin]
         above, below = np.isfinite(problem.upper), np.isfinite(problem.lower)
         self._share = np.where(above & below, 0.5, np.where(above, 1.0, 0.0))[problem.links]
+        self._rest = 1.0 - self._share
         self._program = self._set_up()
 
     def bound(self, question: Question, plus: Array, minus: Array, level: float, slope: Array) -> float:
@@ -139,32 +136,22 @@ class Cuts:
         up, low = self._order.up, self._order.low
         np.minimum(plus, self._most, out=plus)
         np.minimum(minus, self._most - plus, out=minus)
-        lacking = slope - plus[up] - minus[low]
-        if (lacking > 0.0).any():
-            lacking = np.maximum(lacking, 0.0)
-            plus[up] += self._share * lacking
-            minus[low] += (1.0 - self._share) * lacking
+        lacking = np.maximum(slope - plus[up] - minus[low], 0.0)
+        plus[up] += self._share * lacking
+        minus[low] += self._rest * lacking
         g = question.f + (plus - minus) @ self._a
         value = question.constant + level - 0.5 * float(g @ (self._h_inverse @ g))
         value -= float(plus @ sides[0] - minus @ sides[1])
-        beyond = self._pairing @ (plus + minus) - self._price
-        if (beyond > 0.0).any():
-            value -= float(self._per_curve @ np.maximum(beyond, 0.0) ** 2)
-        return value
+        beyond = np.maximum(self._pairing @ (plus + minus) - self._price, 0.0)
+        return value - float(self._per_curve @ (beyond * beyond))
 
     def ask(self, question: Question) -> Below | None:
         """The bound; None where the QP fails."""
-        order, n_q = self._order, question.f.size
-        up, low = order.up, order.low
-        m = low.stop
-        sides = order.sides(question)
-        upper, lower = self._upper.copy(), self._lower.copy()
-        upper[:m], lower[:m] = sides
-        upper[up] -= self._first.backoff
-        lower[low] += self._first.backoff
-        f = self._f.copy()
-        f[:n_q] = question.f
-        solved = self._program.solve(f, upper, lower)
+        n_q, m = question.f.size, self._order.low.stop
+        sides = self._order.sides(question)
+        upper = np.concatenate([sides[0] - self._first_above, self._upper])
+        lower = np.concatenate([sides[1] + self._first_below, self._lower])
+        solved = self._program.solve(np.concatenate([question.f, self._f]), upper, lower)
         if solved is None:
             return None
         variables, multipliers = solved
@@ -177,7 +164,12 @@ class Cuts:
         minus = plus - multipliers[:m]
         bound = self._value(question, sides, plus, minus, float(weights @ self._level), weights @ self._slope)
         room = variables[n_q:-1] * self._unit + self._first.backoff
-        return Below(bound, weights, room, self._slope @ room - self._level, sides)
+        return Below(bound, weights, room, sides)
+
+    def height(self, below: Below) -> Array:
+        """How far the bound's φ is above each cut (K,)."""
+        height: Array = self._slope @ below.room - self._level
+        return height
 
     def _set_up(self) -> QuadraticProgram:
         problem, order, first = self._problem, self._order, self._first
@@ -193,9 +185,11 @@ class Cuts:
         a[order.up, n_q:-1], a[order.low, n_q:-1] = np.diag(self._unit), -np.diag(self._unit)
         a[least, n_q:-1] = np.eye(n_l)
         a[self._cut, n_q:-1], a[self._cut, -1] = self._slope * self._unit / self._cost_unit, 1.0
-        self._f = np.zeros(size)
+        self._f = np.zeros(size - n_q)
         self._f[-1] = self._cost_unit
-        self._lower, self._upper = np.full(m + n_l + k, -OPEN), np.full(m + n_l + k, OPEN)
-        self._lower[least] = -first.backoff / self._unit
-        self._lower[self._cut] = (self._level - first.cost - self._slope @ first.backoff) / self._cost_unit
+        self._first_above, self._first_below = np.zeros(m), np.zeros(m)
+        self._first_above[order.up] = self._first_below[order.low] = first.backoff
+        least_cost = (self._level - first.cost - self._slope @ first.backoff) / self._cost_unit
+        self._upper = np.full(n_l + k, OPEN)
+        self._lower = np.concatenate([-first.backoff / self._unit, least_cost])
         return QuadraticProgram(h, a, *order.softness(n_l + k), TOLERANCE)

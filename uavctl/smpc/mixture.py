@@ -64,7 +64,7 @@ class Mixed:
 
 @dataclass(frozen=True, eq=False)
 class _Mixer:
-    """Program of a mixture of a certain number of policies."""
+    """Program of a mixture of a certain number of policies; h and a are its own to write to."""
 
     program: QuadraticProgram
     h: Array
@@ -92,7 +92,8 @@ class Mixture:
         soft = np.isfinite(problem.price)
         self._price = np.where(soft, problem.price, 0.0)
         self._of_q = np.vstack([0.5 * problem.h, problem.a])
-        self._states = np.flatnonzero([row.kind is Kind.STATE for row in problem.rows])
+        self._is_state = np.array([float(row.kind is Kind.STATE) for row in problem.rows])
+        self._state_curve = problem.curve * self._is_state
         self._order = RowOrder(problem)
         self.cuts = Cuts(problem, policies, self._order)
         self._choice = self._choice_program()
@@ -120,16 +121,15 @@ class Mixture:
 
     def cost_of(self, question: Question, q: Array, backoff: Array, covariance: float) -> tuple[float, float]:
         """Cost of a mean q under back-offs (m,) and a covariance cost, and the sum of its state slacks."""
-        problem = self.problem
         n_q = question.f.size
         of_q = self._of_q @ q
         value = of_q[n_q:] + question.offset
         beyond = np.maximum(np.maximum(value - question.upper, question.lower - value) + backoff, 0.0)
         cost = question.constant + covariance + float(q @ (of_q[:n_q] + question.f) + self._price @ beyond)
-        slack = beyond[self._states]
-        if slack.any():
-            cost += float(problem.curve[self._states] @ slack**2)
-        return cost, float(slack.sum())
+        slack = float(self._is_state @ beyond)
+        if slack:
+            cost += float(self._state_curve @ (beyond * beyond))
+        return cost, slack
 
     def _choice_program(self) -> QuadraticProgram:
         """Dual of min Σλ_k J_k s.t. Σλ_k β_k <= room: variables are the prices of the back-offs, and ϑ."""
@@ -148,7 +148,8 @@ class Mixture:
     def _highest(self, below: Below) -> NDArray[np.intp]:
         """Policies with the highest cuts: nearly always enough to mix."""
         chosen = below.weights > _ACTIVE
-        chosen[np.argsort(below.height, kind="stable")[:_HIGHEST]] = True
+        height = self.cuts.height(below)
+        chosen[np.argpartition(height, min(_HIGHEST, height.size) - 1)[:_HIGHEST]] = True
         return np.flatnonzero(chosen)
 
     def _choose(self, below: Below) -> NDArray[np.intp]:
@@ -173,34 +174,30 @@ class Mixture:
 
     def _mix(self, question: Question, below: Below, chosen: NDArray[np.intp]) -> Mixed | None:
         """The mean and the weights of the chosen policies together; the last one's weight is what the others leave."""
-        problem, order = self.problem, self._order
-        n_q, k = question.f.size, chosen.size - 1
-        last, others = chosen[-1], chosen[:-1]
-        mixer = self._mixer(k)
-        h, a = mixer.h.copy(), mixer.a.copy()
-        hessian = self._hessian[chosen[:, None], chosen]
+        order, n_q = self._order, question.f.size
+        mixer = self._mixer(chosen.size - 1)
+        backoff, hessian, linear = self.backoff[chosen], self._hessian[chosen][:, chosen], self._linear[chosen]
         difference = hessian[:-1] - hessian[-1]
-        h[n_q:, n_q:] = difference[:, :-1] - difference[:, -1:]
-        f = np.concatenate([question.f, difference[:, -1] + self._linear[others] - self._linear[last]])
-        backoff = (self.backoff[others] - self.backoff[last]).T
-        a[order.up, n_q:], a[order.low, n_q:] = backoff, -backoff
-        upper, lower = mixer.upper.copy(), mixer.lower.copy()
-        upper[: order.low.stop], lower[: order.low.stop] = below.sides
-        upper[order.up] -= self.backoff[last]
-        lower[order.low] += self.backoff[last]
-        solved = mixer.program.solve_anew(h, f, a, upper, lower)
+        apart = (backoff[:-1] - backoff[-1]).T
+        # These entries are written each time, all others never.
+        mixer.h[n_q:, n_q:] = difference[:, :-1] - difference[:, -1:]
+        mixer.a[order.up, n_q:] = apart
+        mixer.a[order.low, n_q:] = -apart
+        f = np.concatenate([question.f, difference[:, -1] + linear[:-1] - linear[-1]])
+        upper, lower = np.concatenate([below.sides[0], mixer.upper]), np.concatenate([below.sides[1], mixer.lower])
+        upper[order.up] -= backoff[-1]
+        lower[order.low] += backoff[-1]
+        solved = mixer.program.solve_anew(mixer.h, f, mixer.a, upper, lower)
         if solved is None:
             return None
-        values = solved[0]
-        weights = np.zeros(k + 1)
-        np.maximum(values[n_q:], 0.0, out=weights[:-1])
-        weights[-1] = max(0.0, 1.0 - float(weights.sum()))
+        q, others = solved[0][:n_q], np.maximum(solved[0][n_q:], 0.0)
+        weights = np.append(others, max(0.0, 1.0 - float(others.sum())))
         weights /= weights.sum()
-        full = problem.backoff.copy()
-        full[problem.links] = weights @ self.backoff[chosen]
-        covariance = float(weights @ (0.5 * (hessian @ weights) + self._linear[chosen])) + problem.horizon.c_0
-        cost, slack = self.cost_of(question, values[:n_q], full, covariance)
-        return Mixed(values[:n_q], chosen, weights, full, covariance, cost, below.bound, slack)
+        full = self.problem.backoff.copy()
+        full[self.problem.links] = weights @ backoff
+        covariance = float(weights @ (0.5 * (hessian @ weights) + linear)) + self.problem.horizon.c_0
+        cost, slack = self.cost_of(question, q, full, covariance)
+        return Mixed(q, chosen, weights, full, covariance, cost, below.bound, slack)
 
     def _mixer(self, k: int) -> _Mixer:
         """Program of a mixture of k + 1 policies, with all that no question changes."""
@@ -212,8 +209,6 @@ class Mixture:
             a[:m, :n_q] = problem.a[order.origin]
             a[m:-1, n_q:] = np.eye(k)
             a[-1, n_q:] = 1.0
-            upper, lower = np.full(a.shape[0], OPEN), np.full(a.shape[0], -OPEN)
-            lower[m:-1] = 0.0
-            upper[-1] = 1.0
+            upper, lower = np.append(np.full(k, OPEN), 1.0), np.append(np.zeros(k), -OPEN)
             self._mixers[k] = _Mixer(QuadraticProgram(h, a, *order.softness(k + 1)), h, a, upper, lower)
         return self._mixers[k]

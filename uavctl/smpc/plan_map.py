@@ -71,7 +71,9 @@ class PlanMap:
         self._plan = self._plan_matrix()
         self._inputs, self._states, self._reference = slices([steps * plant.n_u, (steps + 1) * plant.n_x, plant.n_x])
         self._off = slice(self._reference.stop, self._plan.shape[0])
-        self._backoff_x, self._backoff_u = self._collect([table[0] for table in self._tables])
+        self._of_x_rows, self._of_u_rows = self._places()
+        first = np.concatenate([table[0] for table in self._tables])
+        self._backoff_x, self._backoff_u = first[self._of_x_rows], first[self._of_u_rows]
         self._backoff_x.flags.writeable = self._backoff_u.flags.writeable = False  # every frozen answer has these
 
     def frozen(self, seq: int, x: Array, p: Array, q: Array, cost: float, lower: float) -> Answer:
@@ -82,10 +84,18 @@ class PlanMap:
     def mixed(self, seq: int, x: Array, p: Array, shares: Sequence[Share], outlook: Outlook) -> Answer:
         """Answer of which every component's share is from its library."""
         tables = zip(self._tables, shares, strict=True)
-        backoffs = self._collect([share.weights @ table[share.policies] for table, share in tables])
+        backoff = np.concatenate([share.weights @ table[share.policies] for table, share in tables])
         cost, lower = sum(share.cost for share in shares), sum(share.lower for share in shares)
         asked = np.concatenate([*(share.q for share in shares), p, x])
-        answer = self._answer(seq, MIXTURE, asked, backoffs, cost, lower, sum(share.slack for share in shares))
+        answer = self._answer(
+            seq,
+            MIXTURE,
+            asked,
+            (backoff[self._of_x_rows], backoff[self._of_u_rows]),
+            cost,
+            lower,
+            sum(share.slack for share in shares),
+        )
         return told(self._design, answer, self._components, outlook)
 
     def _answer(
@@ -174,18 +184,18 @@ class PlanMap:
         of_x[len(inputs) : len(inputs) + len(self._of_x)] = self._of_x
         return np.hstack([np.vstack([inputs, self._of_u @ inputs, reference, *offsets]), of_x])
 
-    def _collect(self, rows: Sequence[Array]) -> tuple[Array, Array]:
-        """Tables of back-offs of the whole plant from those of its components; not to be written to."""
+    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Where the components' tables, one after another, have each back-off: (H+1, m_x) and (H, m_u)."""
         design, steps = self._design, self._shape_u[0]
-        backoff_x, backoff_u = (
-            np.zeros((steps + 1, design.state_set.b.size)),
-            np.zeros((steps, design.input_set.b.size)),
-        )
-        for part, row in zip(self._components, rows, strict=True):
-            split = (steps + 1) * part.rows_x.size
-            backoff_x[:, part.rows_x] = row[:split].reshape(steps + 1, -1)
-            backoff_u[:, part.rows_u] = row[split:].reshape(steps, -1)
-        return backoff_x, backoff_u
+        of_x = np.zeros((steps + 1, design.state_set.b.size), dtype=np.intp)
+        of_u = np.zeros((steps, design.input_set.b.size), dtype=np.intp)
+        at = 0
+        for part in self._components:
+            split = at + (steps + 1) * part.rows_x.size
+            of_x[:, part.rows_x] = np.arange(at, split).reshape(steps + 1, -1)
+            of_u[:, part.rows_u] = np.arange(split, split + steps * part.rows_u.size).reshape(steps, -1)
+            at = split + steps * part.rows_u.size
+        return of_x, of_u
 
 
 def _prediction(a: Array, b: Array, steps: int) -> tuple[Array, Array]:
