@@ -25,7 +25,6 @@ from uavctl.smpc.late import with_late
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
 from uavctl.smpc.plant import Plant, drag_lag
-from uavctl.smpc.printed import PrintedSolver
 from uavctl.smpc.sets import Polytope
 
 NANOSECONDS = 1e9
@@ -142,6 +141,8 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
             "the printed problem knows neither late positions nor an estimate with an error",
             "take `library` or `exact`; or risk.estimate = `exact`, schedule.late = 0 and delays below the step",
         )
+    from uavctl.smpc.printed import PrintedSolver  # CVXPY takes long to load, and nothing else here needs it
+
     return PrintedSolver(design)
 
 

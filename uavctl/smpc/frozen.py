@@ -68,6 +68,12 @@ class FrozenAnswer:
 class Frozen:
     """Frozen policies of all components.
 
+    Attributes:
+        rows: Where each component's rows are.
+        means: Where each component's q is.
+        programs: The components' pinned mean QPs.
+        allowed: Largest multiplier of each row (Σ m,) that an accepted answer has.
+
     Args:
         mixtures: The components' libraries.
     """
@@ -93,11 +99,11 @@ class Frozen:
         allowed[links] = _ZERO * scale[links]
         # A soft row that is pinned would not be left at its price: such a policy answers nothing.
         allowed[self._pins] = np.where(soft[self._pins], -1.0, slope[self._pins])
-        self._allowed = allowed
+        self.allowed = allowed
         self._most = np.where(soft & ~state, price, np.inf)  # the offset's multipliers; see `QuadraticProgram`
         sense = np.where(soft, SOFT, 0).astype(np.int32)
         sense[self._pins] = EQUAL
-        self._programs = [
+        self.programs = [
             QuadraticProgram(problem.h, problem.a, sense[s], price[s], curve[s])
             for s, problem in zip(self.rows, problems, strict=True)
         ]
@@ -113,7 +119,7 @@ class Frozen:
     def solve(self, numbers: Numbers) -> FrozenAnswer | None:
         """Solve all components; None where a QP has no optimum."""
         means, multipliers = [], []
-        for program, mean, rows in zip(self._programs, self.means, self.rows, strict=True):
+        for program, mean, rows in zip(self.programs, self.means, self.rows, strict=True):
             solved = program.solve(numbers.f[mean], numbers.above[rows], numbers.below[rows])
             if solved is None:
                 return None
@@ -122,7 +128,7 @@ class Frozen:
         q, net = np.concatenate(means), np.concatenate(multipliers)
         np.minimum(net, self._most, out=net)
         np.maximum(net, -self._most, out=net)
-        fits = np.logical_and.reduceat(np.abs(net) <= self._allowed, self._row_starts).tolist()
+        fits = np.logical_and.reduceat(np.abs(net) <= self.allowed, self._row_starts).tolist()
         return FrozenAnswer(q, net, fits)
 
     def certify(self, numbers: Numbers, answer: FrozenAnswer) -> tuple[float, float]:

@@ -20,12 +20,15 @@ SOFT, EQUAL = 8, 5
 TOLERANCE = 1e-10
 _MOST_ITERATIONS = 2000
 # Share of the largest curvature that a soft row has at least: without any, DAQP loses its way between equalities.
-_LEAST_CURVE = 1e-8
+LEAST_CURVE = 1e-8
 _OPTIMAL = (1, 2)  # 2: soft rows were left
 
 
 class QuadraticProgram:
     """A program whose matrices are given once; f and the sides follow each question. Not for concurrent use.
+
+    Attributes:
+        sense: DAQP's state of each row (m,).
 
     Args:
         h: H (n, n), positive definite.
@@ -39,7 +42,7 @@ class QuadraticProgram:
     def __init__(
         self, h: Array, a: Array, sense: Sense, price: Array, curve: Array, tolerance: float = TOLERANCE
     ) -> None:
-        self._sense = sense
+        self.sense = sense
         model = daqp.Model()
         sides = np.full(a.shape[0], OPEN)
         model.setup(h, np.zeros(h.shape[0]), a, sides, -sides, sense)  # the soft rows fix the workspace
@@ -49,7 +52,7 @@ class QuadraticProgram:
             "eps_prox": 0.0,
             "iter_limit": _MOST_ITERATIONS,
         }
-        rho = 0.5 / np.maximum(curve, _LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
+        rho = 0.5 / np.maximum(curve, LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
         self._update, self._solve = model.update, model.solve
 
@@ -58,13 +61,13 @@ class QuadraticProgram:
 
         The sides may be infinite; f and the sides that are not must be finite.
         """
-        if self._update(f=f, bupper=upper, blower=lower, sense=self._sense) < 0:
+        if self._update(f=f, bupper=upper, blower=lower, sense=self.sense) < 0:
             return None
         return self._read()
 
     def solve_anew(self, h: Array, f: Array, a: Array, upper: Array, lower: Array) -> tuple[Array, Array] | None:
         """The same with new matrices of the same sizes."""
-        if self._update(H=h, f=f, A=a, bupper=upper, blower=lower, sense=self._sense) < 0:
+        if self._update(H=h, f=f, A=a, bupper=upper, blower=lower, sense=self.sense) < 0:
             return None
         return self._read()
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import gammaincinv, ndtri
 
 Allocation = Literal["ellipsoid", "halfspace"]
 
@@ -22,8 +22,8 @@ def kappa(gamma: float, n: int, rows: int, allocation: Allocation) -> float:
             inequality, the same share of the risk for each row, with Gaussian quantiles.
     """
     if allocation == "ellipsoid":
-        return float(np.sqrt(chi2.ppf(gamma, n)))
-    return float(norm.isf((1.0 - gamma) / max(1, rows)))
+        return _chi(gamma, n)
+    return float(-ndtri((1.0 - gamma) / max(1, rows)))
 
 
 def component_kappa(gamma: float, sizes: Sequence[int]) -> float:
@@ -33,4 +33,9 @@ def component_kappa(gamma: float, sizes: Sequence[int]) -> float:
         gamma: Likelihood that the whole vector has to be inside with.
         sizes: Dimension of each part; the largest decides.
     """
-    return float(np.sqrt(chi2.ppf(gamma ** (1.0 / len(sizes)), max(sizes))))
+    return _chi(gamma ** (1.0 / len(sizes)), max(sizes))
+
+
+def _chi(gamma: float, n: int) -> float:
+    """Root of the χ² quantile with n degrees of freedom."""
+    return float(np.sqrt(2.0 * gammaincinv(0.5 * n, gamma)))
