@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
@@ -74,6 +73,8 @@ def build_trajectory(given: TrajectoryConfig, design: Design) -> Trajectory:
         positions = np.column_stack([np.interp(within_s, times_s, column) for column in places.T])
         motion = follow(plant, positions, None)
     else:
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline  # takes long to load, and few flights need it
+
         spline = (
             CubicHermiteSpline(times_s, places, np.array(given.velocities_mps))
             if given.velocities_mps
