@@ -10,6 +10,7 @@ import numpy as np
 from sim.autopilot import Autopilot
 from sim.channel import Channel
 from sim.mocap import Cameras
+from sim.script import Script, ScriptedChannel
 from sim.vehicle import Vehicle
 from uavctl.config.types import Config
 from uavctl.data import Truth
@@ -29,6 +30,8 @@ class Peers:
     from there on. It is therefore called when time moves *past* the boundary: what arrives at the
     boundary's own instant is already in it, what arrives later (on real sockets, a fraction of a
     millisecond) is not.
+
+    With a `script`, plant, start, disturbances and the channel are its, not those of the configuration.
     """
 
     def __init__(
@@ -39,11 +42,16 @@ class Peers:
         airborne: bool = True,
         shared_link: bool = False,
         on_truth: Callable[[Truth], None] | None = None,
+        script: Script | None = None,
     ) -> None:
         for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
-        self.vehicle = VEHICLES[config.sim.plant](config, for_vehicle, start_ns)
+        self.vehicle = VEHICLES[config.sim.plant](config, for_vehicle, start_ns, script)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
-        self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
+        self.channel: Channel | ScriptedChannel
+        if script is None:
+            self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
+        else:
+            self.channel = ScriptedChannel(script.delays_ns)
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
         self._airborne = airborne
         self._mocap_link = VEHICLE if shared_link else MOCAP
@@ -91,8 +99,13 @@ class Peers:
             mode=self.autopilot.mode_name,
         )
 
-    def flush(self) -> None:
-        """Tell the truth of a boundary that time has reached but not passed; for the end of a run."""
+    def flush(self, to_ns: int | None = None) -> None:
+        """Tell the truth of a boundary that time has reached but not passed; for the end of a run.
+
+        With `to_ns`, of that one: the vehicle alone moves on to it, and nothing more is sent.
+        """
+        if to_ns is not None:
+            self._move(to_ns)
         if self._truth_ns == self.now_ns:
             self._tell()
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, logm
 
+from sim.script import Script
 from uavctl.config.types import Config, PlantConfig
 from uavctl.data import Vec3
 from uavctl.errors import DesignError
@@ -135,18 +136,23 @@ class Vehicle:
     """State of the plant at one moment, moved forward by `advance`.
 
     w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
-    changed. Axes that the plant has not stay at their start position.
+    changed. Axes that the plant has not stay at their start position. With a `script`, plant, start and w are its.
     """
 
-    def __init__(self, config: Config, seed: np.random.SeedSequence, start_ns: int) -> None:
-        self.model = linear_model(config.plant)
+    def __init__(
+        self, config: Config, seed: np.random.SeedSequence, start_ns: int, script: Script | None = None
+    ) -> None:
+        self.model = linear_model(config.plant if script is None else script.plant)
         self._rng = np.random.default_rng(seed)
+        self._given = None if script is None else iter(script.disturbances)
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
         self._offset_m = config.sim.start_position_m
         x = np.zeros(self.model.a.shape[0])
         for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
             x[p] = config.sim.start_position_m[axis]
             x[v] = config.sim.start_velocity_mps[axis]
+        if script is not None:
+            x = script.start.copy()
         self._anchor_x: Array = x  # state at the last change of u or w
         self._anchor_ns = start_ns
         self._x: Array | None = x  # state now, once asked for
@@ -157,6 +163,8 @@ class Vehicle:
         self.grounded = False
 
     def _draw(self) -> Array:
+        if self._given is not None:
+            return next(self._given, np.zeros(self.model.e.shape[1]))
         return self.model.w_root @ self._rng.standard_normal(self.model.w_root.shape[0])
 
     @property

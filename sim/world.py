@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sim.peers import Peers
+from sim.script import Script
 from uavctl.config.types import Config
 from uavctl.data import Flyer, Truth
 
@@ -22,6 +23,7 @@ class World:
         on_truth: gets the `Truth` of every Δt boundary, see `Peers`.
         on_progress: gets the seconds flown so far, after every Δt.
         start_ns: time of tick 0.
+        script: plant, start, disturbances and losses of a flight that is flown again; the `Truth` at its end is told.
     """
 
     def __init__(
@@ -32,6 +34,7 @@ class World:
         on_progress: Callable[[float], None] | None = None,
         *,
         start_ns: int = 0,
+        script: Script | None = None,
     ) -> None:
         self._flyer = flyer
         self._on_progress = on_progress
@@ -39,7 +42,8 @@ class World:
         self._tick_ns = round(config.daemon.tick_s * 1e9)
         self._ticks_per_step = round(config.plant.dt_s / config.daemon.tick_s)
         shared = config.daemon.vehicle == config.daemon.mocap
-        self.peers = Peers(config, start_ns, shared_link=shared, on_truth=on_truth)
+        self._again = script is not None
+        self.peers = Peers(config, start_ns, shared_link=shared, on_truth=on_truth, script=script)
 
     def run(self, duration_s: float) -> None:
         """Fly all the ticks that begin within `duration_s`; once only."""
@@ -47,7 +51,7 @@ class World:
             self._tick(tick)
             if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
                 self._on_progress((tick + 1) * self._tick_ns * 1e-9)
-        self.peers.flush()
+        self.peers.flush(self._start_ns + round(duration_s * 1e9) if self._again else None)
 
     def _tick(self, tick: int) -> None:
         at_ns = self._start_ns + tick * self._tick_ns

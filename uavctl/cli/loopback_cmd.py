@@ -19,6 +19,7 @@ from rich.progress import Progress
 from logs.disk import check_room
 from logs.recorder import Recorder, SyncRecorder
 from logs.summary import FlightSummary, render
+from sim.script import Script
 from sim.server import Ready, serve_in_child
 from sim.world import World
 from uavctl.build import build_design
@@ -61,7 +62,7 @@ def loopback(
     check_room(path, config.log.free_bytes)
     with located(loaded):
         prepared = prepare(config, design)
-    summary = (_real_time if udp else _lockstep)(prepared, path)
+    summary = (_real_time if udp else lockstep)(prepared, path)
     common.show(summary, lambda: render(summary))
     return 0 if summary.steps and not summary.recorder_dropped else 1
 
@@ -84,7 +85,8 @@ class _InterruptedError(Exception):
     """The operator asked for the end of a flight in virtual time."""
 
 
-def _lockstep(prepared: Prepared, path: Path) -> FlightSummary:
+def lockstep(prepared: Prepared, path: Path, script: Script | None = None) -> FlightSummary:
+    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn."""
     config = prepared.config
     recorder = SyncRecorder(path, config.log.chunk_bytes, config.log.queue)
     begun = time.perf_counter()
@@ -106,7 +108,7 @@ def _lockstep(prepared: Prepared, path: Path) -> FlightSummary:
             def record(truth: Truth) -> None:
                 recorder.put(TRUTH, truth.at_ns, truth)
 
-            world = World(config, loop, on_truth=record, on_progress=show)
+            world = World(config, loop, on_truth=record, on_progress=show, script=script)
             begun = time.perf_counter()
             world.run(config.duration_s)
     finally:

@@ -1,0 +1,67 @@
+"""A flight with everything given that is drawn otherwise: for flying one run of a campaign again."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.channel import Counters
+from uavctl.config.types import PlantConfig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Script:
+    """What the simulated vehicle and the radio channel do, in place of the configuration's plant, link and draws.
+
+    Attributes:
+        plant: The plant that flies; the controller may believe in another one.
+        start: Its state at the start (n_x,).
+        disturbances: w of each step (T, n_w); zero after the last one.
+        delays_ns: Delay of each position sent [ns], None for one that is lost; those after the last one are lost.
+    """
+
+    plant: PlantConfig
+    start: Array
+    disturbances: Array
+    delays_ns: tuple[int | None, ...]
+
+
+class ScriptedChannel:
+    """One direction of a radio link that loses and delays the packets that it is told to.
+
+    Args:
+        delays_ns: Of each packet [ns], None for one that is lost; those after the last one are lost.
+    """
+
+    def __init__(self, delays_ns: tuple[int | None, ...]) -> None:
+        self._delays_ns = delays_ns
+        self._pending: list[tuple[int, int, bytes]] = []
+        self.counters = Counters()
+
+    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
+        """Send a packet at `at_ns`; a `certain` one is not lost, and not late if it was to be lost."""
+        number = self.counters.sent
+        self.counters.sent += 1
+        delay_ns = self._delays_ns[number] if number < len(self._delays_ns) else None
+        if delay_ns is None and not certain:
+            self.counters.lost += 1
+            return
+        heapq.heappush(self._pending, (at_ns + (delay_ns or 0), number, data))
+
+    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
+        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
+        due = []
+        while self._pending and self._pending[0][0] <= to_ns:
+            arrival_ns, _, data = heapq.heappop(self._pending)
+            due.append((arrival_ns, data))
+        return due
+
+    @property
+    def next_ns(self) -> int | None:
+        """Time of the next arrival [ns], None if nothing is under way."""
+        return self._pending[0][0] if self._pending else None

@@ -1,0 +1,195 @@
+"""The page of a campaign says what its figures say, and holds for campaigns of any shape."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from campaign_results import cell, runs, write
+
+from uavctl.campaign.page import write_report
+from uavctl.campaign.results import read_results
+from uavctl.campaign.statistics import summarise
+from uavctl.campaign.verdict import Verdict, brief, grouped, in_words, verdicts, word_of
+from uavctl.errors import UavctlError
+
+N = 60
+NOISE = np.random.default_rng(3).normal(0.0, 1.0, N)
+SMPC = 100.0 + NOISE
+
+
+class _Text(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        if tag not in ("meta", "br", "path", "use", "rect", "circle"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("path", "use", "rect", "circle"):
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text.append(data)
+
+
+def text_of(path: Path) -> str:
+    parser = _Text()
+    parser.feed(path.read_text(encoding="utf-8"))
+    assert parser.open == []
+    return re.sub(r"\s+", " ", " ".join(parser.text))
+
+
+def judged(tmp_path: Path, baseline: list[dict[str, Any]], smpc: list[dict[str, Any]] | None = None) -> Verdict:
+    rows = [*(smpc or runs(0, SMPC.tolist())), *baseline]
+    results = read_results(write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "theirs")], rows))
+    (found,) = verdicts(results, grouped(summarise(tmp_path)))
+    return found
+
+
+def outside(steps: int) -> list[int]:
+    return [steps] * N
+
+
+def test_cheaper_and_as_safe_is_yes(tmp_path: Path) -> None:
+    found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()))
+    assert (found.holds, found.beaten, word_of(found)) == (True, False, "yes")
+    assert brief(found.comparisons[0]) == "costs 10 % more"
+    assert in_words(found)[0].startswith("The SMPC costs less, and breaks limits no more often, than theirs (10 % more")
+
+
+def test_a_difference_that_pairs_tell_is_told(tmp_path: Path) -> None:
+    # Both costs lie within 99.7 to 100.3; the difference of 0.02 is the same in every run.
+    found = judged(tmp_path, runs(1, (SMPC + 0.02).tolist()))
+    assert found.holds
+
+
+def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(tmp_path: Path) -> None:
+    cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1), input_violations=outside(15))
+    found = judged(tmp_path, cheaper)
+    assert (found.holds, found.beaten, word_of(found)) == (False, False, "no")
+    assert brief(found.comparisons[0]) == "costs 3 % less, breaks limits more often"
+    (sentence,) = in_words(found)
+    assert "states in 2 % of steps (SMPC 0 %), inputs in 30 % of steps (SMPC 0 %)" in sentence
+    assert sentence.endswith("That is more than the SMPC's design allows for inputs (10 %).")
+
+
+def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
+    found = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
+    assert in_words(found)[0].endswith("(states 5 %, inputs 10 %): its caution is what costs.")
+
+
+def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
+    found = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
+    assert (found.holds, found.beaten) == (False, True)
+    assert "theirs costs 50 % less" in in_words(found)[0]
+    assert "breaks limits no more often" in in_words(found)[0]
+
+
+def test_cheaper_at_a_higher_violation_rate_is_no(tmp_path: Path) -> None:
+    worse = runs(0, SMPC.tolist(), state_violations=outside(2))
+    found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
+    assert (found.holds, found.beaten) == (False, False)
+    assert brief(found.comparisons[0]) == "costs 10 % more, keeps limits better"
+
+
+def test_costs_that_cannot_be_told_apart_are_no(tmp_path: Path) -> None:
+    found = judged(tmp_path, runs(1, (SMPC + np.tile([1.0, -1.0], N // 2)).tolist()))
+    assert (found.holds, found.beaten) == (False, False)
+    assert brief(found.comparisons[0]) == "costs the same"
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three losses and a burst link, a refused cell, failed runs, a name that is no HTML."""
+    cells, rows = [], []
+    for place, (link, loss) in enumerate([("10 %", 0.1), ("30 %", 0.3), ("50 %", 0.5), ("bursts", None)]):
+        told: dict[str, Any] = {"link": link, "link_loss": loss}
+        cells += [cell(3 * place, "smpc", "smpc", **told), cell(3 * place + 1, "lqg <b>", **told)]
+        cells.append(cell(3 * place + 2, "far", "smpc", refused="tau: nothing is fast enough", **told))
+        cost = (100.0 + 10.0 * place) + NOISE
+        rows += runs(3 * place, cost.tolist())
+        theirs = 0.9 * cost
+        theirs[7] = np.nan if place == 1 else theirs[7]
+        rows += runs(3 * place + 1, theirs.tolist(), state_violations=outside(3))
+    folder = write(tmp_path_factory.mktemp("grid"), cells, rows)
+    (folder / "campaign.toml").write_text('name = "by hand"\n')
+    write_report(folder)
+    return folder
+
+
+def test_the_page_is_complete_in_itself(grid: Path) -> None:
+    html = (grid / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|<script|<link|url\((?!#)", html)
+    assert len(html) < 1_500_000
+    ids = re.findall(r'\bid="([^"]*)"', html)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'(?:href="#|url\(#)([^")]+)', html)) <= set(ids)
+
+
+def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None:
+    text = text_of(grid / "report.html")
+    assert "Campaign “by hand” 12 cells · seed 7 · uavctl 9.9" in text
+    assert "480 runs of 50 steps were flown" in text
+    assert "4 cells had no design and were not flown" in text
+    assert "In 0 of 4 cases the SMPC costs less than every baseline" in text
+    assert "in 4 every baseline that costs less breaks limits more often" in text
+    assert "Not flown: tau: nothing is fast enough." in text
+    assert 'name = "by hand"' in text
+    assert "lqg <b>" in text
+
+
+def test_failed_runs_are_listed_and_a_run_can_be_flown_again(grid: Path) -> None:
+    text = text_of(grid / "report.html")
+    assert "1 run failed; they are listed below." in text
+    assert "4 lqg <b> 30 % 7 it broke" in text
+    costliest = int(NOISE.argmax())
+    assert f"uavctl campaign --refly 9:{costliest} --out" in text
+
+
+def test_links_that_are_a_loss_make_a_line_and_others_dots(grid: Path) -> None:
+    html = (grid / "report.html").read_text(encoding="utf-8")
+    figures = set(re.findall(r'<figure id="([^"]*)"', html))
+    assert {"cost-loss-s0", "states-loss-s0", "inputs-loss-s0", "cost-link-s0", "states-link-s0"} <= figures
+    assert {"difference-s0-0", "ages-wide", "ages-narrow"} <= figures
+    (states,) = re.findall(r'<figure id="states-loss-s0".*?</figure>', html, re.DOTALL)
+    assert "stroke-dasharray" in states
+    assert "var(--limit" in states  # the promised risk
+    (cost,) = re.findall(r'<figure id="cost-loss-s0".*?</figure>', html, re.DOTALL)
+    assert "var(--limit" not in cost
+
+
+def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
+    html = (grid / "report.html").read_text(encoding="utf-8")
+    labels = re.findall(r'<figure [^>]*><svg role="img" aria-label="([^"]+)"', html)
+    assert len(labels) == html.count("<figure")
+
+
+@pytest.mark.parametrize(
+    ("cells", "rows", "said"),
+    [
+        ([cell(0, "lqg")], runs(0, [1.0, 2.0]), "No SMPC was flown."),
+        ([cell(0, "smpc", "smpc")], runs(0, [1.0]), "There is no baseline to compare with."),
+        ([cell(0, "smpc", "smpc")], runs(0, [np.nan, np.nan]), "No run ended in order; all 2 failed."),
+        ([cell(0, "smpc", "smpc", refused="no")], runs(1, [1.0]), "Not flown: no."),
+        ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [1.0]), *runs(1, [1e300])], "less than every baseline"),
+        ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [0.0, 0.0]), *runs(1, [0.0, 0.0])], "costs the same"),
+    ],
+)  # fmt: skip
+def test_campaigns_of_odd_shapes_have_a_page(cells: Any, rows: Any, said: str, tmp_path: Path) -> None:
+    assert said in text_of(write_report(write(tmp_path, cells, rows)))
+
+
+def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    folder = write(tmp_path, [cell(0, "a")], runs(0, [1.0]))
+    (folder / "report.html").mkdir()
+    with pytest.raises(UavctlError, match="cannot be written"):
+        write_report(folder)

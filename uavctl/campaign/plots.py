@@ -1,0 +1,295 @@
+"""Figures of a campaign's page: cost, violation rates, inputs, ages and differences, by controller and link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from textwrap import fill
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
+
+from logs.page import Mark
+from logs.plots import DASHED, DOTTED
+from logs.plots_control import WIDE_IN
+from logs.svg import WIDTH_IN, Drawing, canvas, colour
+from uavctl.campaign.intervals import Pair
+from uavctl.campaign.results import Results
+from uavctl.campaign.statistics import CellSummary
+from uavctl.campaign.verdict import Comparison, Verdict
+
+# Beyond this ratio of the largest to the smallest, a logarithmic axis.
+_WIDE = 4.0
+_NUMERIC_AT_LEAST = 3  # links with a plain loss, for a line over it
+_LINEAR_PERCENT = 3.0  # of the axis of differences; logarithmic beyond
+_FARTHEST_PERCENT = 1e6  # what is beyond stands there
+# A controller that diverges would press all others together: beyond this times the least, it leaves the frame.
+_TALLEST = 1e5
+_TITLE_WIDTH = 48
+_LABEL_WIDTH = 16  # characters of a link's name in a line
+_LOOKS = tuple(
+    (role, kind)
+    for kind in ("planned", "dashed")
+    for role in ("estimate", "sample", "target", "plan", "truth", "muted")
+)
+_LINE = {"planned": "-", "dashed": DASHED}
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How each controller is drawn, the same in all figures."""
+
+    controllers: tuple[str, ...]
+
+    def of(self, controller: str) -> tuple[str, str, str]:
+        """Colour's role, kind of line, marker."""
+        place = self.controllers.index(controller)
+        role, kind = _LOOKS[place % len(_LOOKS)]
+        return role, kind, _MARKERS[place % len(_MARKERS)]
+
+    def marks(self) -> tuple[Mark, ...]:
+        """The legend."""
+        return tuple(Mark(kind, role, name) for name in self.controllers for role, kind, _ in (self.of(name),))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a figure shows of each cell.
+
+    Attributes:
+        key: In the figure's id.
+        title: Of the figure.
+        label: Of its axis.
+        value: The figure of a cell and its interval; None where it has none.
+        promised: The share that a cell's design allows; None where that is no matter.
+        scale: To the unit of the axis.
+    """
+
+    key: str
+    title: str
+    label: str
+    value: Callable[[CellSummary], tuple[float | None, Pair | None]]
+    promised: Callable[[CellSummary], float | None]
+    scale: float = 1.0
+
+
+COST = Quantity("cost", "Cost", "cost of a run", lambda c: (c.cost, c.cost_ci), lambda _: None)
+SETTLED = Quantity(
+    "settled", "Settled cost", "cost of a step", lambda c: (c.settled_cost, c.settled_cost_ci), lambda _: None
+)
+STATES = Quantity(
+    "states",
+    "States outside the limits",
+    "steps with a state outside [%]",
+    lambda c: (c.violation_rate, c.violation_ci),
+    lambda c: c.promised_x,
+    100.0,
+)
+INPUTS = Quantity(
+    "inputs",
+    "Inputs asked for outside the limits",
+    "steps with an input outside [%]",
+    lambda c: (c.input_violation_rate, c.input_violation_ci),
+    lambda c: c.promised_u,
+    100.0,
+)
+QUANTITIES = (COST, STATES, SETTLED, INPUTS)
+
+
+def compared(cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str) -> Iterator[Drawing]:
+    """Every quantity of the cells of one disturbance and plant: over the loss where it is a number, by link else.
+
+    Args:
+        cells: Of all links and controllers.
+        losses: Loss of the links that are nothing but a loss.
+        looks: How controllers are drawn.
+        key: Keeps the figures' ids apart.
+    """
+    flown = [cell for cell in cells if cell.cost is not None]
+    named = {cell.link for cell in flown}
+    numeric = {link: loss for link, loss in losses.items() if link in named}
+    if len(set(numeric.values())) < _NUMERIC_AT_LEAST:
+        numeric = {}
+    others = [cell for cell in flown if cell.link not in numeric]
+    if numeric:
+        shown = [cell for cell in flown if cell.link in numeric]
+        yield from (_over_loss(one, shown, numeric, looks, key) for one in QUANTITIES)
+    if others:
+        yield from (_by_link(one, others, looks, key) for one in QUANTITIES)
+
+
+def _over_loss(
+    quantity: Quantity, cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str
+) -> Drawing:
+    name = f"{quantity.key}-loss-{key}"
+    with canvas(name, 2.8) as one:
+        ax = one.axes(quantity.title, "positions lost [%]", quantity.label)
+        floor = _scale(ax, quantity, cells, ax.set_yscale)
+        for controller in dict.fromkeys(cell.controller for cell in cells):
+            role, kind, marker = looks.of(controller)
+            mine = sorted((cell for cell in cells if cell.controller == controller), key=lambda c: losses[c.link])
+            x = np.array([100.0 * losses[cell.link] for cell in mine])
+            value, low, high = _figures(quantity, mine)
+            ax.fill_between(x, np.maximum(low, floor), high, color=colour(role), alpha=0.16, lw=0)
+            ax.plot(
+                x, np.where(value > floor, value, np.nan), ls=_LINE[kind], marker=marker, ms=3.8, color=colour(role)
+            )
+            none = value <= floor
+            ax.plot(x[none], high[none], ls="", marker=CARETDOWNBASE, ms=5, color=colour(role))
+        _promise(ax.axhline, quantity, cells)
+    return Drawing(name, one.svg, f"{quantity.title} of each controller over the loss of the link")
+
+
+def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key: str) -> Drawing:
+    """Grouped dots: a row for each link, a dot with its interval for each controller."""
+    name = f"{quantity.key}-link-{key}"
+    links = list(dict.fromkeys(cell.link for cell in cells))
+    who = list(dict.fromkeys(cell.controller for cell in cells))
+    labels = [fill(link, _LABEL_WIDTH) for link in links]
+    with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
+        ax = one.axes(quantity.title, quantity.label, "")
+        floor = _scale(ax, quantity, cells, ax.set_xscale)
+        for place, controller in enumerate(who):
+            role, kind, marker = looks.of(controller)
+            mine = [cell for cell in cells if cell.controller == controller]
+            rows = np.array([links.index(cell.link) + _offset(place, len(who)) for cell in mine])
+            value, low, high = _figures(quantity, mine)
+            face = colour(role) if kind == "planned" else colour("card")
+            ax.hlines(rows, np.maximum(low, floor), high, color=colour(role), lw=1.6)
+            there = value > floor
+            ax.plot(value[there], rows[there], ls="", marker=marker, ms=4.2, color=colour(role), mfc=face)
+            ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=colour(role))
+        _promise(ax.axvline, quantity, cells)
+        _rows(ax, labels)
+    return Drawing(name, one.svg, f"{quantity.title} of each controller by link")
+
+
+def differences(verdicts: Sequence[Verdict], looks: Looks, title: str, key: str) -> Drawing | None:
+    """Paired cost differences of each baseline to one SMPC by link, over the SMPC's cost."""
+    shown = [verdict for verdict in verdicts if any(one.share is not None for one in verdict.comparisons)]
+    if not shown:
+        return None
+    labels = [fill(verdict.group[0], _LABEL_WIDTH) for verdict in shown]
+    who = list(dict.fromkeys(one.baseline.controller for verdict in shown for one in verdict.comparisons))
+    name = f"difference-{key}"
+    with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
+        ax = one.axes(fill(title, _TITLE_WIDTH), "what the baseline costs more [%]", "")
+        ax.set_xscale("symlog", linthresh=_LINEAR_PERCENT, linscale=0.8)
+        ax.axvline(0.0, color=colour("ink"), lw=0.9)
+        for row, verdict in enumerate(shown):
+            for comparison in verdict.comparisons:
+                place = row + _offset(who.index(comparison.baseline.controller), len(who))
+                _difference(ax, comparison, place, looks)
+        ax.xaxis.set_major_locator(SymmetricalLogLocator(base=10.0, linthresh=_LINEAR_PERCENT, subs=(1.0, 3.0)))
+        ax.xaxis.set_major_formatter(FuncFormatter(_plain))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        _rows(ax, labels)
+    return Drawing(name, one.svg, f"{title}: what each baseline costs more, by link, with its interval")
+
+
+def _difference(ax: Axes, one: Comparison, place: float, looks: Looks) -> None:
+    """A full dot where the SMPC breaks no limit more often, else a cross."""
+    if one.share is None:
+        return
+    mean, low, high = np.clip(100.0 * np.array(one.share), -_FARTHEST_PERCENT, _FARTHEST_PERCENT)
+    role, _, marker = looks.of(one.baseline.controller)
+    ax.hlines(place, low, high, color=colour(role), lw=1.6)
+    marker, width = (marker, 1.0) if one.as_safe else ("x", 1.8)
+    ax.plot(mean, place, ls="", marker=marker, ms=4.4, mew=width, color=colour(role))
+
+
+def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawing]:
+    """How often the age of information was at least j, by link: for a wide page and for a narrow one."""
+    by_link: dict[str, list[int]] = {}
+    for cell in cells:
+        if cell.ages and len(cell.ages) >= len(by_link.get(cell.link, [])):
+            by_link[cell.link] = cell.ages
+    steps = results.planned * results.steps
+    label = f"Share of {steps} steps in which the age of information is at least j, by link"
+    drawings = []
+    for key, width_in in (("ages-wide", WIDE_IN), ("ages-narrow", WIDTH_IN)):
+        with canvas(key, 2.8, width_in) as one:
+            _tails(one.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
+        drawings.append(Drawing(key, one.svg, label))
+    return drawings[0], drawings[1]
+
+
+def _tails(ax: Axes, histograms: list[list[int]]) -> None:
+    for place, counts in enumerate(histograms):
+        role, kind = _LOOKS[place % len(_LOOKS)]
+        tail = 100.0 * np.cumsum(np.array(counts, dtype=np.float64)[::-1])[::-1] / max(1, sum(counts))
+        shown = np.flatnonzero(tail)
+        ax.plot(shown, tail[shown], ls=_LINE[kind], marker=_MARKERS[place % len(_MARKERS)], ms=3.4, color=colour(role))
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(FuncFormatter(_plain))
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    ax.set_xlim(left=-0.3)
+
+
+def age_marks(cells: Sequence[CellSummary]) -> tuple[Mark, ...]:
+    """Its legend."""
+    links = dict.fromkeys(cell.link for cell in cells if cell.ages)
+    return tuple(
+        Mark(kind, role, link) for place, link in enumerate(links) for role, kind in (_LOOKS[place % len(_LOOKS)],)
+    )
+
+
+def _figures(quantity: Quantity, cells: Sequence[CellSummary]) -> np.ndarray:
+    rows = [(value, *interval) for value, interval in map(quantity.value, cells) if value is not None and interval]
+    return quantity.scale * np.array(rows, dtype=np.float64).T
+
+
+def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale: Callable[[str], None]) -> float:
+    """A logarithmic axis where the figures lie far apart; at or below the value returned there is no place on it."""
+    value, _, high = _figures(quantity, cells)
+    above = value[value > 0.0]
+    if not high.size or not (high > 0.0).any():
+        return -np.inf
+    least = above.min() if above.size else high.min()
+    axis = ax.yaxis if set_scale == ax.set_yscale else ax.xaxis
+    if high.max() < _WIDE * least and (value > 0.0).all():
+        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_formatter(FuncFormatter(_plain))
+        return -np.inf
+    set_scale("log")
+    axis.set_major_formatter(FuncFormatter(_plain))
+    axis.set_minor_formatter(NullFormatter())
+    if high.max() > _TALLEST * least and quantity.scale == 1.0:
+        (ax.set_ylim if axis is ax.yaxis else ax.set_xlim)(0.5 * least, _TALLEST * least)
+    if high.max() < 100.0 * least:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    return 0.0
+
+
+def _promise(draw: Callable[..., object], quantity: Quantity, cells: Sequence[CellSummary]) -> None:
+    promised = {quantity.promised(cell) for cell in cells} - {None}
+    for share in promised:
+        draw(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
+
+
+def _offset(place: int, count: int) -> float:
+    """Within a row, from -0.36 to 0.36."""
+    return 0.0 if count == 1 else 0.72 * (place / (count - 1) - 0.5)
+
+
+def _row_in(label: str, count: int) -> float:
+    """Height of a row [in]."""
+    return max(0.13 * count + 0.08, 0.15 * (label.count("\n") + 1) + 0.06)
+
+
+def _rows(ax: Axes, labels: Sequence[str]) -> None:
+    ax.set_yticks(range(len(labels)), labels)
+    ax.set_ylim(len(labels) - 0.5, -0.5)
+    ax.grid(visible=False, axis="y")
+    for row in range(1, len(labels)):
+        ax.axhline(row - 0.5, color=colour("grid"), lw=0.6, ls=DOTTED)
+
+
+def _plain(value: float, _place: int) -> str:
+    for least, suffix in ((1e6, "M"), (1e4, "k")):
+        if abs(value) >= least:
+            return f"{value / (1e6 if suffix == 'M' else 1e3):.6g}{suffix}"
+    return f"{value:.4g}"

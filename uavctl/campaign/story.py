@@ -1,0 +1,59 @@
+"""What a campaign came to, in sentences made from its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from logs.summary import count
+from uavctl.campaign.verdict import Verdict, group_of, percent
+from uavctl.campaign.view import View
+
+
+def story(view: View) -> Iterator[str]:
+    """Sentences; each is true of this campaign's figures."""
+    results, cells = view.results, view.cells
+    refused = sum(bool(cell.refused) for cell in cells)
+    failed = sum(cell.failed for cell in cells)
+    flown = sum(cell.runs for cell in cells)
+    yield (
+        f"{count(flown, 'run')} of {count(results.steps, 'step')} were flown: {count(results.planned, 'run')} for each "
+        f"of {count(len(cells) - refused, 'cell')}, all cells on the same disturbances and losses."
+    )
+    if refused:
+        yield f"{count(refused, 'cell')} had no design and were not flown; the reasons are below."
+    yield f"{count(failed, 'run')} failed; they are listed below." if failed else "No run failed."
+    judged = [verdict for verdict in view.verdicts if verdict.comparisons]
+    if judged:
+        yield _outcome(judged)
+    yield from _promise(view)
+
+
+def _outcome(judged: Sequence[Verdict]) -> str:
+    """How often the SMPC was below all baselines, how often one was below it, and what that one did."""
+    holds, beaten = sum(v.holds for v in judged), sum(v.beaten for v in judged)
+    bought = sum(not v.beaten and any(one.cheaper > 0 for one in v.comparisons) for v in judged)
+    text = (
+        f"In {holds} of {count(len(judged), 'case')} the SMPC costs less than every baseline at equal or lower "
+        f"violation rates. In {beaten} a baseline costs less and breaks limits no more often; in {bought} every "
+        "baseline that costs less breaks limits more often."
+    )
+    left = len(judged) - holds - beaten - bought
+    return f"{text} In {left} costs cannot be told apart, or a baseline keeps limits better." if left else text
+
+
+def _promise(view: View) -> Iterator[str]:
+    """Whether the risk promised was kept."""
+    kept = [cell for cell in view.cells if cell.promised_x is not None and cell.violation_ci is not None]
+    if not kept:
+        return
+    over = [c for c in kept if c.violation_ci is not None and c.violation_ci[0] > (c.promised_x or 0.0)]
+    worst = max(kept, key=lambda cell: cell.violation_rate or 0.0)
+    where = f"{worst.controller}, {view.place(group_of(worst))}"
+    if over:
+        yield f"{count(len(over), 'cell')} of {len(kept)} broke state limits more often than the design allows."
+    else:
+        yield f"None of the {count(len(kept), 'cell')} with a promise broke state limits more often than it allows."
+    yield (
+        f"The most was {percent(worst.violation_rate)} of steps ({where}), where {percent(worst.promised_x)} are "
+        "allowed."
+    )
