@@ -1,0 +1,101 @@
+"""What every baseline is given: the same plant, limits and weights as the SMPC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from uavctl.smpc.plant import Plant
+from uavctl.smpc.sets import Polytope
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A control problem with a target.
+
+    Attributes:
+        plant: The plant that is predicted with.
+        state_set: X.
+        input_set: U.
+        q_x: Q_x (n_x, n_x).
+        q_u: Q_u (n_u, n_u), positive definite.
+        target: Equilibrium to go to (n_x,).
+        u_target: Its input (n_u,).
+        horizon: H [steps].
+        slack_linear: Exact penalty of leaving a state row.
+        slack_quadratic: Its quadratic part.
+    """
+
+    plant: Plant
+    state_set: Polytope
+    input_set: Polytope
+    q_x: Array
+    q_u: Array
+    target: Array
+    u_target: Array
+    horizon: int
+    slack_linear: float
+    slack_quadratic: float
+
+    @property
+    def input_box(self) -> tuple[Array, Array]:
+        """Limits of each input by itself (n_u,), (n_u,), infinite where there is none."""
+        return box(self.input_set, self.plant.n_u)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """States, inputs and rows of the sets (their indices) that have to do with no others."""
+
+    states: Index
+    inputs: Index
+    rows_x: Index
+    rows_u: Index
+
+
+def parts(problem: Problem) -> tuple[Part, ...]:
+    """Independent parts of a problem without disturbances; those without an input are left out."""
+    plant, c_x, c_u = problem.plant, problem.state_set.c, problem.input_set.c
+    coupled = np.block(
+        [
+            [(plant.a != 0) | (problem.q_x != 0) | (np.abs(c_x.T) @ np.abs(c_x) != 0), plant.b != 0],
+            [np.zeros((plant.n_u, plant.n_x), dtype=bool), (problem.q_u != 0) | (np.abs(c_u.T) @ np.abs(c_u) != 0)],
+        ]
+    )
+    _, label = connected_components(sparse.csr_array(coupled), directed=False)
+    of_x, of_u = label[: plant.n_x], label[plant.n_x :]
+    return tuple(
+        Part(
+            states=np.flatnonzero(of_x == i),
+            inputs=np.flatnonzero(of_u == i),
+            rows_x=_rows(problem.state_set, of_x == i),
+            rows_u=_rows(problem.input_set, of_u == i),
+        )
+        for i in dict.fromkeys(of_u.tolist())
+    )
+
+
+def _rows(limits: Polytope, variables: NDArray[np.bool_]) -> Index:
+    return np.flatnonzero(np.any(limits.c[:, variables] != 0, axis=1) & np.isfinite(limits.b))
+
+
+def box(limits: Polytope, n: int) -> tuple[Array, Array]:
+    """The largest box (n,), (n,) around a set of which only rows of a single variable are looked at."""
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    for row, side in zip(limits.c, limits.b, strict=True):
+        (used,) = np.nonzero(row)
+        if used.size != 1:
+            continue
+        (i,) = used
+        if row[i] > 0:
+            high[i] = min(high[i], side / row[i])
+        else:
+            low[i] = max(low[i], side / row[i])
+    return low, high
