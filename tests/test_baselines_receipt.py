@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from baseline_rig import PAPER_START, Fed, problem
 
 from uavctl.smpc.baselines import HoldLast, PacketisedPredictive, ZeroOnLoss
 from uavctl.smpc.baselines.mpc import BatchMpc
+from uavctl.smpc.sets import Polytope
 
 # Newest position known in the steps 0, 1 …: one that is lost in between, a late one (step 5 sees that of step 4).
 NEWEST = (0, 1, 1, 1, 1, 4, 4, 7)
@@ -61,3 +64,16 @@ def test_news_from_the_past_is_predicted_with_the_inputs_that_acted() -> None:
     for u in fed.inputs[0, 1:]:
         x = given.plant.a @ x + given.plant.b @ u
     assert fed.step(1) == pytest.approx(mpc.plans(x[None])[0, 0], abs=1e-9)
+
+
+def test_a_margin_keeps_the_plan_that_far_from_the_state_limits() -> None:
+    """Oracle: the same plan within limits that are drawn in by that many standard deviations of E w."""
+    given = problem("paper")
+    plant = given.plant
+    sigma = np.sqrt(np.diagonal(plant.e @ plant.w @ plant.e.T))
+    drawn_in = given.state_set.b - 3.0 * np.abs(given.state_set.c) @ sigma
+    narrower = replace(given, state_set=Polytope(given.state_set.c, drawn_in))
+    fed = Fed(given, PacketisedPredictive(given, 3.0), PAPER_START)
+    plan = BatchMpc(narrower).plans(PAPER_START[None])[0]
+    assert np.array([fed.step(0) for _ in range(6)]) == pytest.approx(plan[:6], abs=1e-9)
+    assert np.abs(plan - BatchMpc(given).plans(PAPER_START[None])[0]).max() > 0.1

@@ -99,3 +99,10 @@ def box(limits: Polytope, n: int) -> tuple[Array, Array]:
         else:
             low[i] = max(low[i], side / row[i])
     return low, high
+
+
+def deviations(limits: Polytope, covariance: Array) -> Array:
+    """Standard deviation along each row (m,)."""
+    variance = np.einsum("mi,ij,mj->m", limits.c, covariance, limits.c)
+    along: Array = np.sqrt(np.maximum(variance, 0.0))
+    return along

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.smpc.baselines.mpc import BatchMpc
-from uavctl.smpc.baselines.problem import Problem
+from uavctl.smpc.baselines.problem import Problem, deviations
 from uavctl.smpc.batch import News, predict
 
 Array = NDArray[np.float64]
@@ -20,14 +20,17 @@ class _OnReceipt(ABC):
 
     Args:
         problem: The problem.
+        margin: How far the plans keep from the state limits, in standard deviations of one step's disturbance.
 
     Raises:
         DesignError: The plant has no regulator.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, margin: float = 0.0) -> None:
         self._problem = problem
-        self._mpc = BatchMpc(problem)
+        plant = problem.plant
+        step = plant.e @ plant.w @ plant.e.T
+        self._mpc = BatchMpc(problem, margin * deviations(problem.state_set, step))
         self.begin(0)
 
     def begin(self, runs: int) -> None:

@@ -13,10 +13,9 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines.mpc import BatchMpc
-from uavctl.smpc.baselines.problem import Problem
+from uavctl.smpc.baselines.problem import Problem, deviations
 from uavctl.smpc.batch import News, predict
 from uavctl.smpc.lqg_bound import lqr
-from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
 
@@ -87,8 +86,8 @@ def _backoffs(problem: Problem, delay: int, kappa_x: float, kappa_u: float) -> t
     loop, spread = plant.a + plant.b @ k, np.zeros_like(step)
     backoff_x, backoff_u = [], []
     for _ in range(problem.horizon + 1):
-        backoff_x.append(kappa_x * _deviations(problem.state_set, error + spread))
-        backoff_u.append(kappa_u * _deviations(problem.input_set, k @ spread @ k.T))
+        backoff_x.append(kappa_x * deviations(problem.state_set, error + spread))
+        backoff_u.append(kappa_u * deviations(problem.input_set, k @ spread @ k.T))
         spread = loop @ spread @ loop.T + step
     return np.array(backoff_x), np.array(backoff_u[:-1])
 
@@ -101,8 +100,8 @@ def _prediction_gain(problem: Problem, error: Array, step: Array, kappa_x: float
         k = lqr(plant, problem.q_x, weight * problem.q_u).k
         spread = solve_discrete_lyapunov(plant.a + plant.b @ k, step)
         taken = max(
-            _taken(kappa_x * _deviations(problem.state_set, error + spread), room_x),
-            _taken(kappa_u * _deviations(problem.input_set, k @ spread @ k.T), room_u),
+            _taken(kappa_x * deviations(problem.state_set, error + spread), room_x),
+            _taken(kappa_u * deviations(problem.input_set, k @ spread @ k.T), room_u),
         )
         if taken < best[0]:
             best = (taken, k)
@@ -121,10 +120,3 @@ def _taken(backoff: Array, room: Array) -> float:
     """Largest share of the room that a back-off takes."""
     shares = np.divide(backoff, room, out=np.full(room.size, np.inf), where=room > 0.0)
     return float(shares.max(initial=0.0))
-
-
-def _deviations(limits: Polytope, covariance: Array) -> Array:
-    """Standard deviation along each row (m,)."""
-    variance = np.einsum("mi,ij,mj->m", limits.c, covariance, limits.c)
-    deviations: Array = np.sqrt(np.maximum(variance, 0.0))
-    return deviations
