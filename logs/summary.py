@@ -72,6 +72,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     largest_gap: float | None  # of a plan's cost above its certified lower bound, relative; None without a plan
     missed_ticks: int
     max_age_s: float  # largest age of the newest sample at a flown tick
+    trajectory: bool  # whether the target of the moment was a trajectory's; else a waypoint, or a place to hold
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
     final_error_m: float | None  # distance from the target at the last flown boundary
     recorder_dropped: int  # records that the disk was too slow for
@@ -126,6 +127,7 @@ def summarise(
         largest_gap=max((plan.gap for plan in flight.plans if np.isfinite(plan.gap)), default=None),
         missed_ticks=sum(d.missed_ticks for d in flight.decisions),
         max_age_s=max((e.age_s for e in flight.estimates if e.at_ns in flown_ns), default=0.0),
+        trajectory=flight.moving_target,
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
         final_error_m=float(error_m[-1]) if len(error_m) else None,
         recorder_dropped=recorder_dropped,
@@ -204,7 +206,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
         ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
         ("Plans found", _methods(s)),
         ("Cost", f"{s.cost:.6g}{seen}"),
-        ("Distance from target", _distance(s)),
+        (f"Distance from {'trajectory' if s.trajectory else 'target'}", _distance(s)),
         ("Decision time", _times(s.decision_us)),
         _punctuality(s),
     ]

@@ -17,6 +17,9 @@ _IN_FLIGHT = {
     ControlMode.HOLD: "The recording ends while the fallback held zero acceleration.",
 }
 
+# A target that moves by less than this share of its longest step only settles.
+_STILL = 0.05
+
 
 def story(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Sentences that say what happened; each is true of this flight's data."""
@@ -30,7 +33,7 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
         _state_limits(flight, summary),
         _input_limits(flight, summary),
         _plans(flight, summary),
-        *_waypoints(flight),
+        *(_trajectory(flight) if summary.trajectory else _waypoints(flight)),
         _ending(flight, summary),
     ]
 
@@ -41,9 +44,13 @@ def _engaged(flight: FlightData, s: FlightSummary, final_m: float, settled_m: fl
     seen = "" if s.state_source == "truth" else ", by the estimate"
     return (
         f"The controller took over {_after(begun_s)} and flew {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
-        f"It began {number(start_m)} m from the target and ended {number(final_m)} m from it{seen}; "
+        f"It began {number(start_m)} m from the {_goal(s)} and ended {number(final_m)} m from it{seen}; "
         f"over the last quarter the distance was {number(settled_m)} m (root mean square)."
     )
+
+
+def _goal(s: FlightSummary) -> str:
+    return "trajectory's place of the moment" if s.trajectory else "target"
 
 
 def _after(begun_s: float) -> str:
@@ -142,6 +149,27 @@ def _waypoints(flight: FlightData) -> list[str]:
         return []
     times = ", ".join(f"waypoint {then + 1} at {_seconds(flight, at_ns)}" for at_ns, then in left)
     return [f"It set out for {times}."]
+
+
+def _trajectory(flight: FlightData) -> list[str]:
+    """How far and how long the target moved, and how near to it the vehicle was meanwhile."""
+    times_s, states = flight.targets
+    moves = np.linalg.norm(np.diff(states[:, list(flight.design.position_index)], axis=0), axis=1)
+    (moved,) = np.nonzero(moves > _STILL * moves.max(initial=0.0))
+    if not len(moved):
+        return ["The trajectory did not move."]
+    begun_s, ended_s = float(times_s[moved[0]]), float(times_s[moved[-1] + 1])
+    error_m = position_error_m(flight)[(flight.steps.t_s >= begun_s) & (flight.steps.t_s <= ended_s)]
+    near = (
+        f"; the distance from its place of the moment was {number(float(np.sqrt(np.mean(error_m**2))))} m meanwhile "
+        f"(root mean square), at most {number(float(error_m.max()))} m"
+        if len(error_m)
+        else ""
+    )
+    return [
+        f"It was to follow a trajectory, {number(float(moves.sum()))} m from {number(begun_s)} s to "
+        f"{number(ended_s)} s{near}."
+    ]
 
 
 def _ending(flight: FlightData, s: FlightSummary) -> str:

@@ -11,7 +11,8 @@ from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, Record, Sink
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design import Design, design_record
+from uavctl.smpc.design import Design
+from uavctl.smpc.design_record import design_record
 from uavctl.smpc.library import Library
 
 R = TypeVar("R", bound=Record)
@@ -34,13 +35,13 @@ def make_loop(config: Config, sink: Sink, design: Design | None = None, library:
     return ControlLoop(config, build_controller(config, design, library), sink, lambda: 0)
 
 
-def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:
+def lockstep(name: str, duration_s: float, *overrides: str, library: Library | None = None) -> Memory:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
     design = build_design(config)
     memory = Memory()
     memory.put("/uavctl/header", 0, header(config, design))
-    loop = make_loop(config, memory, design)
+    loop = make_loop(config, memory, design, library)
     World(config, loop, on_truth=lambda truth: memory.put("/sim/truth", truth.at_ns, truth)).run(duration_s)
     return memory
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.config.types import ClockConfig, DaemonConfig, EstimatorConfig, FrameConfig, SourceConfig
+from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
 from uavctl.data import Event, PositionSample, VehicleStatus
 from uavctl.mavlink.link import Item, Link
 

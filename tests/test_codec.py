@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Setpoint, SetpointSource, Vec3
 from uavctl.frames import Convention
-from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text, TimeSync
 
 CAMERA = Peer(17, 18)

@@ -14,7 +14,8 @@ from scipy.stats import chi2, norm
 
 from uavctl.errors import DesignError
 from uavctl.smpc import design as design_module
-from uavctl.smpc.design import Design, design_record, make_design
+from uavctl.smpc.design import Design, make_design
+from uavctl.smpc.design_record import design_record
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.risk import kappa
 from uavctl.smpc.sets import Polytope

@@ -13,10 +13,11 @@ import pytest
 from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_link, packets, samples, statuses
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.config.types import SourceConfig
+from uavctl.config.peers import SourceConfig
 from uavctl.data import PositionSample, Setpoint, SetpointSource, Severity
 from uavctl.mavlink import codec
-from uavctl.mavlink.codec import Encoder, decode
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.link import Item, Link
 from uavctl.mavlink.mode import HandOver, Sending, State
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from logs.moving_limits import box_at
 from logs.replay import replay
 from logs.report import report_html
-from logs.summary import position_error_m, summarise
+from logs.summary import position_error_m, rows, summarise
 from logs.words import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
@@ -168,7 +169,25 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert report_html(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
     moving = flight(flown(22.0, *as_trajectory(20.0)))
     assert moving.moving_target and not data.moving_target
-    assert report_html(moving, summarise(moving, wall_s=1.0)).startswith("<!DOCTYPE html>")
+    summary = summarise(moving, wall_s=1.0)
+    assert report_html(moving, summary).startswith("<!DOCTYPE html>")
+    assert summary.trajectory and "Distance from trajectory" in dict(rows(summary))
+    assert "Distance from target" in dict(rows(summarise(data, wall_s=1.0)))
+    told = story(moving, summary)
+    (sentence,) = [text for text in told if "follow a trajectory" in text]
+    assert not any("from the target" in text or "waypoint" in text for text in told)
+    # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
+    found = re.fullmatch(
+        r"It was to follow a trajectory, (\S+) m from (\S+) s to (\S+) s; the distance from its place of the moment "
+        r"was (\S+) m meanwhile \(root mean square\), at most (\S+) m\.",
+        sentence,
+    )
+    assert found is not None
+    length_m, begun_s, ended_s, rms_m, most_m = map(float, found.groups())
+    error_m = position_error_m(moving)
+    assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
+    assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
+    assert 0.0 < rms_m < most_m == pytest.approx(error_m.max(), abs=5e-4)
 
 
 def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:

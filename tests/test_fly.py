@@ -21,7 +21,8 @@ from uavctl.build import build_design
 from uavctl.config import load_config
 from uavctl.config.load import parse
 from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
-from uavctl.library_store import decode, library_for
+from uavctl.library_bytes import decode
+from uavctl.library_store import library_for
 
 SOURCE = Path(__file__).parent / "foreign_source.py"
 LIMIT_S = 60.0

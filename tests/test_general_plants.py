@@ -14,13 +14,14 @@ from scipy.linalg import block_diag
 
 from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
+from uavctl.smpc.answer import NOMINAL
 from uavctl.smpc.components import decompose, whole
-from uavctl.smpc.conic import ConicSolver
+from uavctl.smpc.conic import ConicSolver, PartSolver
 from uavctl.smpc.design import make_design
 from uavctl.smpc.equilibria import equilibria
 from uavctl.smpc.horizon import horizon_of
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.printed import PrintedSolver
+from uavctl.smpc.printed import PrintedProblem, PrintedSolver
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,22 @@ def test_cost_is_that_of_the_printed_problem(name: str) -> None:
     printed = PrintedSolver(made.design).solve(0, made.x, made.design.target)
     assert printed.status is SolveStatus.OPTIMAL
     assert made.answer.cost == pytest.approx(printed.cost, rel=1e-6)
+
+
+def test_the_printed_form_of_an_axis_that_nothing_disturbs() -> None:
+    made = case("calm axis, no column")
+    calm, windy = sorted(decompose(made.design), key=lambda part: part.e.shape[1])
+    assert (calm.e.shape[1], windy.e.shape[1]) == (0, 1)
+    printed = PrintedProblem(made.design, calm).solve(made.x, made.design.target)
+    exact = PartSolver(made.design, calm).solve(made.x, made.design.target, NOMINAL)
+    assert printed.status is SolveStatus.OPTIMAL
+    assert printed.cost == pytest.approx(exact.cost, rel=1e-6)
+    assert printed.inputs == pytest.approx(exact.inputs, abs=1e-4)
+    assert not printed.backoff_x.any() and not printed.backoff_u.any()
+    # The whole problem, whose other axis may end inaccurate: it is as good as that one.
+    assert PrintedSolver(made.design).solve(0, made.x, made.design.target).cost == pytest.approx(
+        made.answer.cost, rel=1e-5
+    )
 
 
 def test_shapes_cover_what_they_are_to_cover() -> None:

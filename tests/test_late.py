@@ -25,7 +25,9 @@ from uavctl.smpc.answer import Outlook
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
 from uavctl.smpc.late import make_late, with_late
+from uavctl.smpc.library import make_library
 from uavctl.smpc.link import LatePackets, gilbert_elliott
+from uavctl.smpc.plan_map import TOLERANCE
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -239,7 +241,8 @@ def test_the_printed_solver_is_for_what_it_knows() -> None:
         assert caught.value.key == "solver.method"
 
 
-LATE_LINK = ("link.delay_s=0.25", "link.loss=0.1", "clock.latency_s=0.25", "solver.method=exact")
+LATE = ("link.delay_s=0.25", "link.loss=0.1", "clock.latency_s=0.25")
+LATE_LINK = (*LATE, "solver.method=exact")
 
 
 @pytest.fixture(scope="module")
@@ -279,3 +282,22 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
     config = load_config("room", ["duration_s=12.0", *LATE_LINK])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
+
+
+def test_a_flight_on_late_positions_with_a_library() -> None:
+    """Every plan comes from the late policies, with a certificate that the exact program confirms."""
+    design = build_design(load_config("room", list(LATE)))
+    library = make_library(design, most=12)
+    assert [len(parts) for parts in library.variants] == [3, 3, 3]
+    memory, solver = lockstep("room", 12.0, *LATE, library=library), ConicSolver(design)
+    plans = memory.of(Plan)
+    assert len(plans) > 40
+    assert {plan.method for plan in plans} == {"frozen", "mixture"}
+    assert all(0.0 <= plan.gap <= TOLERANCE for plan in plans)
+    for plan in plans[::4]:
+        exact = solver.solve(plan.seq, np.array(plan.states[0]), design.target, Outlook(late=1))
+        assert exact.status is SolveStatus.OPTIMAL
+        assert plan.cost_lower <= exact.cost * (1.0 + 1e-7)
+        assert exact.cost <= plan.cost * (1.0 + 1e-7)
+    config = load_config("room", ["duration_s=12.0", *LATE])
+    assert replay(memory.entries, lambda sink: make_loop(config, sink, design, library)).identical

@@ -22,10 +22,12 @@ from logs.recover import recover
 from logs.replay import recorded_library, replay
 from uavctl.build import build_design
 from uavctl.cli.app import run
+from uavctl.code_id import decider_id
 from uavctl.config import load_config
 from uavctl.data import Header, Plan, PolicyLibrary
 from uavctl.errors import RecordingError
-from uavctl.library_store import StoredLibrary, cache_file, decode, encode, library_for
+from uavctl.library_bytes import StoredLibrary, decode, encode
+from uavctl.library_store import cache_file, library_for
 from uavctl.smpc.library import Library
 
 LIBRARY = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) * 20)
@@ -124,6 +126,32 @@ def test_a_library_recorded_in_the_place_of_the_one_flown_with_is_found(
         capsys, "log", "replay", str(rewritten(flown, tmp_path / "x.mcap", {PolicyLibrary: changed})), code=1
     )
     assert found["first_difference"]["topic"] == "/uavctl/plan"
+
+
+def test_a_replay_that_differs_says_which_versions_it_was_recorded_with(
+    flown: Path, stored: StoredLibrary, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert document(capsys, "log", "replay", str(flown))["other_versions"] == []
+    header = next(records(flown, Header))
+    assert header.versions["code"] == decider_id()
+    without = {name: version for name, version in header.versions.items() if name != "code"}
+    others = {
+        "c.mcap": ({**header.versions, "code": "0123", "numpy": "1.0"}, "code 0123", 2),
+        "d.mcap": (without, "code unknown", 1),
+    }
+    library = msgspec.structs.replace(
+        recorded_library(flown), data=encode(worse(stored.library), stored.names, stored.check, 0.0)
+    )
+    for name, (changed, words, count) in others.items():
+        other = msgspec.structs.replace(header, versions=changed)
+        path = rewritten(flown, tmp_path / name, {Header: other, PolicyLibrary: library})
+        found = document(capsys, "log", "replay", str(path), code=1)
+        assert len(found["other_versions"]) == count
+        assert f"recorded with {words}, here is {decider_id()}" in found["other_versions"]
+        assert run(["log", "replay", str(path)]) == 1
+        told = capsys.readouterr()
+        assert f"recorded with {words}, here is {decider_id()}: decisions may differ" in " ".join(told.err.split())
+        assert f"recorded with {words}, here is {decider_id()}" in told.out
 
 
 def test_a_recording_that_lacks_its_library_is_told(

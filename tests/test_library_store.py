@@ -14,9 +14,11 @@ import pytest
 from optimisation_cases import START, paper_spec
 
 from uavctl import library_store
+from uavctl.code_id import maker_id
 from uavctl.errors import DesignError, LibraryError
+from uavctl.library_bytes import check_fits, decode, encode
 from uavctl.library_check import LibraryCheck, check_library
-from uavctl.library_store import Advance, cache_file, check_fits, decode, encode, library_for, load
+from uavctl.library_store import Advance, cache_file, library_for, load
 from uavctl.smpc.components import decompose
 from uavctl.smpc.design import Design, make_design
 from uavctl.smpc.horizon import horizon_of
@@ -191,29 +193,12 @@ def test_another_design_and_other_code_have_other_files(
 ) -> None:
     library_for(design)
     here = cache_file(design)
-    assert here.name == f"{design.design_id}-{library_store.maker_id()}.library"
+    assert here.name == f"{design.design_id}-{maker_id()}.library"
     assert cache_file(replace(design, design_id="other")) != here
     monkeypatch.setattr(library_store, "maker_id", lambda: "later")
     assert cache_file(design) != here
     library_for(design)
     assert grower.calls == 2
-
-
-def test_the_code_s_hash_follows_its_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def hashed() -> str:
-        library_store.maker_id.cache_clear()
-        return library_store.maker_id()
-
-    (tmp_path / "a.py").write_text("one", encoding="utf-8")
-    own = hashed()
-    with monkeypatch.context() as patch:
-        patch.setattr("importlib.resources.files", lambda package: tmp_path)
-        first = hashed()
-        (tmp_path / "a.pyc").write_text("no source", encoding="utf-8")
-        assert hashed() == first != own
-        (tmp_path / "a.py").write_text("two", encoding="utf-8")
-        assert hashed() != first
-    assert hashed() == own
 
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {

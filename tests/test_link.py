@@ -8,9 +8,10 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import MS, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 
-from uavctl.config.types import ClockConfig, DaemonConfig, EstimatorConfig, FrameConfig, SourceConfig
+from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
 from uavctl.data import Setpoint, SetpointSource, Severity
-from uavctl.mavlink.codec import UnsendableError
+from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.link import Link
 
 NOW = 50_000 * SECOND

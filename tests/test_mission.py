@@ -236,7 +236,14 @@ side = "lower"
 times_s = [-1.0]
 values = [-3.5]
 sides = 1
+
+[[fence]]
+state = "north"
+side = "upper"
+times_s = [0.0, 1.0, 2.0]
+values = [1.0, -3.0, -4.0]
 """
+BEYOND = "values = [1.0, -3.0, -4.0]"
 
 
 def problems(text: str, *overrides: str) -> list[str]:
@@ -257,8 +264,10 @@ def test_all_that_is_wrong_with_a_mission_is_told_at_once_with_its_line() -> Non
         ("fence[0].times_s[1]", "4 s is not after 5 s", "times_s = [5.0, 4.0]"),
         ("fence[0].values", "has 1 entries, there are 2 times", "values = [2.0]"),
         ("fence[1].state", '"up" is no axis of the plant', 'state = "up"'),
-        ("fence[2].times_s", "begins at -1 s", "times_s = [-1.0]"),
-        ("fence[2].values", "-3.5 is beyond sets.state_lower[0] = -3", "values = [-3.5]"),
+        ("fence[2].times_s[0]", "begins at -1 s", "times_s = [-1.0]"),
+        ("fence[2].values[0]", "-3.5 is beyond sets.state_lower[0] = -3", "values = [-3.5]"),
+        ("fence[3].values[1]", "-3 as upper limit leaves nothing up to sets.state_lower[0] = -3", BEYOND),
+        ("fence[3].values[2]", "-4 as upper limit leaves nothing up to sets.state_lower[0] = -3", BEYOND),
         ("fence[2].sides", 'unknown key (nearest valid name "side")', "sides = 1"),
     ]
     for key, words, line in wanted_words:
@@ -348,6 +357,27 @@ def test_of_many_bad_rows_the_first_are_told_and_the_others_counted(tmp_path: Pa
     told = str(raised.value).splitlines()
     assert len(told) == 6
     assert "way.csv: 7 more" in told[-1]
+
+
+@pytest.mark.parametrize(
+    ("samples", "told"),
+    [
+        ("t,x,y,z\n0,0,0,-1\n\n2,0,0,-1\n1,0,0,-1\n", ["5: mission.trajectory.times_s[2]: 1 s is not after 2 s"]),
+        ("-1,0,0,-1\n1,0,0,-1\n", ["1: mission.trajectory.times_s[0]: begins at -1 s, before the mission does"]),
+        (
+            "0,0,0,-1\n1,0,9,-1\n",
+            ["2: mission.trajectory.positions_m[1][1]: east 9 m is outside the admissible box [-2.5, 2.5]"],
+        ),
+        ("t,x,y,z\n0,0,0,-1\n", [" mission.trajectory.times_s: has 1 entries, a motion has at least 2"]),
+    ],
+)
+def test_samples_that_do_not_fit_are_told_with_their_own_file_and_line(
+    tmp_path: Path, samples: str, told: list[str]
+) -> None:
+    with pytest.raises(ConfigError) as raised:
+        with_file(tmp_path, samples)
+    lines = str(raised.value).splitlines()
+    assert [one.split(";")[0] for one in lines] == [f"{tmp_path / 'way.csv'}:{one}" for one in told]
 
 
 @pytest.mark.parametrize(("samples", "words"), [("", "has no rows"), ("t,x\n", "has no rows")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import clarabel
 import numpy as np
 import pytest
 from full_problem import Margins, gains, horizons, margins
@@ -13,12 +14,16 @@ from library_rig import PRESETS, all_kinds, asked, design_of, mean_optimum
 from numpy.typing import NDArray
 from optimisation_cases import coupled
 
+from uavctl.build import build_design
+from uavctl.config import load_config
+from uavctl.smpc.answer import NOMINAL
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import PartSolver
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import horizon_of
 from uavctl.smpc.meanqp import Kind, MeanProblem
 from uavctl.smpc.policies import Covariance, Policy, PolicyProgram
+from uavctl.smpc.region import Region
 
 Array = NDArray[np.float64]
 Multipliers = tuple[Array, Array, Array, list[Array]]
@@ -234,3 +239,28 @@ def test_the_best_policy_is_the_exact_program_s(name: str) -> None:
             assert mean_optimum(problem, question, backoff) + policy.cost == pytest.approx(answer.cost, rel=1e-6)
             checked += 1
     assert checked > 15
+
+
+def test_a_proof_that_there_is_no_policy_serves_other_questions_and_harms_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same program for all questions, and with a new one for each."""
+    design = build_design(load_config("room", ["schedule.late=2"])).late[1]
+    part = decompose(design)[2]
+    program, region, rng = program_of(design, 2), Region(design, part), np.random.default_rng(11)
+    questions = [
+        program.problem.question(*region.draw(rng), region.ahead(rng) if k % 2 else NOMINAL) for k in range(120)
+    ]
+    alone = [PolicyProgram(program.problem, design.max_iterations).best(question) for question in questions]
+    solves, solver = [], clarabel.DefaultSolver
+
+    def counted(*program: object) -> clarabel.DefaultSolver:
+        solves.append(program)
+        return solver(*program)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("uavctl.smpc.policies.clarabel.DefaultSolver", counted)
+    shared = [program.best(question) for question in questions]
+    assert [None if policy is None else policy.theta.tobytes() for policy in shared] == [
+        None if policy is None else policy.theta.tobytes() for policy in alone
+    ]
+    none = alone.count(None)
+    assert 5 < none < 60
+    assert len(solves) < len(questions) - none / 2

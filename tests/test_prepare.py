@@ -11,7 +11,8 @@ from uavctl import library_store
 from uavctl.build import build_design
 from uavctl.cli import prepare
 from uavctl.config import load_config
-from uavctl.library_store import Advance, StoredLibrary, library_for
+from uavctl.library_bytes import StoredLibrary
+from uavctl.library_store import Advance, library_for
 from uavctl.smpc.design import Design
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver

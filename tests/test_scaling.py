@@ -12,7 +12,7 @@ from plant_cases import SHAPES, case, kept
 from plant_units import Units, design_in_units, in_units
 
 from uavctl.data import SolveStatus
-from uavctl.smpc import cones
+from uavctl.smpc import conic_settings
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, make_design
@@ -107,7 +107,7 @@ def test_parts_of_a_step_are_exact_in_any_units() -> None:
 def test_a_tighter_tolerance_gives_the_same_optimum(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regularisation and tolerance of the solver move the optimum by less than 1e-6."""
     made = case(name)
-    monkeypatch.setattr(cones, "GAP_TOLERANCE", 1e-9)
+    monkeypatch.setattr(conic_settings, "GAP_TOLERANCE", 1e-9)
     tight = ConicSolver(made.design).solve(0, made.x, made.design.target)
     assert tight.status is SolveStatus.OPTIMAL
     assert abs(tight.gap) < 1e-8

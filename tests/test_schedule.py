@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise, product
 
 import numpy as np
 import pytest
 from hypothesis import given as hypothesis_given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.schedule import Demand, fixed, greedy, nested
 
+Array = NDArray[np.float64]
 H = 12
 
 
@@ -59,18 +62,23 @@ def test_number_of_nested_schedules(tau: int, count: int, kept: int) -> None:
     assert len(list(nested(demand(tau), 0.985))) == kept
 
 
-@pytest.mark.parametrize("gamma_max", [1.0, 0.985])
-def test_nested_schedules_are_those_of_a_blind_enumeration(gamma_max: float) -> None:
-    horizon, tau, q = 9, 3, 0.3
+def enumerated(horizon: int, tau: int, q: float) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """Delays and α of every schedule with information that never gets older and α > 0.95, written down blindly."""
     free = horizon - tau
-    expected = set()
     for newest in product(*[range(-1, t) for t in range(free)]):
         newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]
         if any(later < earlier for earlier, later in pairwise(newest_all)):
             continue
-        alpha = [1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)]
-        if min(alpha) > 0.95 and 0.95 / np.prod(alpha) < 1.0 and 0.95 / np.prod(alpha) <= gamma_max:
-            expected.add(tuple(t - r for t, r in enumerate(newest_all)))
+        alpha = np.array([1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)])
+        if alpha.min() > 0.95:
+            yield tuple(t - r for t, r in enumerate(newest_all)), alpha
+
+
+@pytest.mark.parametrize("gamma_max", [1.0, 0.985])
+def test_nested_schedules_are_those_of_a_blind_enumeration(gamma_max: float) -> None:
+    horizon, tau = 9, 3
+    gammas = {delays: 0.95 / np.prod(alpha) for delays, alpha in enumerated(horizon, tau, 0.3)}
+    expected = {delays for delays, gamma in gammas.items() if gamma < 1.0 and gamma <= gamma_max}
     found = [schedule.delays for schedule in nested(demand(tau, horizon), gamma_max)]
     assert set(found) == expected
     assert len(found) == len(expected) > 1
@@ -167,16 +175,7 @@ def test_joint_likelihood_is_the_sum_over_all_patterns_of_losses(delays: tuple[i
 
 def test_joint_nested_schedules_are_those_of_a_blind_enumeration() -> None:
     horizon, tau, q = 10, 3, 0.3
-    free = horizon - tau
-    expected = set()
-    for newest in product(*[range(-1, t) for t in range(free)]):
-        newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]
-        if any(later < earlier for earlier, later in pairwise(newest_all)):
-            continue
-        alpha = [1.0 if r < 0 else 1.0 - q ** (t - r) for t, r in enumerate(newest_all)]
-        delays = tuple(t - r for t, r in enumerate(newest_all))
-        if min(alpha) > 0.95 and 0.95 / all_usable(delays, q) <= 0.985:
-            expected.add(delays)
+    expected = {delays for delays, _ in enumerated(horizon, tau, q) if 0.95 / all_usable(delays, q) <= 0.985}
     found = {schedule.delays for schedule in nested(demand(tau, horizon, joint=True), 0.985)}
     assert found == expected
     assert {schedule.delays for schedule in nested(demand(tau, horizon), 0.985)} < found

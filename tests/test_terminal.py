@@ -200,6 +200,7 @@ def assumptions(
         terminal=axis_terminal() if terminal is None else terminal,
         state_set=Polytope.from_box([-30.0, -8.0], [50.0, 7.0]) if state_set is None else state_set,
         input_set=Polytope.from_box([-7.5], [7.5]) if input_set is None else input_set,
+        q_u=Q_U,
         target=np.array([position_m, 0.0]),
         estimate_cov=np.zeros((2, 2)),
         kappa_x=3.0,

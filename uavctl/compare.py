@@ -224,6 +224,7 @@ def _by_component(spec: DesignSpec, design: Design) -> Design | str:
             terminal=terminal,
             state_set=design.state_set,
             input_set=design.input_set,
+            q_u=design.q_u,
             target=design.target,
             estimate_cov=design.estimate_cov,
             kappa_x=kappa_x_terminal,

@@ -271,7 +271,7 @@ class PolicyLibrary(Record, frozen=True, kw_only=True):
 
     library_id: str
     design_id: str
-    data: bytes  # as `uavctl.library_store.encode` writes it
+    data: bytes  # as `uavctl.library_bytes.encode` writes it
 
 
 class Sink(Protocol):

@@ -32,6 +32,8 @@ _COMMANDS = {
     "design": ("design_cmd:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
     "solve": ("solve_cmd:solve", "Solve one decision problem, towards the configured target."),
     "bench": ("bench_cmd:bench", "Measure the speed of a decision, beside the problem as printed."),
+    "paper": ("paper_cmd:paper", "Reproduce Section 5 of the paper, every claim beside what was measured."),
+    "campaign": ("campaign_cmd:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
     "log": ("log_cmd:log_app", "Look into recordings: info, recover, replay, report."),
 }
 for _name, (_path, _help) in _COMMANDS.items():

@@ -16,8 +16,9 @@ from uavctl.cli import compare_cmd
 from uavctl.cli.common import DEFAULTS, Common, located
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
-from uavctl.library_store import StoredLibrary
-from uavctl.smpc.design import Design, design_record
+from uavctl.library_bytes import StoredLibrary
+from uavctl.smpc.design import Design
+from uavctl.smpc.design_record import design_record
 from uavctl.smpc.terminal import stationary_cost
 
 

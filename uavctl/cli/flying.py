@@ -26,10 +26,11 @@ from logs.topics import HEADER, LIBRARY
 from uavctl import __version__
 from uavctl.cli.common import messages
 from uavctl.cli.prepare import Prepared
+from uavctl.code_id import decider_id
 from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design import design_record
+from uavctl.smpc.design_record import design_record
 
 REFRESH_S = 0.25
 # How long another thread may keep the control thread waiting for the interpreter [s].
@@ -84,7 +85,7 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
 def versions() -> dict[str, str]:
     """What decides alike must be of the same versions."""
     found = {name: metadata.version(name) for name in _LIBRARIES}
-    return {"uavctl": __version__, "python": platform.python_version(), **found}
+    return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
 
 
 def cpu() -> str:

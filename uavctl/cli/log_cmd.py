@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from cyclopts import App, Parameter
 from rich.markup import escape
 from rich.table import Table
@@ -31,7 +32,7 @@ from uavctl.config.load import parse
 from uavctl.data import Header, Sink
 from uavctl.errors import LibraryError, RecordingError, UsageError
 from uavctl.flight.controller import Controller
-from uavctl.library_store import check_fits, decode
+from uavctl.library_bytes import check_fits, decode
 from uavctl.loop import VEHICLE, ControlLoop
 
 RECOVERED_WITH_LOSS = 3
@@ -77,7 +78,9 @@ def replay(
             "--config and --set are for a .tlog: a recording of ours is replayed with its own configuration"
         )
     recorded = header(flight)
-    _warn_of_differences(recorded)
+    others = _other_versions(recorded)
+    for text in others:
+        messages().print(f"{text}: decisions may differ", style="yellow", markup=False)
     config = parse(recorded.config_toml, f"{flight} (configuration)").config
     whole = recording_info(flight)
     make_loop = _loop_maker(config, _recorded_controller(flight, config))
@@ -89,7 +92,8 @@ def replay(
         messages().print(text, style="yellow", markup=False)
     if not whole.finished:
         messages().print("the recording is torn: compared up to its end", style="yellow", markup=False)
-    common.show(result, lambda: _replay_table(result))
+    document = {**msgspec.structs.asdict(result), "other_versions": others}
+    common.show(document, lambda: _replay_table(result, others))
     return 0 if result.identical else 1
 
 
@@ -153,17 +157,15 @@ def _replay_foreign(flight: Path, common: Common) -> int:
     return 0
 
 
-def _warn_of_differences(recorded: Header) -> None:
-    """Versions and CPU type decide the last bits: say so before a difference is found."""
+def _other_versions(recorded: Header) -> list[str]:
+    """What decides a flight's last bits and is not what the recording was made with: code, libraries, CPU type."""
     here = {**versions(), "cpu": cpu()}
     there = {**recorded.versions, "cpu": recorded.cpu}
-    for name in sorted(here.keys() | there.keys()):
-        if here.get(name) != there.get(name):
-            messages().print(
-                f"recorded with {name} {there.get(name)}, here is {here.get(name)}: the last bits may differ",
-                style="yellow",
-                markup=False,
-            )
+    return [
+        f"recorded with {name} {there.get(name, 'unknown')}, here is {here.get(name, 'none')}"
+        for name in sorted(here.keys() | there.keys())
+        if here.get(name) != there.get(name)
+    ]
 
 
 def _two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
@@ -188,7 +190,7 @@ def _ages(ages: Mapping[str, int], horizon: int) -> str:
     return ", ".join(f"{name}: {count}" for name, count in classes.items())
 
 
-def _replay_table(result: ReplayResult) -> Table:
+def _replay_table(result: ReplayResult, others: list[str]) -> Table:
     rows: list[tuple[str, object]] = [
         ("decisions", result.decisions),
         ("records compared", result.compared),
@@ -200,6 +202,7 @@ def _replay_table(result: ReplayResult) -> Table:
             ("first difference", f"{first.topic} at {first.at_ns} ns, {first.field}"),
             ("recorded", first.recorded),
             ("replayed", first.replayed),
+            *(("made otherwise", text) for text in others),
         ]
     return _two_columns("Replay", rows)
 

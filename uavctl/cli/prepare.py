@@ -13,7 +13,8 @@ from uavctl.build import build_controller
 from uavctl.cli.common import messages
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
-from uavctl.library_store import StoredLibrary, library_for
+from uavctl.library_bytes import StoredLibrary
+from uavctl.library_store import library_for
 from uavctl.smpc.design import Design
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -12,12 +12,12 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
-from rich.table import Table
 
 from uavctl.build import build_design, build_solver
 from uavctl.build_mission import build_names
 from uavctl.cli.common import DEFAULTS, Common, located
 from uavctl.cli.prepare import ready_library
+from uavctl.cli.wide_table import Column, WideTable
 from uavctl.config import Config
 from uavctl.data import SolveStatus
 from uavctl.errors import UsageError
@@ -103,19 +103,28 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
     gave_way = [tell_all(build_names(design), answer.gave_way)] if answer.gave_way else []
-    plan = Table()
-    names = state_names(design.plant.n_x, design.plant.axes)
-    for heading in ("t", *names, *(f"u_{axis[0]}" for axis in design.plant.axes), "back-off x", "back-off u"):
-        plan.add_column(heading, justify="right")
-    for t, state in enumerate(answer.states):
-        inputs, of_inputs = (answer.inputs[t], answer.backoff_u[t]) if t < design.horizon else ([], [])
-        blank = [""] * (design.plant.n_u - len(inputs))
-        plan.add_row(
-            str(t), *_figures(state), *_figures(inputs), *blank, _largest(answer.backoff_x[t]), _largest(of_inputs)
-        )
     return Group(
-        head, facts, *gave_way, "Predicted means, inputs, and the largest back-off from a limit, stage by stage:", plan
+        head,
+        facts,
+        *gave_way,
+        "Predicted means, inputs, and the largest back-off from a limit, stage by stage:",
+        plan_table(answer, design),
     )
+
+
+def plan_table(answer: Answer, design: Design) -> WideTable:
+    """The plan, stage by stage: the columns of an axis stay together, and so do the back-offs."""
+    axes, count = design.plant.axes, len(answer.states)
+    names = [*state_names(design.plant.n_x, axes), *(f"u_{axis[0]}" for axis in axes)]
+    values = [*answer.states.T, *answer.inputs.T]
+    groups: dict[str, list[Column]] = {}
+    for name, of_stages in zip(names, values, strict=True):
+        groups.setdefault(name.partition("_")[2] or name, []).append(_column(name, of_stages, count))
+    backoffs = [
+        _column(f"back-off {of}", [max(rows, default=0.0) for rows in table], count)
+        for of, table in (("x", answer.backoff_x), ("u", answer.backoff_u))
+    ]
+    return WideTable(Column("t", [str(t) for t in range(count)]), [*groups.values(), backoffs])
 
 
 def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
@@ -126,9 +135,7 @@ def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
     return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:each]]
 
 
-def _figures(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
-    return [f"{value:.3f}" for value in values]
-
-
-def _largest(values: Sequence[float] | NDArray[np.float64]) -> str:
-    return f"{max(values):.3f}" if len(values) else ""
+def _column(heading: str, values: Iterable[float], rows: int) -> Column:
+    """A column of figures, blank where there are fewer of them than `rows`."""
+    cells = [f"{value:.3f}" for value in values]
+    return Column(heading, [*cells, *([""] * (rows - len(cells)))])

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from uavctl.config import mission_checks
+from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem as Problem
 from uavctl.config.types import (
     CostConfig,
-    DaemonConfig,
     Floats,
     LimitsConfig,
     LinkConfig,

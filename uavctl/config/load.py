@@ -7,7 +7,7 @@ import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin
@@ -22,6 +22,7 @@ from uavctl.config.index import key_lines
 from uavctl.config.mission import MissionConfig
 from uavctl.config.reference import description, element, is_section, type_text
 from uavctl.config.samples import read_samples
+from uavctl.config.source import Source
 from uavctl.config.types import Config, Section
 from uavctl.errors import ConfigError, DesignError
 
@@ -38,35 +39,6 @@ _WORDS = {
 _MAY_BE_INFINITE = "sets."  # an open side; everything else is finite
 _LONGEST_VALUE = 40
 _UNKNOWN = "unknown key"
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where a configuration came from: enough to say where each key stands.
-
-    Attributes:
-        file: The file, as a person finds it.
-        lines: Key path -> line in the file.
-        overrides: (key path, text as typed) of each override, in order.
-    """
-
-    file: str
-    lines: Mapping[str, int]
-    overrides: tuple[tuple[str, str], ...] = ()
-
-    def where(self, key: str) -> str:
-        """The override that set `key`, else `file:line` of the key or of the nearest table around it."""
-        for path, text in reversed(self.overrides):
-            if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
-                return f"--set {text}"
-        around = key
-        while around and around not in self.lines:
-            around = around[: max(around.rfind("."), around.rfind("["), 0)]
-        return f"{self.file}:{self.lines.get(around, 1)}"
-
-    def tell(self, problem: Problem) -> str:
-        """One line: place, key, what is wrong, what to do."""
-        return f"{self.where(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
 
 
 @dataclass(frozen=True)
@@ -113,7 +85,8 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     config = _decode(Config, table, "", found, sections)
     mission = sections.get("mission", MissionConfig())
     if isinstance(mission, MissionConfig):
-        sections["mission"] = mission = read_samples(mission, Path(file).parent, found)
+        mission, places = read_samples(mission, Path(file).parent, found)
+        sections["mission"], source = mission, replace(source, elsewhere=places)
     found.extend(check(sections))
     problems.extend(source.tell(problem) for problem in found)
     if problems or config is None:

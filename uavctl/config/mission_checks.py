@@ -103,20 +103,28 @@ def _tightens(key: str, sets: SetsConfig, fence: FenceConfig, state: int) -> Ite
         count = len(sets.state_lower)
         yield Problem(f"{key}.state", f"there is no state {state}", f"give 0 to {count - 1}")
         return
-    low, high = sets.state_lower[state], sets.state_upper[state]
-    wide = [value for value in fence.values if (value > high if fence.side == "upper" else value < low)]
-    if wide:
-        side = high if fence.side == "upper" else low
-        yield Problem(
-            f"{key}.values",
-            f"{wide[0]:g} is beyond sets.state_{fence.side}[{state}] = {side:g}",
-            "a fence may only close in; widen the constant limit",
-        )
+    sides = {"lower": sets.state_lower[state], "upper": sets.state_upper[state]}
+    opposite = "lower" if fence.side == "upper" else "upper"
+    inwards = 1.0 if fence.side == "lower" else -1.0
+    for i, value in enumerate(fence.values):
+        if inwards * (value - sides[fence.side]) < 0:
+            yield Problem(
+                f"{key}.values[{i}]",
+                f"{value:g} is beyond sets.state_{fence.side}[{state}] = {sides[fence.side]:g}",
+                "a fence may only close in; widen the constant limit",
+            )
+        elif inwards * (value - sides[opposite]) >= 0:
+            yield Problem(
+                f"{key}.values[{i}]",
+                f"{value:g} as {fence.side} limit leaves nothing up to sets.state_{opposite}[{state}] = "
+                f"{sides[opposite]:g}",
+                f"give a value {'below' if opposite == 'upper' else 'above'} it",
+            )
 
 
 def _increasing(key: str, times_s: Floats) -> Iterator[Problem]:
     if times_s and times_s[0] < 0:
-        yield Problem(key, f"begins at {times_s[0]:g} s, before the mission does", "give times >= 0")
+        yield Problem(f"{key}[0]", f"begins at {times_s[0]:g} s, before the mission does", "give times >= 0")
     for i, (now, then) in enumerate(pairwise(times_s)):
         if not now < then:
             yield Problem(f"{key}[{i + 1}]", f"{then:g} s is not after {now:g} s", "give increasing times")

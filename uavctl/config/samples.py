@@ -8,35 +8,51 @@ from pathlib import Path
 
 import msgspec
 
-from uavctl.config.mission import MissionConfig, TrajectoryConfig
+from uavctl.config.mission import MissionConfig
 from uavctl.config.problem import Problem
 from uavctl.config.section import Floats
 
 _TOLD = 5  # bad rows that are told one by one
 _WANTED = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
 _WITHOUT, _WITH = 4, 7  # columns
+_LISTS = ("times_s", "positions_m", "velocities_mps")
 
 
-def read_samples(mission: MissionConfig, folder: Path, found: list[Problem]) -> MissionConfig:
+def read_samples(mission: MissionConfig, folder: Path, found: list[Problem]) -> tuple[MissionConfig, dict[str, str]]:
     """The samples of `mission.trajectory.file` in its place, so that the configuration is complete in itself.
 
     Args:
         mission: As it was decoded.
         folder: Where a relative name starts from.
         found: What is wrong with the file is added here.
+
+    Returns:
+        The mission, and where the keys that come from the file stand: `file:line`, or the file for a whole list.
     """
     given, key = mission.trajectory, "mission.trajectory.file"
     if not given.file:
-        return mission
+        return mission, {}
     if given.times_s or given.positions_m or given.velocities_mps:
         found.append(Problem(key, "there are samples in the table as well", "keep the file or the samples"))
-        return mission
+        return mission, {}
+    path = folder / given.file
     try:
-        motion = _with_samples(given, folder)
+        rows = _rows(path)
     except _SamplesError as error:
         found.extend(Problem(key, reason, "mend the file") for reason in error.reasons)
-        return mission
-    return msgspec.structs.replace(mission, trajectory=motion)
+        return mission, {}
+    motion = msgspec.structs.replace(
+        given,
+        file="",
+        times_s=tuple(row[0] for _, row in rows),
+        positions_m=tuple(_three(row[1:4]) for _, row in rows),
+        velocities_mps=tuple(_three(row[4:7]) for _, row in rows if len(row) == _WITH),
+    )
+    places = {}
+    for name in _LISTS:
+        places[f"mission.trajectory.{name}"] = str(path)
+        places |= {f"mission.trajectory.{name}[{i}]": f"{path}:{line}" for i, (line, _) in enumerate(rows)}
+    return msgspec.structs.replace(mission, trajectory=motion), places
 
 
 class _SamplesError(Exception):
@@ -47,8 +63,8 @@ class _SamplesError(Exception):
         self.reasons = reasons
 
 
-def _with_samples(given: TrajectoryConfig, folder: Path) -> TrajectoryConfig:
-    path = folder / given.file
+def _rows(path: Path) -> list[tuple[int, Floats]]:
+    """Line number and values of each row, all of the same width."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
@@ -65,14 +81,7 @@ def _with_samples(given: TrajectoryConfig, folder: Path) -> TrajectoryConfig:
     if wrong:
         more = (f"{path}: {len(wrong) - _TOLD} more",) if len(wrong) > _TOLD else ()
         raise _SamplesError((*wrong[:_TOLD], *more))
-    values = [tuple(float(cell) for cell in cells) for _, cells in rows]
-    return msgspec.structs.replace(
-        given,
-        file="",
-        times_s=tuple(row[0] for row in values),
-        positions_m=tuple(_three(row[1:4]) for row in values),
-        velocities_mps=tuple(_three(row[4:7]) for row in values if width == _WITH),
-    )
+    return [(number, tuple(float(cell) for cell in cells)) for number, cells in rows]
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

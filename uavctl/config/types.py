@@ -13,10 +13,12 @@ from msgspec import Meta
 from uavctl.config.link import LinkConfig as LinkConfig
 from uavctl.config.mission import FenceConfig as FenceConfig
 from uavctl.config.mission import MissionConfig as MissionConfig
+from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.section import Floats as Floats
 from uavctl.config.section import Position as Position
 from uavctl.config.section import Rows as Rows
 from uavctl.config.section import Section as Section
+from uavctl.config.sim import SimConfig
 
 
 class PlantConfig(Section, frozen=True, kw_only=True):
@@ -183,23 +185,6 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     ]
 
 
-class FrameConfig(Section, frozen=True, kw_only=True):
-    """Camera frame to local NED."""
-
-    convention: Annotated[Literal["ned", "enu"], Meta(description="axes of the source's positions")] = "ned"
-    origin_m: Annotated[Position, Meta(description="position of the camera frame's origin in local NED [m]")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    yaw_deg: Annotated[
-        float,
-        Meta(
-            ge=-180, le=180, description="heading of the camera frame's first axis (after conversion to NED axes) [deg]"
-        ),
-    ] = 0.0
-
-
 class EstimatorConfig(Section, frozen=True, kw_only=True):
     """Kalman filter."""
 
@@ -241,88 +226,6 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
         Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")
     ]
     slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
-
-
-class SourceConfig(Section, frozen=True, kw_only=True):
-    """Which messages count as external positions."""
-
-    messages: Annotated[
-        tuple[
-            Literal[
-                "VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LOCAL_POSITION_NED"
-            ],
-            ...,
-        ],
-        Meta(
-            min_length=1,
-            description="messages that are taken; LOCAL_POSITION_NED is the vehicle's own estimate only if named",
-        ),
-    ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
-    system_id: Annotated[
-        int, Meta(ge=0, le=255, description="MAVLink system id that positions must come from; 0 takes any")
-    ] = 0
-    rate_hz: Annotated[
-        float,
-        Meta(ge=0, description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]"),
-    ] = 0.0
-
-
-class ClockConfig(Section, frozen=True, kw_only=True):
-    """The source's clock."""
-
-    latency_s: Annotated[
-        float, Meta(ge=0, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]")
-    ] = 0.0
-    window_s: Annotated[float, Meta(gt=0, description="window of the sliding minimum of (received − stamp) [s]")] = 10.0
-    future_tolerance_s: Annotated[float, Meta(ge=0, description="a stamp further in the future is refused [s]")] = 0.02
-
-
-class DaemonConfig(Section, frozen=True, kw_only=True):
-    """The control loop and its connections."""
-
-    tick_s: Annotated[float, Meta(gt=0, le=0.1, description="time between setpoints; divides Δt [s]")]
-    vehicle: Annotated[str, Meta(description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
-    mocap: Annotated[
-        str, Meta(description="URL of the source of positions; the same URL as the vehicle's is one connection")
-    ] = "udpin://0.0.0.0:14560"
-    system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
-    component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
-        25
-    )
-
-
-class CameraConfig(Section, frozen=True, kw_only=True):
-    """Simulated motion capture."""
-
-    rate_hz: Annotated[float, Meta(gt=0, description="samples a second [1/s]")]
-    phase_s: Annotated[float, Meta(ge=0, description="time of the first sample; then every 1/rate_hz [s]")] = 0.0
-    noise_std_m: Annotated[float, Meta(ge=0, description="noise of a position, each axis [m]")] = 0.0
-    latency_s: Annotated[float, Meta(ge=0, description="processing time in the cameras, before the link [s]")] = 0.0
-    clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
-    message: Annotated[
-        Literal["vision", "vicon", "mocap", "odometry"],
-        Meta(description="MAVLink message; `odometry` carries the velocity too"),
-    ] = "vision"
-
-
-class SimConfig(Section, frozen=True, kw_only=True):
-    """The simulated side of the wire."""
-
-    camera: CameraConfig
-    plant: Annotated[Literal["linear"], Meta(description="simulated vehicle")] = "linear"
-    autopilot: Annotated[
-        Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
-    ] = "px4"
-    seed: Annotated[int, Meta(ge=0, description="seed of every random draw")] = 0
-    start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
-    start_velocity_mps: Annotated[Position, Meta(description="velocity at the start, local NED [m/s]")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    setpoint_timeout_s: Annotated[
-        float, Meta(gt=0, description="silence after which the vehicle leaves the mode that takes setpoints [s]")
-    ] = 1.0
 
 
 class LogConfig(Section, frozen=True, kw_only=True):

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
-from uavctl.config.types import ClockConfig, EstimatorConfig, FrameConfig, SourceConfig
+from uavctl.config.peers import ClockConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
 from uavctl.data import PositionSample, Vec3
 from uavctl.frames import Convention, Frame
 from uavctl.mavlink.clocksync import ClockSource, ClockSync, Refusal, RoundTrips
-from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 
 MAX_SOURCES = 16

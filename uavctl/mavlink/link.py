@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from uavctl.config.types import ClockConfig, DaemonConfig, EstimatorConfig, FrameConfig, SourceConfig
+from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
 from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, VehicleStatus
-from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.intake import PositionIntake
 from uavctl.mavlink.messages import Message, Position, TimeSync

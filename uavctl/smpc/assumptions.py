@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
+from uavctl.smpc.equilibria import rest_input
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 from uavctl.smpc.terminal import Terminal, invariance_residual, lyapunov_residual
@@ -42,6 +43,7 @@ def check_assumptions(
     terminal: Terminal,
     state_set: Polytope,
     input_set: Polytope,
+    q_u: Array,
     target: Array,
     estimate_cov: Array,
     kappa_x: float,
@@ -56,6 +58,7 @@ def check_assumptions(
         terminal: Its terminal ingredients.
         state_set: X.
         input_set: U.
+        q_u: Q_u (n_u, n_u): of several inputs that hold the target, the cheapest is the one that plans rest with.
         target: Equilibrium x_s (n_x,) around which the terminal set lies.
         estimate_cov: Covariance of the state estimate's error (n_x, n_x), which comes on top of Σ_x.
         kappa_x: κ of the terminal states.
@@ -67,7 +70,7 @@ def check_assumptions(
         DesignError: An item fails; it is named with its figures.
     """
     k_sigma = terminal.k @ terminal.sigma_x @ terminal.k.T
-    rest = np.asarray(np.linalg.lstsq(plant.b, target - plant.a @ target, rcond=None)[0], dtype=np.float64)
+    rest = rest_input(plant.a, plant.b, q_u, target)
     radius, residual = terminal.spectral_radius, invariance_residual(terminal, plant.w)
     drop = lyapunov_residual(terminal)
     checks = (

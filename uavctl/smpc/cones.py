@@ -18,17 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from uavctl.smpc.conic_settings import conic_settings
 from uavctl.smpc.scaling import Scale
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
-
-# The optimum is to be right to 1e-7. With a smaller gap the linear algebra may run out of digits before the end.
-GAP_TOLERANCE = 1e-8
-RESIDUAL_TOLERANCE = 1e-8
-
-# A factorisation by blocks pays for long horizons only: at H = 40 it takes a third of the time.
-_MANY_ROWS = 900
 
 # A linear cost above _STEEPEST, as far outside the limits, would pass for an unbounded problem: it becomes _STEEP.
 _STEEPEST = 1e8
@@ -286,16 +280,7 @@ class ConicProgram:
         return Solution(BREAKDOWN, np.full(self._q_const.size, np.nan), np.nan, np.nan, 0)
 
     def _set_up(self, q: Array, b: Array, cost: float = 1.0) -> clarabel.DefaultSolver:
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_iter = self._max_iterations
-        settings.max_threads = 1
-        settings.direct_solve_method = "faer" if b.size > _MANY_ROWS else "qdldl"
-        # Both would change the shape of the data that update() replaces.
-        settings.presolve_enable = False
-        settings.chordal_decomposition_enable = False
-        settings.tol_gap_abs = settings.tol_gap_rel = GAP_TOLERANCE
-        settings.tol_feas = RESIDUAL_TOLERANCE
+        settings = conic_settings(self._max_iterations, b.size)
         # Where the terminal condition's interior is thin, the solver's own values run out of digits before the end.
         settings.static_regularization_constant = 1e-9
         settings.max_step_fraction = 0.97

@@ -97,6 +97,11 @@ def _held(basis: Array, positions: Index) -> Index:
     return np.array(sorted(chosen), dtype=np.intp)
 
 
+def rest_input(a: Array, b: Array, q_u: Array, x: Array) -> Array:
+    """The input (n_u,) that plans rest with in the equilibrium `x` (n_x,): of several the one of least cost."""
+    return holding(b, q_u, (x - a @ x)[:, None])[:, 0]
+
+
 def holding(b: Array, q_u: Array, pull: Array) -> Array:
     """Inputs (n_u, n_y) with B u = `pull` (n_x, n_y); of several the cheapest by Q_u, and of those the smallest."""
     rows, columns = equilibrated(b)

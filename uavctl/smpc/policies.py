@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from uavctl.smpc.cones import GAP_TOLERANCE, RESIDUAL_TOLERANCE, unless_panic
+from uavctl.smpc.cones import unless_panic
+from uavctl.smpc.conic_settings import conic_settings
 from uavctl.smpc.horizon import Affine, Horizon
 from uavctl.smpc.meanqp import MeanProblem, Question, Row
 from uavctl.smpc.reduction import terminal_bound
@@ -31,6 +32,9 @@ _FAR = 1e3
 
 # What a policy may miss the terminal condition by, scaled to unit variances.
 _KEPT = 1e-6
+
+# How far a question is on the infeasible side of another's proof, relative to that one, to share its fate.
+_BEYOND = 1e-3
 
 _ENDED_WELL = ("Solved", "AlmostSolved", "InsufficientProgress")
 
@@ -186,7 +190,8 @@ class PolicyProgram:
         self._constant = np.concatenate(constants)
         self._linear_rows = linear.shape[0]
         self._cones = cones
-        self._settings = _settings(max_iterations)
+        self._settings = conic_settings(max_iterations, self._a.shape[0])
+        self._proofs: list[Array] = []  # z with Aᵀz = 0 in the dual cone: bᵀz >= 0 wherever there is a policy
 
     def _of_theta(self, matrix: sparse.csr_array, size: int) -> sparse.csr_array:
         left = sparse.csr_array((matrix.shape[0], self._theta.start))
@@ -203,7 +208,10 @@ class PolicyProgram:
         return self._solve(np.zeros(problem.h.shape[0]), upper, -upper)
 
     def best(self, question: Question) -> Policy | None:
-        """The optimal policy of one question; None without an optimum."""
+        """The optimal policy of one question; None without an optimum.
+
+        What proved that a question has none is kept: it proves the same of most others, without solving anything.
+        """
         backoff = self.problem.backoff
         upper = question.upper - question.offset - backoff
         return self._solve(question.f, upper, question.lower - question.offset + backoff)
@@ -216,9 +224,14 @@ class PolicyProgram:
         above = self._above.size
         right[:above] = upper[self._above]
         right[above : above + self._below.size] = -lower[self._below]
+        if any(proof @ right < -_BEYOND for proof in self._proofs):
+            return None
         solver = clarabel.DefaultSolver(self._p, linear / cov.scale, self._a, right, self._cones, self._settings)
         solution = unless_panic(solver.solve)
         if solution is None or str(solution.status) not in _ENDED_WELL:
+            if solution is not None and str(solution.status) == "PrimalInfeasible":
+                proof = np.array(solution.z)
+                self._proofs.append(proof / -(proof @ right))
             return None
         dual = np.array(solution.z)[self._linear_rows :] * cov.scale
         equal, triangle, rest = np.split(dual, np.cumsum([cov.equal.offset.size, cov.triangle.offset.size]))
@@ -267,16 +280,3 @@ def _places(order: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     column = np.repeat(np.arange(order), np.arange(1, order + 1))
     row = np.concatenate([np.arange(j + 1) for j in range(order)])
     return row, column
-
-
-def _settings(max_iterations: int) -> clarabel.DefaultSettings:
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_iter = max_iterations
-    settings.max_threads = 1
-    settings.direct_solve_method = "qdldl"
-    settings.presolve_enable = False
-    settings.chordal_decomposition_enable = False
-    settings.tol_gap_abs = settings.tol_gap_rel = GAP_TOLERANCE
-    settings.tol_feas = RESIDUAL_TOLERANCE
-    return settings

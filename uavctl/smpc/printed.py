@@ -51,8 +51,11 @@ class PrintedProblem:
         self._regularization = regularization
         part, H, tau = component, design.horizon, design.terminal.tau
         n_x, n_u = part.b.shape
-        n_w = part.e.shape[1]
-        root_w = _root(part.w)
+        # Where nothing disturbs the component, a disturbance without effect stands for none, and no gain answers it.
+        calm = not part.w.size
+        e, w = (np.zeros((n_x, 1)), np.zeros((1, 1))) if calm else (part.e, part.w)
+        n_w = e.shape[1]
+        root_w = _root(w)
         self._x = cp.Parameter(n_x)
         self._x_s = cp.Parameter(n_x)
         self._u_s = cp.Parameter(n_u)
@@ -60,7 +63,9 @@ class PrintedProblem:
         # (8): u_t = V_t x(k) + Σ_r M_{t,r} w(k+r), r <= t - d_t. x(k) is known, so V_t x(k) is a free vector v_t.
         self._v = cp.Variable((H, n_u))
         self._m = {
-            (t, r): cp.Variable((n_u, n_w)) for t in range(H) for r in range(max(0, t - design.schedule.delays[t] + 1))
+            (t, r): cp.Variable((n_u, n_w))
+            for t in range(0 if calm else H)
+            for r in range(max(0, t - design.schedule.delays[t] + 1))
         }
 
         # (1): means, and the matrices of all disturbances' effects, x_t - x̄_t = G_t w, u_t - v_t = M_t w.
@@ -71,7 +76,7 @@ class PrintedProblem:
             blocks = [self._m.get((t, r), np.zeros((n_u, n_w))) for r in range(H)]
             self._gain.append(cp.hstack(blocks) @ np.kron(np.eye(H), root_w))
             enter = np.zeros((n_x, H * n_w))
-            enter[:, t * n_w : (t + 1) * n_w] = part.e @ root_w
+            enter[:, t * n_w : (t + 1) * n_w] = e @ root_w
             mean.append(part.a @ mean[-1] + part.b @ self._v[t])
             effect.append(part.a @ effect[-1] + part.b @ self._gain[-1] + enter)
         self._effect = effect
@@ -94,9 +99,10 @@ class PrintedProblem:
             for c, b in zip(part.c_u, part.b_u, strict=True):
                 constraints.append(c @ self._v[t] + design.kappa_u[t] * cp.norm(c @ self._gain[t]) <= b)
 
-        # (19c): ξ̄_H = 0 (here: at rest in the target), Σ_ξ - Ξ_H ⪰ 0 by its Schur complement.
+        # (19c): ξ̄_H = 0 (here: at rest in the target), Σ_ξ - Ξ_H ⪰ 0 by its Schur complement; both are 0 in the calm.
         constraints.append(xi_mean == 0)
-        constraints.append(cp.bmat([[part.sigma_xi, xi_effect], [xi_effect.T, np.eye(H * n_w)]]) >> 0)
+        if not calm:
+            constraints.append(cp.bmat([[part.sigma_xi, xi_effect], [xi_effect.T, np.eye(H * n_w)]]) >> 0)
         self._problem = cp.Problem(cp.Minimize(cost), constraints)
 
     def solve(self, x: Array, target: Array) -> PartAnswer:

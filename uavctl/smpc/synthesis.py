@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from uavctl.errors import DesignError
 from uavctl.smpc.delayed_loop import DelayedLoop, Limit, Weight
 from uavctl.smpc.design import DesignSpec
+from uavctl.smpc.equilibria import rest_input
 from uavctl.smpc.gain_search import GainTask, best_gain
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.risk import kappa
@@ -83,7 +84,7 @@ def synthesize(
     if tau < 1:
         raise DesignError("smpc.tau", f"{tau} is no delay", "give at least 1 step")
     noise = plant.e @ plant.w @ plant.e.T
-    rest = np.asarray(np.linalg.lstsq(plant.b, target - plant.a @ target, rcond=None)[0], dtype=np.float64)
+    rest = rest_input(plant.a, plant.b, q_u, target)
     error = np.zeros_like(plant.a) if estimate_cov is None else estimate_cov
     k = np.zeros((plant.n_u, plant.n_x))
     tasks, starts = [], 0

@@ -1,0 +1,30 @@
+"""Small campaigns on preset paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from uavctl.campaign.cells import Cell, cells_of
+from uavctl.campaign.compose import Campaign
+from uavctl.campaign.read import read_campaign
+from uavctl.cli.prepare import ready_library
+
+HEAD = 'name = "small"\nconfig = "paper"\n'
+
+
+def controller(kind: str, *more: str) -> str:
+    return table("controller", kind, f'kind = "{kind}"', *more)
+
+
+def table(of: str, name: str, *more: str) -> str:
+    return "\n".join([f"[[{of}]]", f'name = "{name}"', *more, ""])
+
+
+def read(folder: Path, *parts: str) -> Campaign:
+    file = folder / "small.toml"
+    file.write_text(HEAD + "".join(parts), encoding="utf-8")
+    return read_campaign(file)[0]
+
+
+def cells(folder: Path, *parts: str) -> tuple[Cell, ...]:
+    return cells_of(read(folder, *parts), ready_library)

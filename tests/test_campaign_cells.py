@@ -1,0 +1,148 @@
+"""Cells: the grid and its order, who is refused, what runs meet, who flies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_rig import cells, controller, read, table
+
+from uavctl.campaign.cells import cell_of, cells_of, document
+from uavctl.campaign.chance import draw
+from uavctl.campaign.controllers import TUNING_FIRST, build, built
+from uavctl.campaign.links import newest
+from uavctl.campaign.setting import Met, met, problem_of, start_of
+from uavctl.campaign.tasks import CHUNK, tasks_of
+from uavctl.campaign.world import fly
+from uavctl.cli.prepare import ready_library
+from uavctl.config import load_config
+from uavctl.smpc.baselines import Lqg, WorstCaseDelay
+from uavctl.smpc.batch_smpc import BatchSmpc
+from uavctl.smpc.risk import kappa
+
+LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
+WEAK = table("plant", "weak", 'set = ["plant.b=[[0.1, 0.0], [0.2, 0.0], [0.0, 0.1], [0.0, 0.2]]"]')
+
+
+def test_the_grid_is_the_product_in_the_order_given(tmp_path: Path) -> None:
+    found = cells(
+        tmp_path,
+        controller("lqg"),
+        controller("hold-last"),
+        LINKS,
+        table("disturbance", "a"),
+        table("plant", "b"),
+        WEAK,
+    )
+    assert [cell.index for cell in found] == list(range(8))
+    assert [cell.names[:2] + cell.names[3:] for cell in found[:5]] == [
+        ("lqg", "good", "b"),
+        ("lqg", "good", "weak"),
+        ("lqg", "bad", "b"),
+        ("lqg", "bad", "weak"),
+        ("hold-last", "good", "b"),
+    ]
+    # One recipe for all cells with the same controller that believes the same.
+    assert len({id(cell.recipe) for cell in found}) == 4
+    assert len({cell.recipe.key for cell in found if cell.recipe}) == 4
+
+
+def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> None:
+    first, weak = cells(tmp_path, controller("lqg", 'link = "good"'), LINKS, table("plant", "b"), WEAK)[2:]
+    assert first.recipe is weak.recipe and weak.recipe is not None
+    assert weak.recipe.config.link.loss == 0.1 and weak.setting.link.loss == 0.6
+    assert met(first.setting, 0, 1).scene.plant.b[1, 0] == 0.39
+    assert met(weak.setting, 0, 1).scene.plant.b[1, 0] == 0.2
+    assert problem_of(weak.recipe.config).plant.b[1, 0] == 0.39
+
+
+def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
+    links = table("link", "as printed") + table("link", "bad", 'set = ["link.loss=0.6"]')
+    campaign = read(tmp_path, controller("smpc"), controller("lqg"), links)
+    found = cells_of(campaign, ready_library)
+    assert [bool(cell.refused) for cell in found] == [False, True, False, False]
+    assert found[1].refused.startswith("smpc.delta_x: 0.95 is out of reach") and found[1].recipe is None
+    assert {task.cell for task in tasks_of(found)} == {0, 2, 3}
+    told = document(campaign, found)["cells"]
+    assert isinstance(told, list)
+    assert told[1]["refused"] == found[1].refused and told[1]["design_id"] is None
+    assert told[0]["promised_x"] == pytest.approx(0.05) and told[0]["link_loss"] == 0.3
+    assert told[2]["promised_x"] is None and told[2]["kind"] == "lqg"
+    again = cell_of(campaign, 0, ready_library)
+    assert again.recipe is not None and found[0].recipe is not None and again.recipe.key == found[0].recipe.key
+
+
+def test_a_plant_that_cannot_be_flown_is_refused_too(tmp_path: Path) -> None:
+    negative = 'set = ["plant.a=[[1.0, 0.79, 0.0, 0.0], [0.0, -0.6, 0.0, 0.0], [0, 0, 1, 0.79], [0, 0, 0, 0.61]]"]'
+    (found,) = cells(tmp_path, controller("lqg"), table("plant", "none", negative))
+    assert found.refused.startswith("plant.a: A has no real logarithm") and found.recipe is None
+
+
+def test_every_cell_meets_the_same_chance(tmp_path: Path) -> None:
+    lines = 'steps = 9\nmaster = 5\nset = ["plant.w=[[0.5, 0.1], [0.1, 0.3]]"]\n'
+    found = cells(tmp_path, lines, controller("lqg"), controller("hold-last"), LINKS)
+    one, other = (met(cell.setting, 3, 4) for cell in (found[0], found[2]))
+    np.testing.assert_array_equal(one.disturbances, other.disturbances)
+    np.testing.assert_array_equal(one.newest, other.newest)
+    # A worse link loses what the better one loses, and more.
+    assert (met(found[1].setting, 3, 4).newest <= one.newest).all()
+    chances = draw(5, 3, 4, 9, 2)
+    np.testing.assert_array_equal(one.newest, newest(found[0].setting.link, 1.0, chances.link))
+    root = np.linalg.cholesky(np.array([[0.5, 0.1], [0.1, 0.3]]))
+    whitened = one.disturbances @ np.linalg.inv(root).T
+    turn = whitened.reshape(-1, 2).T @ np.linalg.pinv(chances.normal.reshape(-1, 2).T)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-9)  # any two roots differ by a rotation
+    np.testing.assert_array_equal(met(found[0].setting, 4, 1).disturbances[0], one.disturbances[1])
+
+
+def test_runs_start_where_they_are_told(tmp_path: Path) -> None:
+    def starts(line: str) -> Met:
+        (found,) = cells(tmp_path, line, controller("lqg"))
+        return met(found.setting, 2, 50)
+
+    np.testing.assert_array_equal(starts("").scene.start, np.tile([35.0, -2.0, -20.0, -4.0], (50, 1)))
+    np.testing.assert_array_equal(starts("start = [1, 2, 3, 4]\n").scene.start[7], [1, 2, 3, 4])
+    box = starts("start_box = [[-1, 0, 5, 0], [1, 2, 5, 8]]\n")
+    drawn = box.scene.start
+    assert (drawn >= [-1, 0, 5, 0]).all() and (drawn <= [1, 2, 5, 8]).all()
+    assert (drawn[:, 2] == 5).all() and len(np.unique(drawn[:, 0])) == 50
+    assert drawn.mean(axis=0) == pytest.approx([0, 1, 5, 4], abs=1.2)
+    (found,) = cells(tmp_path, "start_box = [[-1, 0, 5, 0], [1, 2, 5, 8]]\n", controller("lqg"))
+    np.testing.assert_array_equal(met(found.setting, 9, 1).scene.start[0], drawn[7])
+    np.testing.assert_array_equal(start_of(found.setting.spec, found.setting.base), [0, 1, 5, 4])
+    # The draws of where runs start leave the others as they are.
+    np.testing.assert_array_equal(box.disturbances, starts("").disturbances)
+
+
+def test_every_kind_of_controller_flies(tmp_path: Path) -> None:
+    kinds = ("smpc", "lqg", "packetised", "worst-case-delay", "hold-last", "zero-on-loss", "pid")
+    found = cells(tmp_path, "steps = 6\n", *(controller(kind) for kind in kinds))
+    assert [cell.kind for cell in found] == list(kinds) and not any(cell.refused for cell in found)
+    recipes = [cell.recipe for cell in found if cell.recipe is not None]
+    assert isinstance(build(recipes[0]), BatchSmpc) and isinstance(build(recipes[1]), Lqg)
+    assert recipes[6].gains is not None
+    assert built(recipes[1]) is built(recipes[1])
+    assert built(recipes[2]) is not built(recipes[1])
+
+
+def test_the_worst_case_delay_is_tau_with_the_promised_likelihoods(tmp_path: Path) -> None:
+    (found,) = cells(tmp_path, 'set = ["smpc.tau=3"]\n', controller("worst-case-delay"))
+    config, recipe = load_config("paper", ["smpc.tau=3"]), found.recipe
+    assert recipe is not None
+    own, problem = build(recipe), problem_of(config)
+    expected = WorstCaseDelay(problem, 3, kappa(0.95, 4, 8, "ellipsoid"), kappa(0.9, 2, 4, "ellipsoid"))
+    meets = met(found.setting, 0, 5)
+    one, other = (fly(meets.scene, each, meets.newest, meets.disturbances) for each in (own, expected))
+    np.testing.assert_array_equal(one.inputs, other.inputs)
+
+
+def test_tasks_are_fixed_chunks_and_tuning_runs_are_nobody_s(tmp_path: Path) -> None:
+    found = cells(tmp_path, f"runs = {2 * CHUNK + 7}\n", controller("lqg"), LINKS)
+    tasks = list(tasks_of(found))
+    assert [(task.cell, task.first, task.runs) for task in tasks] == [
+        (cell, first, runs) for cell in (0, 1) for first, runs in ((0, CHUNK), (CHUNK, CHUNK), (2 * CHUNK, 7))
+    ]
+    names = [task.name for task in tasks]
+    assert names == sorted(names) and len(set(names)) == 6
+    assert TUNING_FIRST >= 10_000_000  # the most runs that a specification may ask for

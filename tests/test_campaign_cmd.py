@@ -1,0 +1,190 @@
+"""`uavctl campaign` as it is typed: the same table however it is flown, and whatever ends it half way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from campaign_rig import HEAD, controller, table
+from distributed import LocalCluster
+
+from uavctl.campaign.tasks import CHUNK
+from uavctl.cli.app import run
+
+LIMIT_S = 120.0
+RUNS = CHUNK + 3  # two tasks a cell
+SPEC = (
+    HEAD
+    + f"steps = 6\nruns = {RUNS}\n"
+    + controller("smpc")
+    + controller("lqg")
+    + table("link", "as printed")
+    + table("link", "bad", 'set = ["link.loss=0.6"]')
+    + table("disturbance", "heavy", 'kind = "heavy"')
+)
+KEYS = [
+    "controller", "link", "disturbance", "plant", "runs", "failed", "violation_rate", "violation_ci",
+    "run_violation_rate", "run_violation_ci", "cost", "cost_ci", "fallbacks", "max_age", "refused",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("campaign") / "small.toml"
+    file.write_text(SPEC, encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def flown(spec: Path) -> Path:
+    """A campaign flown by one worker."""
+    folder = spec.parent / "one"
+    assert run(["campaign", str(spec), "--workers", "1", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Address of a real scheduler with two real worker processes."""
+    with LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        yield str(cluster.scheduler_address)
+
+
+def contents(folder: Path) -> bytes:
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".lock", "campaign.json", "campaign.toml", "report.html", "runs.parquet"
+    ]  # fmt: skip
+    return (folder / "runs.parquet").read_bytes()
+
+
+def started(spec: Path, folder: Path) -> subprocess.Popen[str]:
+    """A campaign in a process group of its own that has kept its first task."""
+    line = [sys.executable, "-m", "uavctl", "campaign", str(spec), "--workers", "2", "--out", str(folder)]
+    process = subprocess.Popen(line, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + LIMIT_S
+    while not list(folder.glob("parts/*.parquet")):
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.005)
+    return process
+
+
+def test_one_worker_gives_every_run_in_order(flown: Path) -> None:
+    assert contents(flown)
+    found = pq.read_table(flown / "runs.parquet")
+    cells, runs = found["cell"].to_numpy(), found["run"].to_numpy()
+    assert list(dict.fromkeys(cells.tolist())) == [0, 2, 3]  # the SMPC of the bad link is refused
+    assert all((runs[cells == cell] == range(RUNS)).all() for cell in (0, 2, 3))
+    assert set(found["error"].to_pylist()) == {""}
+
+
+def test_two_workers_give_the_same(spec: Path, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["campaign", str(spec), "--workers", "2", "--out", str(tmp_path / "two"), "--json"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    assert contents(tmp_path / "two") == contents(flown)
+    told: dict[str, Any] = json.loads(out)
+    assert told.keys() == {"name", "runs_file", "report", "wall_s", "cells"} and told["name"] == "small"
+    assert told["runs_file"] == str(tmp_path / "two" / "runs.parquet") and Path(told["report"]).exists()
+    assert all(list(cell)[: len(KEYS)] == KEYS for cell in told["cells"])
+    smpc, refused, lqg, _ = told["cells"]
+    assert (smpc["runs"], smpc["failed"], smpc["refused"]) == (RUNS, 0, "")
+    assert refused["runs"] == 0 and refused["refused"].startswith("smpc.delta_x") and refused["cost"] is None
+    assert smpc["cost_ci"][0] < smpc["cost"] < smpc["cost_ci"][1]
+    assert smpc["violation_rate"] <= lqg["violation_rate"] and lqg["violation_ci"][0] <= lqg["violation_rate"]
+
+
+def test_a_dask_cluster_gives_the_same(spec: Path, flown: Path, tmp_path: Path, scheduler: str) -> None:
+    assert run(["campaign", str(spec), "--dask", scheduler, "--out", str(tmp_path / "dask")]) == 0
+    assert contents(tmp_path / "dask") == contents(flown)
+
+
+def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    process = started(spec, folder)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=LIMIT_S)
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")}
+    assert process.returncode == -signal.SIGKILL and 1 <= len(kept) < 6
+    assert not (folder / "runs.parquet").exists()
+    assert run(["campaign", str(spec), "--out", str(folder)]) == 2  # not without --resume
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")} == kept
+    assert run(["campaign", str(spec), "--workers", "1", "--out", str(folder), "--resume"]) == 0
+    assert contents(folder) == contents(flown)
+
+
+def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "stopped"
+    process = started(spec, folder)
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "interrupted" in told and "Traceback" not in told
+    assert told.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
+    assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
+
+
+def test_another_campaign_does_not_go_on(spec: Path, flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["campaign", str(spec), "--runs", "4", "--out", str(flown), "--resume"]) == 2
+    assert f"runs is {RUNS} there and 4 here" in capsys.readouterr().err
+    before = contents(flown)
+    assert run(["campaign", str(spec), "--out", str(flown), "--resume"]) == 0  # complete: only the page is made
+    assert contents(flown) == before
+
+
+def test_fewer_runs_and_a_table_for_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wild = 'set = ["plant.b=[[1e200, 0], [1e200, 0], [0, 1e200], [0, 1e200]]"]'
+    (tmp_path / "c.toml").write_text(
+        HEAD + "steps = 5\n" + controller("lqg") + table("plant", "as modelled") + table("plant", "wild", wild)
+    )
+    monkeypatch.chdir(tmp_path)
+    assert run(["campaign", "c.toml", "--runs", "12", "--workers", "1"]) == 0
+    out = capsys.readouterr().out
+    (folder,) = (tmp_path / "flights").iterdir()
+    assert folder.name.endswith("-small") and f"flights/{folder.name}/runs.parquet" in out
+    assert "wild" in out and "as modelled" in out and "disturbance" not in out
+    rows = pq.read_table(folder / "runs.parquet").to_pylist()
+    assert len(rows) == 24 and {bool(row["error"]) for row in rows if row["cell"] == 0} == {False}
+    assert {row["error"] for row in rows if row["cell"] == 1} == {"ended in numbers that are not finite"}
+
+
+def test_nothing_to_fly_is_told_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.toml").write_text(HEAD + 'set = ["link.loss=0.6"]\n' + controller("smpc"))
+    assert run(["campaign", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out")]) == 1
+    assert "smpc.delta_x: 0.95 is out of reach" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--dask", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
+        (["--resume"], "with --out"),
+        (["--refly", "0:0", "--workers", "2"], "--refly"),
+        (["--dask", "nonsense://127.0.0.1"], "no scheduler answers"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    spec: Path, tmp_path: Path, options: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if options == ["--resume"] else ["--out", str(tmp_path / "out")]
+    assert run(["campaign", str(spec), *options, *out]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_wrong_file_is_told_with_its_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.toml").write_text(HEAD + "step = 6\n" + controller("lqq"))
+    assert run(["campaign", str(tmp_path / "c.toml")]) == 2
+    told = capsys.readouterr().err
+    assert 'c.toml:3: step: unknown key (nearest valid name "steps")' in told
+    assert 'c.toml:6: controller[0].kind: "lqq" is not a choice (nearest valid name "lqg")' in told

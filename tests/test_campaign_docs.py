@@ -1,0 +1,41 @@
+"""The campaigns in docs/campaigns: they can be read, and every SMPC in them has the design that the file says."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from uavctl.build import build_design
+from uavctl.campaign.read import read_campaign
+from uavctl.campaign.setting import Setting, met
+from uavctl.errors import DesignError
+
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "campaigns"
+FILES = sorted(FOLDER.glob("*.toml"))
+# (file, controller, link that it believes in): there is no such design, as the file's head says.
+REFUSED = {
+    *(("loss", "smpc as printed", f"{loss} %") for loss in range(40, 100, 10)),
+    *(("bursts", "smpc as printed", name) for name in ("bursts of 2", "bursts of 3", "bursts of 5", "seldom, of 5")),
+}
+
+
+def test_they_are_there() -> None:
+    assert [file.stem for file in FILES] == ["bursts", "delay", "loss", "wrong-link", "wrong"]
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
+    campaign, _ = read_campaign(file)
+    spec, refused = campaign.spec, set()
+    assert spec.name == file.stem
+    for (i, link), config in campaign.believed.items():
+        if spec.controller[i].kind == "smpc":
+            try:
+                build_design(config)
+            except DesignError:
+                refused.add((file.stem, spec.controller[i].name, link))
+    assert refused == {one for one in REFUSED if one[0] == file.stem}
+    for flown, disturbance in product(campaign.flown_plant, spec.disturbance):
+        met(Setting(spec, campaign.base, flown.plant, campaign.flown_link[0].link, disturbance), 0, 1)

@@ -1,0 +1,89 @@
+"""Workers: one BLAS thread each, replaced when they die, gone when their parent is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from campaign_rig import cells, controller
+
+from uavctl.campaign import pool
+from uavctl.campaign.pool import ONE_THREAD, processes
+from uavctl.campaign.run import fly_tasks
+from uavctl.campaign.tasks import CHUNK, Columns, Task, tasks_of
+from uavctl.errors import UsageError
+
+LIMIT_S = 60.0
+ORPHAN = """
+import os, sys
+from uavctl.campaign.pool import processes
+if __name__ == "__main__":
+    with processes(1) as crew:
+        print(crew._pool.submit(os.getpid).result(), flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_a_worker_that_is_killed_is_replaced_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    tasks = list(tasks_of(cells(tmp_path, f"steps = 3\nruns = {5 * CHUNK}\n", controller("lqg"))))
+    kept: dict[str, Columns] = {}
+    with processes(1) as crew:
+        assert crew._pool.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
+
+        def keep(task: Task, columns: Columns) -> None:
+            if not kept:
+                os.kill(crew._pool.submit(os.getpid).result(), signal.SIGKILL)
+            kept[task.name] = columns
+
+        fly_tasks(tasks, crew, keep, lambda: False)
+    assert sorted(kept) == [task.name for task in tasks]
+    assert {error for columns in kept.values() for error in columns["error"]} == {""}
+    # The environment is as it was.
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2" and "MKL_NUM_THREADS" not in os.environ
+
+
+def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(ORPHAN)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert parent.stdout is not None and parent.stdin is not None
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    parent.communicate(timeout=LIMIT_S)
+    until = time.monotonic() + LIMIT_S
+    while _runs(worker):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_workers_that_would_give_other_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    here = pool._about()
+    assert here[1] == "1"
+    pool._check("tcp://a", {"w": here})
+    with pytest.raises(UsageError, match=r"worker w has uavctl 0\.0, this is"):
+        pool._check("tcp://a", {"v": here, "w": ("0.0", "1")})
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "4")  # it wins over the other
+    with pytest.raises(UsageError, match=r"computes with 4 BLAS threads.*OPENBLAS_NUM_THREADS=1"):
+        pool._check("tcp://a", {"w": pool._about()})
+    assert set(ONE_THREAD.values()) == {"1"}
+
+
+def _runs(process: int) -> bool:
+    """Whether a process is there and has not ended."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

@@ -1,0 +1,128 @@
+"""The folder of a campaign: parts, the table in the end, and what may go on there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from campaign_rig import cells, controller, read, table
+
+from uavctl.campaign.again import again
+from uavctl.campaign.cells import cells_of, document
+from uavctl.campaign.store import SCHEMA, Store, first_difference, table_of
+from uavctl.campaign.tasks import CHUNK, Task, fly_task, lost, tasks_of
+from uavctl.cli.prepare import ready_library
+from uavctl.errors import UavctlError, UsageError
+
+TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
+DOCUMENT = {"name": "one", "runs": 3, "cells": [{"index": 0}]}
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> list[Task]:
+    return list(tasks_of(cells(tmp_path, f"steps = 3\nruns = {CHUNK + 4}\n", controller("lqg"), TWO)))
+
+
+def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, given: list[Task]) -> None:
+    files = []
+    for name, order in (("one", given), ("other", given[::-1])):
+        store = Store(tmp_path / name)
+        with store.opened(DOCUMENT, "text", resume=False):
+            for task in order:
+                store.keep(task, fly_task(task))
+            assert store.kept(given) == {task.name for task in given} and not store.complete()
+            files.append(store.finish(given))
+        assert store.complete() and not (tmp_path / name / "parts").exists()
+    assert files[0].read_bytes() == files[1].read_bytes()
+    found = pq.read_table(files[0])
+    assert found.schema.names == SCHEMA.names
+    assert list(found["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
+    assert list(found["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
+    whole = fly_task(given[1])
+    row = found.slice(CHUNK + 2, 1).to_pylist()[0]
+    assert row["cost"] == whole["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
+    ages = [int(count) for count in whole["ages"][2]]
+    assert row["ages"] == ages[: row["max_age"] + 1] and not any(ages[row["max_age"] + 1 :])
+
+
+def test_rows_without_figures_are_kept(given: list[Task]) -> None:
+    rows = table_of(lost(given[1], "it died")).to_pylist()
+    assert len(rows) == 4 and rows[0]["error"] == "it died" and rows[0]["ages"] == []
+    assert np.isnan(rows[0]["cost"]) and rows[0]["steps"] == 0
+
+
+def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> None:
+    store = Store(tmp_path / "one")
+    with store.opened(DOCUMENT, "text", resume=False):
+        for task in given:
+            store.keep(task, fly_task(task))
+        part = tmp_path / "one" / "parts" / f"{given[1].name}.parquet"
+        part.write_bytes(part.read_bytes()[:-20])
+        with pytest.raises(UavctlError, match=rf"{given[1].name}\.parquet is damaged.*remove it"):
+            store.finish(given)
+
+
+def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Path) -> None:
+    store = Store(tmp_path / "one")
+    with pytest.raises(UsageError, match="leave out --resume"), store.opened(DOCUMENT, "text", resume=True):
+        pass
+    with store.opened(DOCUMENT, "text", resume=False):
+        assert (tmp_path / "one" / "campaign.toml").read_text() == "text"
+        with pytest.raises(UsageError, match="another process"), Store(store.folder).opened(DOCUMENT, "text", True):
+            pass
+    with pytest.raises(UsageError, match="go on with it by --resume"), store.opened(DOCUMENT, "text", resume=False):
+        pass
+    with store.opened(DOCUMENT, "text", resume=True):
+        pass
+    other = {**DOCUMENT, "cells": [{"index": 1}]}
+    with (
+        pytest.raises(UsageError, match=r"cells\[0\]\.index is 0 there and 1 here"),
+        store.opened(other, "text", resume=True),
+    ):
+        pass
+
+
+def test_the_first_difference_is_told() -> None:
+    one = {"a": 1, "b": {"c": [1, {"d": "x"}]}, "e": None}
+    assert first_difference(one, {**one}) is None
+    assert first_difference(one, {**one, "b": {"c": [1, {"d": "y"}]}}) == 'b.c[1].d is "x" there and "y" here'
+    assert first_difference(one, {**one, "b": {"c": [1]}}) == 'b.c is [1,{"d":"x"}] there and [1] here'
+    assert first_difference({}, {"f": 2}) == "f is null there and 2 here"
+
+
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UavctlError, match="file"), Store(tmp_path / "file").opened(DOCUMENT, "text", resume=False):
+        pass
+
+
+def test_one_run_can_be_flown_again(tmp_path: Path) -> None:
+    campaign = read(
+        tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO
+    )
+    made = cells_of(campaign, ready_library)
+    tasks = list(tasks_of(made))
+    store = Store(tmp_path / "one")
+    with store.opened(document(campaign, made), "text", resume=False):
+        rows = fly_task(tasks[3])
+        found = again(tmp_path / "one", 1, CHUNK + 2, ready_library)
+    assert found.flown.cost.shape == (1, 6) and found.campaign == "small" and found.master == 2
+    assert found.flown.cost.sum(axis=1)[0] == rows["cost"][2]
+    x = found.flown.states[0]
+    np.testing.assert_array_equal(x[0], found.start)
+    a, b, e = (np.array(getattr(found.plant, name)) for name in "abe")
+    np.testing.assert_allclose(x[3], a @ x[2] + b @ found.flown.inputs[0, 2] + e @ found.disturbances[2], atol=1e-9)
+    np.testing.assert_array_equal(found.flown.age[0], np.arange(6) - found.newest)
+    assert found.config.link.loss == 0.5
+    with pytest.raises(UsageError, match="cell 3 was not flown"):
+        again(tmp_path / "one", 3, 0, ready_library)
+    with pytest.raises(UsageError, match=f"the runs 0 to {CHUNK + 3}"):
+        again(tmp_path / "one", 1, CHUNK + 4, ready_library)
+    with pytest.raises(UavctlError, match="holds no campaign"):
+        again(tmp_path, 1, 0, ready_library)
+    file = tmp_path / "one" / "campaign.json"
+    file.write_text(file.read_text().replace('"link_loss": 0.5', '"link_loss": 0.4'))
+    with pytest.raises(UavctlError, match=r"flew another controller.*cells\[1\]\.link_loss is 0\.4 there"):
+        again(tmp_path / "one", 1, 0, ready_library)

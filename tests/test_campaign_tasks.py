@@ -1,0 +1,174 @@
+"""Tasks: the figures of each run, runs that crash, and crews whose workers die."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_rig import cells, controller, table
+
+from uavctl.campaign import controllers, tasks
+from uavctl.campaign.controllers import build
+from uavctl.campaign.run import fly_tasks
+from uavctl.campaign.setting import met
+from uavctl.campaign.tasks import Columns, Task, fly_task, lost, tasks_of
+from uavctl.campaign.world import fly
+from uavctl.smpc.batch import News
+from uavctl.smpc.batch_smpc import BatchSmpc
+
+FIGURES = ("cost", "settled_cost", "mean_square_input", "largest_gap")
+# B of preset paper a million times stronger: whatever is asked for drives the state out of all numbers.
+WILD = 'set = ["plant.b=[[1e200, 0], [1e200, 0], [0, 1e200], [0, 1e200]]"]'
+
+
+def task(folder: Path, *parts: str) -> Task:
+    return next(tasks_of(cells(folder, *parts)))
+
+
+def test_figures_are_those_of_the_runs(tmp_path: Path) -> None:
+    one = task(tmp_path, "steps = 11\nruns = 7\n", controller("smpc"))
+    columns = fly_task(one)
+    smpc, meets = build(one.recipe), met(one.setting, 0, 7)
+    flown = fly(meets.scene, smpc, meets.newest, meets.disturbances)
+    assert isinstance(smpc, BatchSmpc)
+    assert set(columns["error"]) == {""}
+    for i in range(7):
+        x, u = flown.states[i], flown.inputs[i]
+        stage = [10 * s[0] ** 2 + 0.1 * s[1] ** 2 + 10 * s[2] ** 2 + 0.1 * s[3] ** 2 for s in x[:-1]]
+        stage = [a + 0.1 * float(b @ b) for a, b in zip(stage, u, strict=True)]
+        assert columns["cost"][i] == pytest.approx(sum(stage), rel=1e-12)
+        assert columns["settled_cost"][i] == pytest.approx(np.mean(stage[5:]), rel=1e-12)
+        assert columns["mean_square_input"][i] == pytest.approx(np.mean([float(b @ b) for b in u]), rel=1e-12)
+        low, high = np.array([-30, -8, -25, -8]), np.array([50, 7, 20, 8])
+        assert columns["state_violations"][i] == sum(((s < low) | (s > high)).any() for s in x[1:])
+        assert columns["saturated"][i] == sum((np.abs(b) >= 7.5 - 1e-6).any() for b in u)
+        assert list(columns["ages"][i]) == [list(flown.age[i]).count(a) for a in range(11)]
+        assert columns["age_sum"][i] == flown.age[i].sum() and columns["max_age"][i] == flown.age[i].max()
+    np.testing.assert_array_equal(columns["decisions"], smpc.tally.decisions)
+    np.testing.assert_array_equal(columns["largest_gap"], smpc.tally.largest_gap)
+    assert all(columns["saturated"]) and (columns["run"] == np.arange(7)).all()
+
+
+def test_a_controller_that_counts_nothing_has_no_gap(tmp_path: Path) -> None:
+    columns = fly_task(task(tmp_path, "steps = 5\nruns = 3\n", controller("lqg")))
+    assert np.isnan(columns["largest_gap"]).all() and not columns["decisions"].any()
+    assert np.isfinite(columns["cost"]).all() and (columns["steps"] == 5).all()
+
+
+def test_numbers_that_leave_all_bounds_are_told_as_an_error(tmp_path: Path) -> None:
+    columns = fly_task(task(tmp_path, "steps = 8\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)))
+    assert set(columns["error"]) == {"ended in numbers that are not finite"}
+    assert all(np.isnan(columns[name]).all() for name in FIGURES)
+    assert not columns["steps"].any() and not columns["ages"].any()
+
+
+class Crashing:
+    """A controller that raises in the run which starts furthest out."""
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+
+    def begin(self, runs: int) -> None: ...
+
+    def act(self, news: News) -> np.ndarray:
+        if news.step == 0 and (news.state[:, 0] > self._limit).any():
+            raise ZeroDivisionError("out of range")
+        return np.zeros((len(news.state), 2))
+
+
+def test_a_run_that_raises_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    box = "start_box = [[0, 0, 0, 0], [10, 0, 0, 0]]\nsteps = 2\nruns = 40\n"
+    one = task(tmp_path, box, controller("lqg"))
+    starts = met(one.setting, 0, 40).scene.start[:, 0]
+    limit = float(np.sort(starts)[-3])
+    monkeypatch.setattr(controllers, "build", lambda recipe: Crashing(limit))
+    columns = fly_task(replace(one, recipe=replace(one.recipe, key="crashing")))
+    out = starts > limit
+    assert out.sum() == 2
+    assert list(columns["error"][out]) == ["ZeroDivisionError: out of range"] * 2
+    assert set(columns["error"][~out]) == {""}
+    assert np.isfinite(columns["cost"][~out]).all() and np.isnan(columns["cost"][out]).all()
+    np.testing.assert_array_equal(columns["run"], np.arange(40))
+
+
+def test_a_controller_that_cannot_be_built_loses_its_runs_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(recipe: object) -> None:
+        raise OSError("no such file")
+
+    one = task(tmp_path, "steps = 2\nruns = 4\n", controller("lqg"))
+    monkeypatch.setattr(controllers, "build", none)
+    columns = fly_task(replace(one, recipe=replace(one.recipe, key="none")))
+    assert list(columns["error"]) == ["OSError: no such file"] * 4
+
+
+class DeadError(Exception):
+    """A worker died."""
+
+
+class FakeCrew:
+    """Two workers; a task that is named in `deadly` takes them with it, that many times."""
+
+    size = 2
+
+    def __init__(self, deadly: dict[str, int]) -> None:
+        self.deadly, self.renewed = dict(deadly), 0
+        self.submitted: list[str] = []
+        self._broken = False
+
+    def submit(self, task: Task) -> Future[Columns]:
+        future: Future[Columns] = Future()
+        self.submitted.append(task.name)
+        if self.deadly.get(task.name, 0):
+            self.deadly[task.name] -= 1
+            self._broken = True
+        if self._broken:
+            future.set_exception(DeadError())
+        else:
+            future.set_result(lost(task, ""))
+        return future
+
+    def broken(self, error: BaseException) -> bool:
+        return isinstance(error, DeadError)
+
+    def renew(self) -> None:
+        self.renewed += 1
+        self._broken = False
+
+
+def never() -> bool:
+    return False
+
+
+def several(folder: Path) -> list[Task]:
+    return list(tasks_of(cells(folder, f"runs = {5 * tasks.CHUNK}\n", controller("lqg"))))
+
+
+@pytest.mark.parametrize("deaths", [1, 2])
+def test_a_worker_that_dies_costs_at_most_the_task_that_kills_it(tmp_path: Path, deaths: int) -> None:
+    given, kept = several(tmp_path), dict[str, str]()
+    crew = FakeCrew({given[1].name: deaths})
+    fly_tasks(given, crew, lambda task, columns: kept.update({task.name: str(columns["error"][0])}), never)
+    assert sorted(kept) == [task.name for task in given]
+    expected = "the worker died, twice" if deaths == 2 else ""
+    assert kept.pop(given[1].name) == expected
+    assert set(kept.values()) == {""} and crew.renewed == deaths
+
+
+def test_what_is_asked_to_stop_keeps_what_is_under_way(tmp_path: Path) -> None:
+    given, kept = several(tmp_path), list[str]()
+    asked: Callable[[], bool] = lambda: len(kept) >= 1  # noqa: E731
+    fly_tasks(given, FakeCrew({}), lambda task, columns: kept.append(task.name), asked)
+    assert 1 <= len(kept) <= 4 and len(kept) < len(given)
+
+
+def test_an_error_that_is_no_worker_s_death_is_raised(tmp_path: Path) -> None:
+    class Broken(FakeCrew):
+        def broken(self, error: BaseException) -> bool:
+            return False
+
+    with pytest.raises(DeadError):
+        fly_tasks(several(tmp_path), Broken({"00000-00000000": 1}), lambda task, columns: None, never)

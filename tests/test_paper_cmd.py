@@ -1,0 +1,119 @@
+"""The command `uavctl paper`: its document, its figures, its refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import msgspec
+import pytest
+
+from uavctl.cli import paper_cmd
+from uavctl.cli.app import run as command
+from uavctl.paper import depth as deep
+from uavctl.paper.result import Complexity, Depth, DesignTried
+
+WANTED = {
+    "runs", "mean_cost", "cost_stderr", "infeasible", "slack_used", "state_violations", "input_violations", "max_age",
+    "age_distribution", "settled_std", "wall_s", "figures", "claims", "variants",
+}  # fmt: skip
+DEPTH = Depth(
+    designs=[
+        DesignTried(tau=3, schedule="d_t = 5", delays=None, gamma_h=None, cost=None, refused="too slow"),
+        DesignTried(tau=4, schedule="greedy", delays=[1, 2], gamma_h=0.97, cost=None, refused=""),
+        DesignTried(tau=4, schedule="d_t = 5", delays=[5, 5], gamma_h=0.97, cost=61670.0, refused=""),
+    ],
+    complexity=[
+        Complexity(
+            tau=tau, horizon=12, gains=36, lifted=8, exact_ms=10.0, printed_ms=printed, library_us=40.0, refused=""
+        )
+        for tau, printed in ((3, 100.0), (4, 151.0))
+    ]
+    + [
+        Complexity(
+            tau=6, horizon=12, gains=0, lifted=14, exact_ms=None, printed_ms=None, library_us=None, refused="unstable"
+        )
+    ],
+    least_settled_cost=11.95,
+)
+
+
+def test_the_document_has_every_figure_and_both_designs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(["paper", "--runs", "5", "--json", "--out", str(tmp_path / "new" / "folder")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.keys() >= WANTED
+    assert [variant["tau"] for variant in found["variants"]] == [4, 3]
+    printed = found["variants"][0]
+    assert {key: found[key] for key in printed} == printed  # at the top: τ = 4 as printed
+    assert found["runs"] == 5 and found["steps"] == 50 and found["seed"] == 0
+    assert found["depth"] is None
+    assert all(claim.keys() == {"key", "claim", "paper", "measured", "holds"} for claim in found["claims"])
+    assert len(found["figures"]) == 3
+    for name in found["figures"]:
+        assert ElementTree.parse(name).getroot().tag.endswith("svg")
+
+
+def test_both_designs_meet_the_same_losses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command(["paper", "--runs", "5", "--json", "--out", str(tmp_path)])
+    four, three = json.loads(capsys.readouterr().out)["variants"]
+    assert four["age_distribution"] == three["age_distribution"]
+    assert four["mean_cost"] != three["mean_cost"]
+    assert four["mean_cost"] == pytest.approx(three["mean_cost"], rel=0.01)
+
+
+def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(["paper", "--runs", "2", "--steps", "12", "--tau", "3", "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    for words in ("claim", "τ = 3", "yes:", "no:", "paper-runs-tau3.svg", "paper-ages.svg", "slack variable"):
+        assert words in shown
+    assert "τ = 4:" not in shown
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["paper-ages.svg", "paper-runs-tau3.svg"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--runs", "0"], "runs"),
+        (["--runs", "-3"], "runs"),
+        (["--steps", "3"], "steps"),
+        (["--tau", "9"], "tau"),
+        (["--seed", "-1"], "seed"),
+        (["--workers", "0"], "workers"),
+        (["--run", "5"], "--run"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(
+    arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["paper", "--out", str(tmp_path), *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert told in (out + err).lower()
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert command(["paper", "--runs", "1", "--out", str(tmp_path / "file" / "below")]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_the_slow_part_is_in_the_document_when_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(deep, "measure_depth", lambda seed, told: DEPTH)
+    arguments = ["paper", "--runs", "2", "--steps", "8", "--tau", "4", "--full", "--out", str(tmp_path)]
+    assert command([*arguments, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {claim["key"] for claim in found["claims"]} >= {"complexity", "optimum"}
+    assert found["depth"] == msgspec.to_builtins(DEPTH)
+    claims = {claim["key"]: claim for claim in found["claims"]}
+    assert claims["complexity"]["holds"] is False  # as printed, 100 ms become 151
+    assert "100 to 151 ms" in claims["complexity"]["measured"]
+    assert command(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "Schedules" in shown and "too slow" in shown and "over τ" in shown and "unstable" in shown
+
+
+def test_the_slow_part_is_loaded_when_asked_for_only() -> None:
+    assert not hasattr(paper_cmd, "measure_depth")
+    assert callable(deep.measure_depth)

@@ -1,0 +1,228 @@
+"""Runs and figures of `uavctl paper`, against flights and sums made here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from uavctl.build import build_design, build_plant
+from uavctl.campaign.chance import draw
+from uavctl.campaign.links import newest
+from uavctl.campaign.world import Flown, Scene, fly
+from uavctl.config import load_config
+from uavctl.library_store import library_for
+from uavctl.paper import run
+from uavctl.paper.assess import age_distribution, assess
+from uavctl.paper.claims import claims_of
+from uavctl.paper.flights import Chunk, Pilot, Setup, Watched, start_state
+from uavctl.paper.result import Claim, VariantResult
+from uavctl.paper.run import fly_all
+from uavctl.paper.totals import Moments, in_ellipsoid, together, total
+from uavctl.paper.variants import PRINTED, SMALLEST, VARIANTS
+from uavctl.smpc.batch_smpc import BatchSmpc, Decisions, OneByOne
+from uavctl.smpc.library_solver import LibrarySolver
+
+Array = NDArray[np.float64]
+
+RUNS, STEPS, SEED = 20, 50, 3
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    config = load_config("paper", PRINTED.overrides)
+    design = build_design(config)
+    return Setup(config, design, library_for(design).library)
+
+
+@pytest.fixture(scope="module")
+def directly(setup: Setup) -> tuple[Flown, BatchSmpc]:
+    """The same runs with nothing of this command in between."""
+    design, plant = setup.design, build_plant(setup.config)
+    chances = draw(SEED, 0, RUNS, STEPS, plant.n_w)
+    scene = Scene(
+        plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
+        np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
+    )  # fmt: skip
+    smpc = BatchSmpc(design, OneByOne(LibrarySolver(design, setup.library), np.zeros(4), (12, 2)), plant, 0.5)
+    w = chances.normal * np.sqrt(0.6)
+    return fly(scene, smpc, newest(setup.config.link, 1.0, chances.link), w), smpc
+
+
+@pytest.fixture(scope="module")
+def result(setup: Setup) -> VariantResult:
+    (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, lambda _: None)
+    return assess(setup, PRINTED.note, flights, SEED)
+
+
+def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Flown, BatchSmpc]) -> None:
+    flown, smpc = directly
+    cost, settled = flown.cost.sum(axis=1), flown.states[:, STEPS // 2 :].reshape(-1, 4)
+    assert result.mean_cost == pytest.approx(cost.mean(), rel=1e-12)
+    assert result.cost_stderr == pytest.approx(cost.std(ddof=1) / np.sqrt(RUNS), rel=1e-9)
+    assert result.settled_std == pytest.approx(settled.std(axis=0), rel=1e-9)
+    assert result.settled_cost == pytest.approx(flown.cost[:, STEPS // 2 :].mean() / 2, rel=1e-12)
+    assert (result.runs, result.steps, result.tau, result.delays) == (RUNS, STEPS, 4, [5] * 12)
+    assert result.decisions == smpc.tally.decisions.sum() == (flown.age == 0).sum()
+    assert result.infeasible == result.slack_used == result.fallbacks == result.failed == 0
+    assert result.state_violations == flown.state_violated.sum()
+    assert result.input_violations == flown.input_violated.sum() == 0
+    assert result.max_age == flown.age.max()
+    assert result.age_distribution == pytest.approx(np.bincount(flown.age.ravel()) / flown.age.size)
+    assert sum(result.age_distribution) == pytest.approx(1.0)
+    aged = (flown.age[:, 1:] > 0).mean(axis=0)
+    assert result.aged_share == pytest.approx([aged.mean(), aged.min(), aged.max()])
+    low, high = np.array([-30, -8, -25, -8]), np.array([50, 7, 20, 8])
+    room = np.stack([high - flown.states[:, 1:].max((0, 1)), flown.states[:, 1:].min((0, 1)) - low], axis=1)
+    assert result.closest == pytest.approx(room.ravel())
+
+
+def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "CHUNK", 7)
+    told: list[int] = []
+    (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, told.append)
+    again = assess(setup, PRINTED.note, flights, SEED)
+    assert told == [7, 7, 6]
+    assert flights.drawn.shape == (7, STEPS + 1, 4)  # of the first chunk
+    for name in ("decisions", "state_violations", "max_age", "age_distribution", "aged_share", "runs_outside"):
+        assert getattr(again, name) == getattr(result, name)
+    assert again.closest == pytest.approx(result.closest, abs=1e-9)
+    assert again.neighbourhood.area_ratio == pytest.approx(result.neighbourhood.area_ratio, rel=1e-9)
+    assert again.mean_cost == pytest.approx(result.mean_cost, rel=1e-12)
+    assert again.cost_stderr == pytest.approx(result.cost_stderr, rel=1e-9)
+
+
+def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "HERE_UP_TO", 0)
+    monkeypatch.setattr(run, "CHUNK", 8)
+    one, two = (fly_all([setup], RUNS, STEPS, SEED, workers, lambda _: None)[0] for workers in (1, 2))
+    assert vars(one.totals).keys() == vars(two.totals).keys()
+    for name, value in vars(one.totals).items():
+        other = getattr(two.totals, name)
+        assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other
+    assert np.array_equal(one.drawn, two.drawn)
+    # Tables of answers fly there, the solver itself here: the same runs.
+    assert one.totals.cost.mean == pytest.approx(result.mean_cost, rel=1e-9)
+    assert one.totals.decisions == result.decisions
+
+
+def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
+    pilot = Pilot(setup, many=False)
+    few, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
+    assert few.flown.states[2] == pytest.approx(more.flown.states[0], abs=1e-9)
+
+
+def test_the_start_is_the_printed_one(setup: Setup) -> None:
+    assert start_state(setup.config, setup.design.plant).tolist() == [35.0, -2.0, -20.0, -4.0]
+
+
+def test_moments_of_parts_are_those_of_all() -> None:
+    values = np.random.default_rng(0).normal(5e4, 3.0, 1000)
+    parts = [Moments.of(part) for part in np.split(values, [1, 10, 400])]
+    found = parts[0] + parts[1] + parts[2] + parts[3]
+    assert found.count == 1000
+    assert found.mean == pytest.approx(values.mean(), rel=1e-14)
+    assert found.stderr == pytest.approx(values.std(ddof=1) / np.sqrt(1000), rel=1e-9)
+    assert Moments.of(values[:1]).stderr == np.inf
+
+
+def test_the_ellipsoid_holds_its_share_of_what_it_is_made_for(setup: Setup) -> None:
+    draws = np.random.default_rng(1).multivariate_normal(np.zeros(4), setup.design.terminal.sigma_x, 40_000)
+    assert in_ellipsoid(draws, setup.design).mean() == pytest.approx(0.95, abs=0.004)  # 3.7 standard errors
+
+
+def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
+    """Runs along given states."""
+    runs, steps = ages.shape
+    flat, flags = np.zeros((runs, steps, 2)), np.zeros((runs, steps), dtype=bool)
+    flags[0, 1:] = True
+    flown = Flown(states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool))
+    return Chunk(flown, decisions=3, infeasible=0, slack_used=1, missed=2, fallbacks=0, largest_gap=0.5)
+
+
+def test_totals_of_made_up_runs(setup: Setup) -> None:
+    states = np.full((2, 5, 4), 100.0)
+    states[0, 2:] = 0.0  # the first run arrives in step 2, the second never
+    found = together([total(made(states, np.array([[0, 1, 0, 1], [0, 1, 2, 3]])), setup.design)] * 2)
+    assert found.arrived.tolist() == [0, 0, 2, 0, 0, 2]
+    assert (found.ended_inside, found.settled_inside, found.settled) == (2, 6, 12)
+    assert found.outside.tolist() == [0, 2, 2, 2]
+    assert (found.runs_outside, found.runs_asking, found.decisions, found.slack_used, found.missed) == (2, 2, 6, 2, 4)
+    assert found.ages[3].tolist() == [0, 2, 0, 2]
+    assert age_distribution(found) == [0.375, 0.375, 0.125, 0.125]
+    # Beyond the upper limits by 100 - limit; from the lower ones, the nearest was the origin.
+    assert found.closest.tolist() == [50.0, -30.0, 93.0, -8.0, 80.0, -25.0, 92.0, -8.0]
+    assert found.largest_gap == 0.5
+
+
+def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
+    design = setup.design
+    inner = OneByOne(LibrarySolver(design, setup.library), design.target, (12, 2))
+
+    class Astray:
+        """Adds a push in the last input of one plan, and gives up another one."""
+
+        def decide(self, x: Array, late: int) -> Decisions:
+            plans = inner.decide(x, late)
+            plans.inputs[0, -1, 1] += 1e-3
+            plans.inputs[1, -1, 1] += 1e-3
+            plans.solved[1] = False
+            return plans
+
+    x = np.array([[1.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [35.0, -2.0, -20.0, -4.0]])
+    for decider, missed in ((inner, 0), (Astray(), 1)):
+        watched = Watched(decider, design)
+        watched.decide(x, 0)
+        assert watched.missed == missed
+
+
+def by_key(claims: list[Claim]) -> dict[str, Claim]:
+    return {one.key: one for one in claims}
+
+
+def test_claims_hold_or_not_by_what_was_measured(result: VariantResult) -> None:
+    def holds(**changes: object) -> dict[str, bool | None]:
+        claims = claims_of(replace(result, **changes), 0.3, 12, 0.95, 0.9)
+        return {key: one.holds for key, one in by_key(claims).items()}
+
+    as_flown = holds()
+    assert as_flown["slack"] and as_flown["box"] and as_flown["neighbourhood"] and as_flown["worst-case"]
+    assert as_flown["aged"] is False  # 30 % by p = 0.7, not 40 %
+    assert as_flown["delta-tau"] is False  # 99.76 % with τ = 4
+    assert holds(tau=3)["delta-tau"] is True
+    assert holds(slack_used=1)["slack"] is False
+    assert holds(infeasible=1)["slack"] is False
+    assert holds(missed_target=1)["terminal"] is False
+    assert holds(state_violations=1)["box"] is False
+    assert holds(input_violations=1)["inputs"] is False
+    assert holds(state_violation_worst_step=0.051)["likelihood"] is False
+    assert holds(fallbacks=1)["planned"] is False
+    assert holds(max_age=4)["oldest"] is False
+    assert holds(settled_trend=4.0, settled_trend_stderr=1.0)["stable"] is False
+    far = replace(result.neighbourhood, arrived=RUNS - 1)
+    assert holds(neighbourhood=far)["converge"] is False
+    wide = replace(result.neighbourhood, area_ratio=[0.1, 0.6])
+    assert holds(neighbourhood=wide)["neighbourhood"] is holds(neighbourhood=wide)["worst-case"] is False
+
+
+def test_the_worst_case_is_worse_on_the_same_runs(result: VariantResult) -> None:
+    worst = result.worst_case
+    assert (worst.runs, worst.delay) == (RUNS, 4)
+    assert worst.mean_cost > result.mean_cost + 5 * result.cost_stderr
+    assert worst.settled_cost > 5 * result.settled_cost
+    assert min(worst.area_ratio) > 2 * max(result.neighbourhood.area_ratio)
+
+
+def test_lqg_breaks_the_input_limits_as_often_as_its_inputs_spread(result: VariantResult) -> None:
+    # 7.4 % over a million steps; the standard error of so few runs is about one point.
+    assert 0.03 < result.lqg_asking < 0.12
+    assert result.lqg_bound == pytest.approx(10.667, abs=1e-3)
+
+
+def test_variants_are_designs_that_the_tool_accepts() -> None:
+    assert (PRINTED, SMALLEST) == VARIANTS
+    for variant in VARIANTS:
+        design = build_design(load_config("paper", variant.overrides))
+        assert design.terminal.tau == variant.tau
+        assert set(design.schedule.delays) == {variant.tau + 1}

@@ -1,0 +1,95 @@
+"""Redundant inputs: Assumption 4.4 is checked at the rest input that plans use, the cheapest, and at no other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from plant_cases import Model, Shape, spec_of
+from scipy.optimize import linprog
+
+from uavctl.errors import DesignError
+from uavctl.smpc.answer import Answer
+from uavctl.smpc.conic import ConicSolver
+from uavctl.smpc.design import DesignSpec, make_design
+from uavctl.smpc.equilibria import rest_input
+from uavctl.smpc.sets import Polytope
+from uavctl.smpc.synthesis import synthesize, terminal_factors
+
+Array = NDArray[np.float64]
+
+# At 2 m the spring pulls with 1, which the inputs share as u_1 + u_2 / 2 = 1. Of those the cheapest, with weights of
+# 100 and 1, is u_1 = 0.01 / 0.26, u_2 = 0.5 / 0.26; the smallest is (0.8, 0.4).
+PLACE_M = (2.0, 0.0, 0.0)
+CHEAPEST = np.array([0.01, 0.5]) / 0.26
+FITS_CHEAPEST, FITS_SMALLEST = [0.5, 2.6], [1.5, 1.2]
+
+
+def spring(rng: np.random.Generator) -> Model:
+    """One axis on a spring, with two inputs."""
+    del rng
+    f, g = np.array([[0.0, 1.0], [-0.5, -0.6]]), np.array([[0.0, 0.0], [1.0, 0.5]])
+    return Model(f, g, np.array([[0.0], [1.0]]), np.array([[0.002]]), (0,), (1,))
+
+
+def asked(sides: list[float], target_m: tuple[float, float, float] = PLACE_M) -> DesignSpec:
+    return replace(
+        spec_of(Shape("spring", spring, horizon=8, tau=1, seed=3)),
+        q_u=np.diag([100.0, 1.0]),
+        state_set=Polytope.from_box([-4.0, -4.0], [4.0, 4.0]),
+        input_set=Polytope.from_box([-side for side in sides], sides),
+        target_m=target_m,
+    )
+
+
+def at_place(given: DesignSpec) -> Answer:
+    design = make_design(given)
+    x = given.plant.equilibrium(PLACE_M)
+    return ConicSolver(design).solve(0, x, x)
+
+
+def some_rest_fits(given: DesignSpec) -> bool:
+    """Whether any input holds the target within the limits."""
+    x = given.plant.equilibrium(PLACE_M)
+    limits = list(zip(*np.split(given.input_set.b, 2), strict=True))
+    found = linprog(
+        np.zeros(2),
+        A_eq=given.plant.b,
+        b_eq=x - given.plant.a @ x,
+        bounds=[(-lower, upper) for upper, lower in limits],
+    )
+    return bool(found.status == 0)
+
+
+def test_the_rest_input_is_the_cheapest() -> None:
+    given = asked(FITS_CHEAPEST)
+    x, (a, b) = given.plant.equilibrium(PLACE_M), (given.plant.a, given.plant.b)
+    found = rest_input(a, b, given.q_u, x)
+    assert found == pytest.approx(CHEAPEST, rel=1e-9)
+    assert a @ x + b @ found == pytest.approx(x, rel=1e-9, abs=1e-12)
+
+
+def test_a_target_that_the_cheapest_rest_input_holds_is_accepted_and_held() -> None:
+    given = asked(FITS_CHEAPEST)
+    answer = at_place(given)
+    assert answer.offset < 1e-6 and answer.slack < 1e-6
+    assert answer.inputs[-1] == pytest.approx(CHEAPEST, rel=1e-5)
+    design = make_design(given)
+    (item,) = [check for check in design.assumptions if check.item == "4.4"]
+    assert item.ok and item.limit == pytest.approx(min(0.5 - CHEAPEST[0], 2.6 - CHEAPEST[1]), rel=1e-9)
+
+
+def test_a_target_that_only_dearer_rest_inputs_hold_is_refused_for_no_plan_would_rest_there() -> None:
+    given = asked(FITS_SMALLEST)
+    assert some_rest_fits(given)
+    with pytest.raises(DesignError, match=r"Assumption 4\.4 fails.*upper limit of input 1"):
+        make_design(given)
+    kappa_x, kappa_u = terminal_factors(given)
+    x = given.plant.equilibrium(PLACE_M)
+    limits = (given.state_set, given.input_set, x, kappa_x, kappa_u)
+    with pytest.raises(DesignError, match="leaves no room"):
+        synthesize(given.plant, given.tau, given.q_x, given.q_u, *limits)
+    # From a design for another target: the plan ends as near as its rest input allows.
+    assert at_place(asked(FITS_SMALLEST, (0.0, 0.0, 0.0))).offset > 0.1

@@ -1,0 +1,154 @@
+"""From what a controller is to believe to the controller: first a recipe, once, then as many controllers as workers."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uavctl.build import build_design, build_plant, build_solver
+from uavctl.campaign.setting import Setting, met, problem_of, start_of
+from uavctl.campaign.spec import CampaignSpec, DisturbanceSpec, Kind
+from uavctl.config import Config
+from uavctl.library_bytes import StoredLibrary, decode
+from uavctl.smpc.answer import Solver
+from uavctl.smpc.baselines import (
+    CascadedPid,
+    HoldLast,
+    Lqg,
+    PacketisedPredictive,
+    PidGains,
+    WorstCaseDelay,
+    ZeroOnLoss,
+    tune,
+)
+from uavctl.smpc.batch import BatchController
+from uavctl.smpc.batch_smpc import BatchSmpc, Decider, OneByOne
+from uavctl.smpc.design import Design
+from uavctl.smpc.explicit import ExplicitDecider
+from uavctl.smpc.library import Library
+from uavctl.smpc.risk import kappa
+
+# Runs that a PID is tuned on: beyond the last index that a campaign can fly.
+TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
+
+LibraryFor = Callable[[Config, Design], StoredLibrary | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """All that a controller is built from; it can be sent to another process.
+
+    Attributes:
+        key: Hash of all the others.
+        kind: What it is.
+        config: The configuration that it believes in.
+        design: Its design, of the SMPC.
+        library: Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`.
+        library_id: The library's hash.
+        gains: The gains of a PID.
+    """
+
+    key: str
+    kind: Kind
+    config: Config
+    design: Design | None = None
+    library: bytes | None = None
+    library_id: str | None = None
+    gains: PidGains | None = None
+
+
+def recipe_for(kind: Kind, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
+    """Make design, library and gains: what takes its time, or depends on chance.
+
+    Args:
+        kind: What it is.
+        config: The configuration that it believes in.
+        spec: The campaign.
+        library_for: Gives the policy library of a design.
+
+    Raises:
+        DesignError: There is no such controller.
+    """
+    made = Recipe("", kind, config)
+    if kind == "smpc":
+        design = build_design(config)
+        stored = library_for(config, design)
+        if stored is None:
+            made = replace(made, design=design)
+        else:
+            made = replace(made, design=design, library=stored.data, library_id=stored.library_id)
+    elif kind == "pid":
+        made = replace(made, gains=_tuned(config, spec))
+    made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
+    if kind != "smpc":
+        build(made)  # a baseline is refused here, not in a worker
+    return made
+
+
+def build(recipe: Recipe) -> BatchController:
+    """A controller of a recipe.
+
+    Raises:
+        DesignError: There is none.
+    """
+    config = recipe.config
+    if recipe.kind == "smpc":
+        return _smpc(recipe)
+    problem = problem_of(config)
+    if recipe.kind == "lqg":
+        return Lqg(problem)
+    if recipe.kind == "packetised":
+        return PacketisedPredictive(problem)
+    if recipe.kind == "hold-last":
+        return HoldLast(problem)
+    if recipe.kind == "zero-on-loss":
+        return ZeroOnLoss(problem)
+    if recipe.kind == "worst-case-delay":
+        plant, allocation = problem.plant, config.risk.allocation
+        kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)
+        kappa_u = kappa(config.smpc.delta_u, plant.n_u, len(problem.input_set.b), allocation)
+        return WorstCaseDelay(problem, config.smpc.tau, kappa_x, kappa_u)
+    if recipe.gains is None:
+        raise ValueError("a PID without gains")
+    return CascadedPid(problem, recipe.gains)
+
+
+_built = threading.local()  # a controller has a state: each thread of a worker has its own
+
+
+def built(recipe: Recipe) -> BatchController:
+    """A controller of a recipe; the last one is kept, since a worker mostly goes on with the same."""
+    if getattr(_built, "key", None) != recipe.key:
+        _built.key = None
+        _built.controller = build(recipe)
+        _built.key = recipe.key
+    controller: BatchController = _built.controller
+    return controller
+
+
+def _smpc(recipe: Recipe) -> BatchSmpc:
+    config, design = recipe.config, recipe.design
+    if design is None:
+        raise ValueError("an SMPC without a design")
+    library = None if recipe.library is None else decode(recipe.library).library
+    decider = _decider(design, library, build_solver(design, config, library))
+    return BatchSmpc(design, decider, build_plant(config), config.fallback.brake_gain_1ps)
+
+
+def _decider(design: Design, library: Library | None, solver: Solver) -> Decider:
+    if library is None:
+        return OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+    return ExplicitDecider(design, library, solver, design.target)
+
+
+def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
+    """The gains that suit what the PID believes in, from where the campaign starts."""
+    believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
+    meets = met(believed, TUNING_FIRST, TUNING_RUNS)
+    start = start_of(spec, config)
+    return tune(problem_of(config), np.asarray(start), meets.newest, meets.disturbances)

@@ -1,0 +1,95 @@
+"""What a campaign is asked to fly, as its TOML file says it.
+
+Every key has its unit and meaning in `Meta(description=...)`, as in the flight configuration.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from uavctl.config.section import Floats, Rows, Section
+
+TRUE = "true"  # a controller that believes in the link it flies on
+
+Kind = Literal["smpc", "lqg", "packetised", "worst-case-delay", "hold-last", "zero-on-loss", "pid"]
+Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
+Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
+Overrides = tuple[str, ...]
+
+
+class ControllerSpec(Section, frozen=True, kw_only=True):
+    """One controller."""
+
+    name: Name
+    kind: Annotated[Kind, Meta(description="what it is")]
+    set: Annotated[
+        Overrides, Meta(description="overrides of the configuration that it is designed from: what it believes")
+    ] = ()
+    link: Annotated[
+        str, Meta(description="the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
+    ] = TRUE
+
+
+class LinkSpec(Section, frozen=True, kw_only=True):
+    """One link."""
+
+    name: Name
+    set: Annotated[Overrides, Meta(description="overrides of the configuration's [link]")] = ()
+
+
+class DisturbanceSpec(Section, frozen=True, kw_only=True):
+    """One disturbance: a transform of the same standard normal draws."""
+
+    name: Name
+    kind: Annotated[
+        Shape,
+        Meta(
+            description="`gaussian`; `uniform`; `heavy`: Student's t with 4 degrees; `gusts`: each step keeps `memory` "
+            "of the last one's. All have the plant's covariance W, times scale²"
+        ),
+    ] = "gaussian"
+    scale: Annotated[float, Meta(ge=0, description="factor of W's standard deviations")] = 1.0
+    bias: Annotated[float, Meta(description="constant that is added, in standard deviations of W")] = 0.0
+    memory: Annotated[float, Meta(ge=0, lt=1, description="with `gusts`: correlation of a step with the next")] = 0.0
+
+
+class PlantSpec(Section, frozen=True, kw_only=True):
+    """One plant that is flown; the controllers go on believing in the configuration's."""
+
+    name: Name
+    set: Annotated[Overrides, Meta(description="overrides of the configuration's [plant]")] = ()
+
+
+class TuningSpec(Section, frozen=True, kw_only=True):
+    """What a user would set otherwise for some controllers on the links that they believe in."""
+
+    controllers: Annotated[tuple[str, ...], Meta(min_length=1, description="names of [[controller]]s")]
+    links: Annotated[tuple[str, ...], Meta(min_length=1, description="names of [[link]]s that they believe in")]
+    set: Annotated[Overrides, Meta(min_length=1, description="overrides of the design; they win over the controller's")]
+
+
+class CampaignSpec(Section, frozen=True, kw_only=True):
+    """A campaign: every controller on every link in every disturbance with every plant, each for the same runs."""
+
+    name: Annotated[
+        str,
+        Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", description="name of the campaign; part of its folder's name"),
+    ]
+    config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
+    set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
+    steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
+    runs: Annotated[int, Meta(ge=1, le=10_000_000, description="runs of each cell")] = 1000
+    master: Annotated[int, Meta(ge=0, description="seed: run i's draws come from (master, i), in every cell")] = 0
+    start: Annotated[Floats, Meta(description="state (n_x) in which every run starts; else sim.start_*")] = ()
+    start_box: Annotated[
+        Rows, Meta(description="[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box")
+    ] = ()
+    controller: Annotated[tuple[ControllerSpec, ...], Meta(description="controllers")]
+    link: Annotated[tuple[LinkSpec, ...], Meta(description="links")] = (LinkSpec(name="as configured"),)
+    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(description="disturbances")] = (
+        DisturbanceSpec(name="gaussian"),
+    )
+    plant: Annotated[tuple[PlantSpec, ...], Meta(description="plants")] = (PlantSpec(name="as modelled"),)
+    tuning: Annotated[tuple[TuningSpec, ...], Meta(description="settings of controllers on some links")] = ()

@@ -1,0 +1,196 @@
+"""`uavctl campaign`: many flights of many controllers on the same noise and the same losses."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter, validators
+from rich.console import Group, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from uavctl.errors import UsageError
+
+try:
+    import pyarrow  # noqa: F401 everything below needs it
+except ImportError as missing:
+    raise UsageError("campaigns are kept by pyarrow, which is not there; install uavctl[campaign]") from missing
+
+from uavctl.campaign.cells import cells_of, document
+from uavctl.campaign.page import write_report
+from uavctl.campaign.pool import Crew, cluster, processes
+from uavctl.campaign.read import read_campaign
+from uavctl.campaign.run import fly_tasks
+from uavctl.campaign.statistics import CellSummary, summarise
+from uavctl.campaign.store import Store
+from uavctl.campaign.tasks import Columns, Task, tasks_of
+from uavctl.cli import refly_cmd
+from uavctl.cli.common import Common, messages
+from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.prepare import ready_library
+
+_NAMES = ("controller", "link", "disturbance", "plant")
+
+
+class CampaignResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a campaign came to."""
+
+    name: str
+    runs_file: str
+    report: str
+    wall_s: float
+    cells: list[CellSummary]
+
+
+def campaign(
+    spec: Annotated[Path, Parameter(help="TOML file of the campaign; with --refly its folder", show_default=False)],
+    *,
+    runs: Annotated[
+        int | None, Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1))
+    ] = None,
+    workers: Annotated[
+        int | None,
+        Parameter(help="processes that fly; else one for each processor", validator=validators.Number(gte=1)),
+    ] = None,
+    dask: Annotated[str | None, Parameter(help="fly on the workers of the Dask scheduler at this address")] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the results; else a new one below flights/")] = None,
+    resume: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
+    ] = False,
+    refly: Annotated[
+        str | None,
+        Parameter(metavar="CELL:RUN", help="fly one run of a campaign once more, into a recording in --out"),
+    ] = None,
+    json: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
+    ] = False,
+) -> int:
+    """Fly a grid of controllers, links, disturbances and plants, each on the same noise and the same losses.
+
+    The results do not depend on the number of workers, nor on where they are. Every finished task is kept at once: a
+    campaign that was interrupted or killed goes on with --resume.
+    """
+    if refly is not None and (resume or (runs, workers, dask) != (None, None, None)):
+        raise UsageError("--refly flies one run by itself; it goes with --out and --json only")
+    if dask is not None and workers is not None:
+        raise UsageError("--workers are this machine's, --dask has its own; give one of them")
+    if resume and out is None:
+        raise UsageError("--resume: give the campaign's folder with --out")
+    if refly is not None:
+        flight = refly_cmd.refly(spec, refly, out)
+        Common(json=json).show(flight, lambda: refly_cmd.picture(flight))
+        return 0 if flight.summary.steps else 1
+    read, text = read_campaign(spec, runs)
+    begun = time.perf_counter()
+    cells = cells_of(read, ready_library)
+    store = Store(out or _new_folder(read.spec.name))
+    tasks = list(tasks_of(cells))
+    with store.opened(document(read, cells), text, resume):
+        done = store.complete() or _fly(store, tasks, _crew(dask, workers))
+        if not done:
+            left = len(tasks) - len(store.kept(tasks))
+            _tell(f"interrupted; {left} of {len(tasks)} tasks are left. To go on:\n{_again(spec, runs, store.folder)}")
+            return 1
+        runs_file = store.finish(tasks)
+        _tell("writing the page")
+        report = write_report(store.folder)
+    result = CampaignResult(
+        name=read.spec.name,
+        runs_file=str(runs_file),
+        report=str(report),
+        wall_s=time.perf_counter() - begun,
+        cells=summarise(store.folder),
+    )
+    Common(json=json).show(result, lambda: _picture(result))
+    return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
+
+
+def _new_folder(name: str) -> Path:
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
+    return Path("flights") / f"{stamp}-{name.replace(' ', '-')}"
+
+
+def _crew(dask: str | None, workers: int | None) -> AbstractContextManager[Crew]:
+    return processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
+
+
+def _fly(store: Store, tasks: list[Task], crew: AbstractContextManager[Crew]) -> bool:
+    """Fly the tasks that are not there; False if it was interrupted."""
+    kept = store.kept(tasks)
+    left = [task for task in tasks if task.name not in kept]
+    if not left:
+        return True
+    with stop_on_signals() as stopped, crew as flying, _progress(tasks, kept) as advance:
+
+        def keep(task: Task, columns: Columns) -> None:
+            store.keep(task, columns)
+            advance(task)
+
+        fly_tasks(left, flying, keep, stopped)
+    return len(store.kept(tasks)) == len(tasks)
+
+
+@contextmanager
+def _progress(tasks: list[Task], kept: set[str]) -> Iterator[Callable[[Task], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    left = (TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, *left, console=messages(), transient=True) as progress:
+        there = sum(task.runs for task in tasks if task.name in kept)
+        bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=there)
+        yield lambda task: progress.update(bar, advance=task.runs)
+
+
+def _again(spec: Path, runs: int | None, folder: Path) -> str:
+    """The command that goes on."""
+    number = () if runs is None else ("--runs", str(runs))
+    return shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(folder), "--resume"])
+
+
+def _tell(text: str) -> None:
+    messages().print(escape(text), soft_wrap=True)
+
+
+def _picture(result: CampaignResult) -> RenderableType:
+    # What is the same in all cells needs no column.
+    lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
+    table = Table(title=f"Campaign {result.name}", title_justify="left")
+    for heading in (*lists, "runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest"):
+        table.add_column(heading, justify="left" if heading in lists else "right")
+    for cell in result.cells:
+        names = [escape(getattr(cell, name)) for name in lists]
+        if cell.refused:
+            table.add_row(*names, "refused")
+            continue
+        figures = (
+            _percent(cell.violation_rate, cell.violation_ci),
+            _percent(cell.run_violation_rate, cell.run_violation_ci),
+            _cost(cell.cost, cell.cost_ci),
+        )
+        table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
+    refusals = dict.fromkeys(f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused)
+    told = [f"Refused: {escape(text)}" for text in refusals]
+    note = (
+        "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
+    )
+    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
+    return Group(table, *told, note, files)
+
+
+def _percent(rate: float | None, interval: tuple[float, float] | None) -> str:
+    if rate is None or interval is None:
+        return "-"
+    low, high = (f"{100 * side:.3g}" for side in interval)
+    return f"{100 * rate:.3g} ({low}–{high})"
+
+
+def _cost(mean: float | None, interval: tuple[float, float] | None) -> str:
+    return "-" if mean is None or interval is None else f"{mean:.6g} ± {(interval[1] - interval[0]) / 2:.2g}"

@@ -1,0 +1,88 @@
+"""Typed messages to MAVLink bytes; what a vehicle must not get is refused.
+
+Message definitions: https://mavlink.io/en/messages/common.html.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.data import Setpoint
+
+BOOT_MS_WRAP = 2**32  # time_boot_ms is unsigned, 32 bits: 49.7 days
+ACCEL_ONLY = 0x0C3F  # type_mask 3135: acceleration used; position, velocity, yaw and yaw rate ignored
+ACCEL_AND_YAW = 0x083F  # type_mask 2111: yaw is used too
+_ABSURD_ACCEL_MPS2 = 1e3
+_INT64 = 2**63
+
+
+class UnsendableError(ValueError):
+    """A message must not be sent as it is; a NaN, for one, aborts ArduPilot."""
+
+
+class Encoder:
+    """Messages to frames, numbered modulo 256 as one sequence.
+
+    `MAVLink.pack` leaves the number alone, so the encoder counts.
+    """
+
+    def __init__(self, system_id: int, component_id: int) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT of an onboard controller."""
+        return self._pack(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+            )
+        )
+
+    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+        """TIMESYNC: request with tc1 = 0, answer with our time in tc1 and the request's ts1.
+
+        Raises:
+            UnsendableError: a time is not a signed 64-bit number.
+        """
+        if not all(-_INT64 <= value < _INT64 for value in (tc1_ns, ts1_ns)):
+            raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
+        return self._pack(mavlink.MAVLink_timesync_message(tc1_ns, ts1_ns))
+
+    def setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
+        """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
+
+        Raises:
+            UnsendableError: a value is not finite, or absurd.
+        """
+        yaw = setpoint.yaw_rad
+        sane = all(abs(value) <= _ABSURD_ACCEL_MPS2 for value in setpoint.accel_mps2)  # NaN is not
+        if not sane or not math.isfinite(yaw or 0.0):
+            raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
+        return self._pack(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                setpoint.at_ns // 1_000_000 % BOOT_MS_WRAP,
+                target_system,
+                target_component,
+                mavlink.MAV_FRAME_LOCAL_NED,
+                ACCEL_ONLY if yaw is None else ACCEL_AND_YAW,
+                *(0.0, 0.0, 0.0),
+                *(0.0, 0.0, 0.0),
+                *setpoint.accel_mps2,
+                yaw or 0.0,
+                0.0,
+            )
+        )
+
+    def land(self, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_NAV_LAND: land where it is."""
+        return self._pack(
+            mavlink.MAVLink_command_long_message(
+                target_system, target_component, mavlink.MAV_CMD_NAV_LAND, 0, *(0.0,) * 7
+            )
+        )
+
+    def _pack(self, message: mavlink.MAVLink_message) -> bytes:
+        data = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
