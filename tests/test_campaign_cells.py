@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, read, table
 
-from uavctl.campaign.cells import cell_of, cells_of, document
+from uavctl.campaign.cells import cell_of, cells_of, document, told
 from uavctl.campaign.chance import draw
 from uavctl.campaign.controllers import TUNING_FIRST, build, built
 from uavctl.campaign.links import newest
@@ -17,7 +17,7 @@ from uavctl.campaign.tasks import CHUNK, tasks_of
 from uavctl.campaign.world import fly
 from uavctl.cli.prepare import ready_library
 from uavctl.config import load_config
-from uavctl.smpc.baselines import Lqg, WorstCaseDelay
+from uavctl.smpc.baselines import Lqg, PacketisedPredictive, WorstCaseDelay
 from uavctl.smpc.batch_smpc import BatchSmpc
 from uavctl.smpc.risk import kappa
 
@@ -64,11 +64,11 @@ def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
     assert [bool(cell.refused) for cell in found] == [False, True, False, False]
     assert found[1].refused.startswith("smpc.delta_x: 0.95 is out of reach") and found[1].recipe is None
     assert {task.cell for task in tasks_of(found)} == {0, 2, 3}
-    told = document(campaign, found)["cells"]
-    assert isinstance(told, list)
-    assert told[1]["refused"] == found[1].refused and told[1]["design_id"] is None
-    assert told[0]["promised_x"] == pytest.approx(0.05) and told[0]["link_loss"] == 0.3
-    assert told[2]["promised_x"] is None and told[2]["kind"] == "lqg"
+    kept = document(campaign, found)["cells"]
+    assert isinstance(kept, list)
+    assert kept[1]["refused"] == found[1].refused and kept[1]["design_id"] is None
+    assert kept[0]["promised_x"] == pytest.approx(0.05) and kept[0]["link_loss"] == 0.3
+    assert kept[2]["promised_x"] is None and kept[2]["kind"] == "lqg"
     again = cell_of(campaign, 0, ready_library)
     assert again.recipe is not None and found[0].recipe is not None and again.recipe.key == found[0].recipe.key
 
@@ -122,6 +122,10 @@ def test_every_kind_of_controller_flies(tmp_path: Path) -> None:
     recipes = [cell.recipe for cell in found if cell.recipe is not None]
     assert isinstance(build(recipes[0]), BatchSmpc) and isinstance(build(recipes[1]), Lqg)
     assert recipes[6].gains is not None
+    assert told(found[6])["gains"] == {
+        name: getattr(recipes[6].gains, name).tolist()
+        for name in ("position_1ps", "velocity_1ps", "integral_1ps2", "derivative", "speed")
+    }
     assert built(recipes[1]) is built(recipes[1])
     assert built(recipes[2]) is not built(recipes[1])
 
@@ -135,6 +139,19 @@ def test_the_worst_case_delay_is_tau_with_the_promised_likelihoods(tmp_path: Pat
     meets = met(found.setting, 0, 5)
     one, other = (fly(meets.scene, each, meets.newest, meets.disturbances) for each in (own, expected))
     np.testing.assert_array_equal(one.inputs, other.inputs)
+
+
+def test_a_margin_goes_to_the_plans_that_it_is_for(tmp_path: Path) -> None:
+    found = cells(
+        tmp_path, controller("packetised"), controller("packetised", "margin = 3.0").replace('d"\n', 'd2"\n', 1)
+    )
+    meets = met(found[0].setting, 0, 5)
+    without, own = (
+        fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances) for cell in found if cell.recipe
+    )
+    expected = PacketisedPredictive(problem_of(load_config("paper")), 3.0)
+    np.testing.assert_array_equal(own.inputs, fly(meets.scene, expected, meets.newest, meets.disturbances).inputs)
+    assert np.abs(own.inputs - without.inputs).max() > 0.1
 
 
 def test_tasks_are_fixed_chunks_and_tuning_runs_are_nobody_s(tmp_path: Path) -> None:

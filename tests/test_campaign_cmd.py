@@ -18,6 +18,7 @@ from campaign_rig import HEAD, controller, table
 from distributed import LocalCluster
 
 from uavctl.campaign.tasks import CHUNK
+from uavctl.cli import campaign_cmd
 from uavctl.cli.app import run
 
 LIMIT_S = 120.0
@@ -131,6 +132,17 @@ def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> No
     assert process.returncode == 1 and "interrupted" in told and "Traceback" not in told
     assert told.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
     assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
+
+
+def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
+    spec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(campaign_cmd, "cells_of", interrupted)
+    assert run(["campaign", str(spec), "--out", str(tmp_path / "none")]) == 1
+    assert "interrupted before the first run" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 def test_another_campaign_does_not_go_on(spec: Path, flown: Path, capsys: pytest.CaptureFixture[str]) -> None:

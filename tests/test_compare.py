@@ -12,8 +12,8 @@ import pytest
 from design_rig import spec
 from numpy.typing import NDArray
 
+from uavctl.build import start_state
 from uavctl.cli.app import run
-from uavctl.cli.compare_cmd import start_state
 from uavctl.compare import compare_gains, seeded_states
 from uavctl.config import load
 from uavctl.smpc.design import make_design

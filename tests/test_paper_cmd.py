@@ -12,6 +12,7 @@ import pytest
 from uavctl.cli import paper_cmd
 from uavctl.cli.app import run as command
 from uavctl.paper import depth as deep
+from uavctl.paper import run
 from uavctl.paper.result import Complexity, Depth, DesignTried
 
 WANTED = {
@@ -60,6 +61,14 @@ def test_both_designs_meet_the_same_losses(tmp_path: Path, capsys: pytest.Captur
     assert four["age_distribution"] == three["age_distribution"]
     assert four["mean_cost"] != three["mean_cost"]
     assert four["mean_cost"] == pytest.approx(three["mean_cost"], rel=0.01)
+
+
+def test_the_document_of_several_chunks_is_plain_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "CHUNK", 2)
+    assert command(["paper", "--runs", "5", "--steps", "8", "--tau", "4", "--json", "--out", str(tmp_path)]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"] == 5
 
 
 def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

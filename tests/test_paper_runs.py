@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.build import build_design, build_plant
+from uavctl.build import build_design, build_plant, start_state
 from uavctl.campaign.chance import draw
 from uavctl.campaign.links import newest
 from uavctl.campaign.world import Flown, Scene, fly
@@ -16,7 +16,7 @@ from uavctl.library_store import library_for
 from uavctl.paper import run
 from uavctl.paper.assess import age_distribution, assess
 from uavctl.paper.claims import claims_of
-from uavctl.paper.flights import Chunk, Pilot, Setup, Watched, start_state
+from uavctl.paper.flights import Chunk, Pilot, Setup, Watched
 from uavctl.paper.result import Claim, VariantResult
 from uavctl.paper.run import fly_all
 from uavctl.paper.totals import Moments, in_ellipsoid, together, total

@@ -24,7 +24,7 @@ from uavctl.smpc.innovation import innovations
 from uavctl.smpc.late import with_late
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.plant import Plant, drag_lag
+from uavctl.smpc.plant import AXES, Plant, drag_lag
 from uavctl.smpc.sets import Polytope
 
 NANOSECONDS = 1e9
@@ -53,6 +53,14 @@ def build_plant(config: Config) -> Plant:
         velocity_index=plant.velocity_index,
         accel_per_input=accel,
     )
+
+
+def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
+    """State (n_x,) in which the simulator starts."""
+    state = plant.equilibrium(config.sim.start_position_m)
+    for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
+        state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
+    return state
 
 
 def build_spec(config: Config) -> DesignSpec:

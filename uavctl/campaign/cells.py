@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 
 import msgspec
@@ -13,6 +13,7 @@ from uavctl.campaign.controllers import LibraryFor, Recipe, recipe_for
 from uavctl.campaign.setting import Setting, met
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
+from uavctl.smpc.baselines import PidGains
 
 VERSION = 1
 
@@ -72,7 +73,7 @@ def _product(campaign: Campaign) -> list[Which]:
 def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
     """The recipe of a controller for the link that it believes in, or why there is none."""
     try:
-        return recipe_for(campaign.spec.controller[key[0]].kind, campaign.believed[key], campaign.spec, library_for)
+        return recipe_for(campaign.spec.controller[key[0]], campaign.believed[key], campaign.spec, library_for)
     except DesignError as error:
         return str(error)
 
@@ -125,9 +126,14 @@ def told(cell: Cell) -> dict[str, object]:
         "library_id": None if recipe is None else recipe.library_id,
         "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
         "promised_u": None if smpc is None else 1.0 - smpc.delta_u,
+        "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
         "link_loss": _plain_loss(cell.setting.link),
         "refused": cell.refused,
     }
+
+
+def _gains(gains: PidGains) -> dict[str, list[float]]:
+    return {field.name: getattr(gains, field.name).tolist() for field in fields(gains)}
 
 
 def _plain_loss(link: LinkConfig) -> float | None:

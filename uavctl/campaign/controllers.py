@@ -12,7 +12,7 @@ import numpy as np
 
 from uavctl.build import build_design, build_plant, build_solver
 from uavctl.campaign.setting import Setting, met, problem_of, start_of
-from uavctl.campaign.spec import CampaignSpec, DisturbanceSpec, Kind
+from uavctl.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
 from uavctl.config import Config
 from uavctl.library_bytes import StoredLibrary, decode
 from uavctl.smpc.answer import Solver
@@ -51,6 +51,7 @@ class Recipe:
         library: Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`.
         library_id: The library's hash.
         gains: The gains of a PID.
+        margin: Of an MPC without back-offs, see `ControllerSpec`.
     """
 
     key: str
@@ -60,13 +61,14 @@ class Recipe:
     library: bytes | None = None
     library_id: str | None = None
     gains: PidGains | None = None
+    margin: float = 0.0
 
 
-def recipe_for(kind: Kind, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
+def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
     """Make design, library and gains: what takes its time, or depends on chance.
 
     Args:
-        kind: What it is.
+        given: What is asked for.
         config: The configuration that it believes in.
         spec: The campaign.
         library_for: Gives the policy library of a design.
@@ -74,18 +76,18 @@ def recipe_for(kind: Kind, config: Config, spec: CampaignSpec, library_for: Libr
     Raises:
         DesignError: There is no such controller.
     """
-    made = Recipe("", kind, config)
-    if kind == "smpc":
+    made = Recipe("", given.kind, config, margin=given.margin)
+    if given.kind == "smpc":
         design = build_design(config)
         stored = library_for(config, design)
         if stored is None:
             made = replace(made, design=design)
         else:
             made = replace(made, design=design, library=stored.data, library_id=stored.library_id)
-    elif kind == "pid":
+    elif given.kind == "pid":
         made = replace(made, gains=_tuned(config, spec))
     made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
-    if kind != "smpc":
+    if given.kind != "smpc":
         build(made)  # a baseline is refused here, not in a worker
     return made
 
@@ -103,11 +105,11 @@ def build(recipe: Recipe) -> BatchController:
     if recipe.kind == "lqg":
         return Lqg(problem)
     if recipe.kind == "packetised":
-        return PacketisedPredictive(problem)
+        return PacketisedPredictive(problem, recipe.margin)
     if recipe.kind == "hold-last":
-        return HoldLast(problem)
+        return HoldLast(problem, recipe.margin)
     if recipe.kind == "zero-on-loss":
-        return ZeroOnLoss(problem)
+        return ZeroOnLoss(problem, recipe.margin)
     if recipe.kind == "worst-case-delay":
         plant, allocation = problem.plant, config.risk.allocation
         kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)

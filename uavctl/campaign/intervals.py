@@ -10,8 +10,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
-from scipy.stats import beta
+from scipy.special import betaincinv, ndtri
 
 from uavctl.errors import UsageError
 
@@ -56,8 +55,8 @@ def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Pair:
     if not 0 <= hits <= trials or trials == 0:
         raise UsageError(f"{hits} of {trials} is no share; count at least one trial, and no more hits than trials")
     tail = 0.5 * (1.0 - level)
-    low = 0.0 if hits == 0 else float(beta.ppf(tail, hits, trials - hits + 1))
-    high = 1.0 if hits == trials else float(beta.ppf(1.0 - tail, hits + 1, trials - hits))
+    low = 0.0 if hits == 0 else float(betaincinv(hits, trials - hits + 1, tail))
+    high = 1.0 if hits == trials else float(betaincinv(hits + 1, trials - hits, 1.0 - tail))
     return low, high
 
 

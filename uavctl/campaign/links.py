@@ -17,7 +17,9 @@ _ROUNDING = 1e-9
 def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
     """Capture step of the newest position that is known at the beginning of each step.
 
-    One position is captured a step, at its beginning; the first one is known at once, as in the paper.
+    One position is captured a step; the first one is known at once, as in the paper. As in the design, the age counts
+    whole steps: where every delay is below Δt, a position is known in its own step; else one that is under way for
+    up to i Δt is known i steps later.
 
     Args:
         link: The link; losses of every model, delay, jitter and blackouts act.
@@ -30,7 +32,8 @@ def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
     steps = chances.shape[1] - 1
     lost = _lost(link, dt_s, chances[:, :steps])
     under_way_s = link.delay_s + link.jitter_s * chances[:, :steps, 2]
-    late = np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
+    within = link.delay_s + link.jitter_s < dt_s
+    late = np.zeros(lost.shape, np.intp) if within else np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
     captured = np.arange(steps)
     known = np.where(lost, steps, captured + late)  # the step that knows it first
     known[:, 0] = 0

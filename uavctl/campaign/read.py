@@ -14,9 +14,7 @@ from uavctl.campaign.spec import TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
 from uavctl.config.checks import dimensions
 from uavctl.config.index import key_lines
-from uavctl.config.load import _decode as decode
-from uavctl.config.load import _nearest as nearest
-from uavctl.config.load import _parse_toml as parse_toml
+from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
 from uavctl.config.problem import Problem
 from uavctl.errors import ConfigError
@@ -90,7 +88,7 @@ def _names(spec: CampaignSpec) -> Iterator[Problem]:
 
 def _known(key: str, name: str, names: Sequence[str], what: str) -> Iterator[Problem]:
     if name not in names:
-        yield Problem(key, f'there is no {what} "{name}"{nearest(name, names)}', f"give one of {', '.join(names)}")
+        yield Problem(key, f'there is no {what} "{name}"{find_nearest(name, names)}', f"give one of {', '.join(names)}")
 
 
 def _starts(spec: CampaignSpec, base: Config) -> Iterator[Problem]:

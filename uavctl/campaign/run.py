@@ -58,6 +58,8 @@ def _fly_alone(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[
         future = crew.submit(task)
         wait([future])
         if not _kept(future, task, crew, keep):
+            if stopped():
+                return  # who asked for the end may have ended the worker too
             keep(task, lost(task, "the worker died, twice"))
             crew.renew()
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_plant
+from uavctl.build import build_plant, start_state
 from uavctl.campaign.chance import draw
 from uavctl.campaign.disturbances import disturbances
 from uavctl.campaign.links import newest
@@ -20,7 +20,6 @@ from uavctl.config.types import PlantConfig
 from uavctl.smpc.baselines import Problem
 from uavctl.smpc.batch import Counts
 from uavctl.smpc.equilibria import equilibria
-from uavctl.smpc.plant import AXES
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -119,11 +118,7 @@ def start_of(spec: CampaignSpec, base: Config) -> Array:
     if spec.start_box:
         middle: Array = np.array(spec.start_box, dtype=np.float64).mean(axis=0)
         return middle
-    plant, sim = build_plant(base), base.sim
-    state: Array = plant.equilibrium(sim.start_position_m)
-    for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
-        state[index] = sim.start_velocity_mps[AXES.index(axis)]
-    return state
+    return start_state(base, build_plant(base))
 
 
 def _starts(setting: Setting, first: int, runs: int) -> Array:

@@ -30,6 +30,14 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
     link: Annotated[
         str, Meta(description="the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
     ] = TRUE
+    margin: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, "
+            "in standard deviations of one step's disturbance",
+        ),
+    ] = 0.0
 
 
 class LinkSpec(Section, frozen=True, kw_only=True):

@@ -82,6 +82,21 @@ class Store:
                 self._parts.mkdir(exist_ok=True)
             yield
 
+    def begun(self) -> bool:
+        """Whether there is a campaign that can go on."""
+        return (self.folder / DOCUMENT).exists()
+
+    def check(self, resume: bool) -> None:
+        """See that there is a campaign if one is to go on, and none if not.
+
+        Raises:
+            UsageError: It is the other way round.
+        """
+        if self.begun() and not resume:
+            raise UsageError(f"{self.folder} holds a campaign; go on with it by --resume, or choose another folder")
+        if resume and not self.begun():
+            raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
+
     def complete(self) -> bool:
         """Whether all runs are in the table."""
         return (self.folder / RUNS).exists()
@@ -140,13 +155,8 @@ class Store:
             raise UavctlError(f"{self._part(task)} is damaged ({error}); remove it and go on with --resume") from error
 
     def _begin(self, document: Mapping[str, object], specification: str, resume: bool) -> None:
+        self.check(resume)
         path = self.folder / DOCUMENT
-        if path.exists() != resume:
-            raise UsageError(
-                f"{self.folder} holds no campaign that could go on; leave out --resume"
-                if resume
-                else f"{self.folder} holds a campaign; go on with it by --resume, or choose another folder"
-            )
         if resume:
             there = msgspec.json.decode(path.read_bytes())
             here = msgspec.json.decode(msgspec.json.encode(document))

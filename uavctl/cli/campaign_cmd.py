@@ -91,18 +91,20 @@ def campaign(
         return 0 if flight.summary.steps else 1
     read, text = read_campaign(spec, runs)
     begun = time.perf_counter()
-    cells = cells_of(read, ready_library)
     store = Store(out or _new_folder(read.spec.name))
-    tasks = list(tasks_of(cells))
-    with store.opened(document(read, cells), text, resume):
-        done = store.complete() or _fly(store, tasks, _crew(dask, workers))
-        if not done:
-            left = len(tasks) - len(store.kept(tasks))
-            _tell(f"interrupted; {left} of {len(tasks)} tasks are left. To go on:\n{_again(spec, runs, store.folder)}")
-            return 1
-        runs_file = store.finish(tasks)
-        _tell("writing the page")
-        report = write_report(store.folder)
+    store.check(resume)  # the designs may take minutes
+    try:
+        cells = cells_of(read, ready_library)
+        tasks = list(tasks_of(cells))
+        with store.opened(document(read, cells), text, resume):
+            if not store.complete() and not _fly(store, tasks, _crew(dask, workers)):
+                raise KeyboardInterrupt
+            runs_file = store.finish(tasks)
+            _tell("writing the page")
+            report = write_report(store.folder)
+    except KeyboardInterrupt:
+        _tell(_interrupted(store, spec, runs))
+        return 1
     result = CampaignResult(
         name=read.spec.name,
         runs_file=str(runs_file),
@@ -149,10 +151,13 @@ def _progress(tasks: list[Task], kept: set[str]) -> Iterator[Callable[[Task], No
         yield lambda task: progress.update(bar, advance=task.runs)
 
 
-def _again(spec: Path, runs: int | None, folder: Path) -> str:
-    """The command that goes on."""
+def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
+    """What is there after an interruption, and how to go on."""
+    if not store.begun():
+        return "interrupted before the first run; policy libraries that were finished are kept"
     number = () if runs is None else ("--runs", str(runs))
-    return shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(folder), "--resume"])
+    again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])
+    return f"interrupted; the runs that were finished are kept. To go on:\n{again}"
 
 
 def _tell(text: str) -> None:

@@ -7,14 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from uavctl.build import build_spec
+from uavctl.build import build_spec, start_state
 from uavctl.cli.common import Common, located, messages
 from uavctl.compare import (
     RISK_OPTIONS,
@@ -25,8 +23,6 @@ from uavctl.compare import (
     compare_gains,
     compare_risk,
 )
-from uavctl.config import Config
-from uavctl.smpc.plant import AXES, Plant
 
 SEED = 0
 
@@ -55,14 +51,6 @@ def risk(common: Common, states: int) -> int:
     document = {**msgspec.to_builtins(found), "wall_s": time.perf_counter() - begin}
     common.show(document, lambda: _risk_picture(found, loaded.config.name))
     return 0
-
-
-def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
-    """State (n_x,) in which the simulator starts."""
-    state = plant.equilibrium(config.sim.start_position_m)
-    for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
-        state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
-    return state
 
 
 @contextmanager

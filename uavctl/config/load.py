@@ -76,13 +76,13 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     Raises:
         ConfigError: With all problems found.
     """
-    table = _parse_toml(text, file)
+    table = parse_toml(text, file)
     problems: list[str] = []
     applied = tuple(_override(table, override, problems) for override in overrides)
     source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
     found: list[Problem] = []
     sections: dict[str, Decoded] = {}
-    config = _decode(Config, table, "", found, sections)
+    config = decode(Config, table, "", found, sections)
     mission = sections.get("mission", MissionConfig())
     if isinstance(mission, MissionConfig):
         mission, places = read_samples(mission, Path(file).parent, found)
@@ -104,7 +104,8 @@ def explain(source: Source, error: DesignError) -> str:
     return source.tell(Problem(error.key, error.reason, error.hint))
 
 
-def _nearest(name: str, names: Sequence[str]) -> str:
+def find_nearest(name: str, names: Sequence[str]) -> str:
+    """A hint at the name that was meant, to be put after a wrong one; empty if none is close."""
     match = difflib.get_close_matches(name, names, n=1)
     return f' (nearest valid name "{match[0]}")' if match else ""
 
@@ -119,7 +120,7 @@ def _read(name_or_path: str) -> tuple[str, str]:
         known = presets()
         raise ConfigError(
             (
-                f"{name_or_path}: no such file or preset{_nearest(name_or_path, known)}; "
+                f"{name_or_path}: no such file or preset{find_nearest(name_or_path, known)}; "
                 f"give a TOML file, or a preset: {', '.join(known)}",
             )
         ) from error
@@ -129,7 +130,12 @@ def _read(name_or_path: str) -> tuple[str, str]:
         raise ConfigError((f"{name_or_path}: is not UTF-8 text; save it as UTF-8",)) from error
 
 
-def _parse_toml(text: str, file: str) -> dict[str, Any]:
+def parse_toml(text: str, file: str) -> dict[str, Any]:
+    """The table of a TOML text.
+
+    Raises:
+        ConfigError: It is no TOML; file and line are named.
+    """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -166,7 +172,7 @@ def _override_value(text: str) -> object:
     return parsed["value"] if len(parsed) == 1 else text
 
 
-def _decode(
+def decode(
     section: type[Section], table: Mapping[str, Any], path: str, found: list[Problem], sections: dict[str, Decoded]
 ) -> Section | None:
     """Decode one table; its problems go to `found`, whole first-level sections to `sections`."""
@@ -191,7 +197,7 @@ def _decode(
             else:
                 found.append(wrong)
         elif isinstance(value, dict):
-            inner = _decode(field.type, value, f"{key}.", found, sections)
+            inner = decode(field.type, value, f"{key}.", found, sections)
             if inner is not None:
                 values[name] = sections[key] = inner
         else:
@@ -203,13 +209,13 @@ def _decode(
 def _decode_element(section: type[Section], value: object, path: str, found: list[Problem]) -> Section | None:
     """Decode one table of a list."""
     if isinstance(value, dict):
-        return _decode(section, value, f"{path}.", found, {})
+        return decode(section, value, f"{path}.", found, {})
     found.append(Problem(path, f"expected a table, got {_short(value)}", "write [[…]] and its keys below"))
     return None
 
 
 def _unknown(path: str, key: str, names: Sequence[str], table: str) -> Problem:
-    nearest = _nearest(key, names)
+    nearest = find_nearest(key, names)
     where = f"[{table[:-1]}]" if table else "the top level"
     return Problem(
         path,
@@ -245,7 +251,7 @@ def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
 
 def _reason(message: str, got: object, field: FieldInfo) -> str:
     if message.startswith("Invalid enum value"):
-        return f"{_short(got)} is not a choice{_nearest(str(got), _choices(field.type))}"
+        return f"{_short(got)} is not a choice{find_nearest(str(got), _choices(field.type))}"
     for word, text in _WORDS.items():
         message = message.replace(word, text)
     wanted = message.partition(", got ")[0]

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from uavctl.bench.growth import copies, few_policies
 from uavctl.bench.timing import Case, median, timed
-from uavctl.build import build_design, build_spec
+from uavctl.build import build_design, build_spec, start_state
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError
-from uavctl.paper.flights import start_state
 from uavctl.paper.optimum import least_settled_cost
 from uavctl.paper.result import Complexity, Depth, DesignTried
 from uavctl.paper.variants import PRESET, PRINTED

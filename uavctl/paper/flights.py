@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_plant
+from uavctl.build import build_plant, start_state
 from uavctl.campaign.chance import draw
 from uavctl.campaign.links import newest
 from uavctl.campaign.setting import problem_of
@@ -20,7 +20,7 @@ from uavctl.smpc.design import Design
 from uavctl.smpc.explicit import ExplicitDecider
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.plant import AXES, Plant
+from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -144,14 +144,6 @@ def fly_runs(
     )
     disturbances = chances.normal @ np.linalg.cholesky(plant.w).T
     return fly(scene, controller, newest(config.link, config.plant.dt_s, chances.link), disturbances)
-
-
-def start_state(config: Config, plant: Plant) -> Array:
-    """x_0 (n_x,)."""
-    state = plant.equilibrium(config.sim.start_position_m)
-    for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
-        state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
-    return state
 
 
 def planes(plant: Plant) -> Sequence[tuple[int, int]]:

@@ -98,7 +98,9 @@ class Totals:
     def __add__(self, other: Totals) -> Totals:
         def joined(name: str) -> Any:
             one, more = getattr(self, name), getattr(other, name)
-            return np.maximum(one, more) if name in _EXTREMES else one + more
+            if name in _EXTREMES:
+                return np.maximum(one, more) if isinstance(one, np.ndarray) else max(one, more)
+            return one + more
 
         return Totals(**{field.name: joined(field.name) for field in fields(self)})
 

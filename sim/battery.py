@@ -1,0 +1,55 @@
+"""The battery: charge, voltage under load, and the rotor speed that the voltage allows."""
+
+from __future__ import annotations
+
+import math
+
+from sim.airframe import Airframe
+
+EMPTY_V = 3.0  # where the Crazyflie's firmware counts the battery as empty
+
+
+class Battery:
+    """A voltage source that sinks with the charge used, behind a resistance, feeding a load of given power.
+
+    Attributes:
+        voltage_v: at the terminals, under the last load.
+        current_a: of the last load.
+        used_c: charge used.
+    """
+
+    def __init__(self, airframe: Airframe, *, charge: float = 1.0) -> None:
+        self._airframe = airframe
+        self.used_c = (1.0 - charge) * airframe.capacity_c
+        self.current_a = 0.0
+        self.voltage_v = self.open_circuit_v
+
+    @property
+    def remaining(self) -> float:
+        """Charge left, 0 to 1."""
+        return max(1.0 - self.used_c / self._airframe.capacity_c, 0.0)
+
+    @property
+    def open_circuit_v(self) -> float:
+        """Voltage without load, linear between the tenths of the table."""
+        table = self._airframe.open_circuit_v
+        place = self.remaining * (len(table) - 1)
+        low = min(int(place), len(table) - 2)
+        return table[low] + (place - low) * (table[low + 1] - table[low])
+
+    @property
+    def largest_rps(self) -> float:
+        """Largest rotor speed at the present voltage."""
+        return self._airframe.speed_at_0v_rps + self._airframe.speed_per_v_rps * self.voltage_v
+
+    def drain(self, thrust_n: float, duration_s: float) -> None:
+        """Feed the electronics and this thrust for a time.
+
+        U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more.
+        """
+        power_w = self._airframe.electronics_w + self._airframe.power_per_thrust_wpn * thrust_n
+        source_v = self.open_circuit_v
+        left = source_v * source_v - 4.0 * self._airframe.resistance_ohm * power_w
+        self.voltage_v = 0.5 * (source_v + math.sqrt(max(left, 0.0)))
+        self.current_a = (source_v - self.voltage_v) / self._airframe.resistance_ohm
+        self.used_c += self.current_a * duration_s

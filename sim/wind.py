@@ -1,0 +1,158 @@
+"""Wind: steady, with gusts after Dryden's model of low altitudes.
+
+MIL-F-8785C, section 3.7.3.4 (scales and intensities below 1000 ft, in feet there) with its spectra; MIL-HDBK-1797
+has the same scales and intensities. The turbulence is frozen and carried past the vehicle by the steady wind
+(Taylor's hypothesis), so one speed turns lengths into times.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammainc
+
+from uavctl.data import Vec3
+
+FOOT_M = 0.3048
+LOWEST_M, HIGHEST_M = 10.0 * FOOT_M, 1000.0 * FOOT_M  # where the model holds; held at its ends outside
+# Without steady wind a frozen field would stand still; a vehicle moves through it at about this speed.
+SLOWEST_MPS = 1.0
+DRAWS = 1000  # normal numbers drawn at once
+CALM: Vec3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Dryden:
+    """Intensities and time scales of the gusts along, across and up and down.
+
+    Attributes:
+        sigma_mps: standard deviation along and across the wind.
+        sigma_down_mps: standard deviation up and down.
+        time_s: L_u / V, that of the gusts along and across.
+        time_down_s: L_w / V.
+    """
+
+    sigma_mps: float
+    sigma_down_mps: float
+    time_s: float
+    time_down_s: float
+
+
+def dryden(gust_wind_mps: float, height_m: float, speed_mps: float) -> Dryden:
+    """The model's figures.
+
+    Args:
+        gust_wind_mps: wind speed at 20 ft that sets the intensity (light 7.7, moderate 15.4, severe 23.2 m/s).
+        height_m: above the ground.
+        speed_mps: at which the field passes the vehicle.
+    """
+    feet = min(max(height_m, LOWEST_M), HIGHEST_M) / FOOT_M
+    shape = 0.177 + 0.000823 * feet
+    down = 0.1 * gust_wind_mps
+    speed = max(speed_mps, SLOWEST_MPS)
+    return Dryden(
+        sigma_mps=down / shape**0.4,
+        sigma_down_mps=down,
+        time_s=feet / shape**1.2 * FOOT_M / speed,
+        time_down_s=feet * FOOT_M / speed,
+    )
+
+
+class _Along:
+    """σ √(2T/π) / (1 + T s), driven by white noise: a first-order process, stepped exactly."""
+
+    def __init__(self, sigma: float, time_s: float, step_s: float, start: float) -> None:
+        self._keep = math.exp(-step_s / time_s)
+        self._add = sigma * math.sqrt(-math.expm1(-2.0 * step_s / time_s))
+        self.value = sigma * start
+
+    def step(self, normal: float) -> None:
+        self.value = self._keep * self.value + self._add * normal
+
+
+class _Across:
+    """σ √(T/π) (1 + √3 T s) / (1 + T s)², driven by white noise, stepped exactly.
+
+    Two lags T in series with states x, y, noise such that var x = 1; then cov(x, y) = var y = ½, and the output
+    σ/√2 (√3 x + (1 - √3) y) has variance σ². Over a step a = h/T: x' = e^-a x + n, y' = e^-a (y + a x) + m, and
+    cov (n, m) = [P(1, 2a), ½ P(2, 2a); ½ P(2, 2a), ½ P(3, 2a)] with the regularised incomplete gamma function P.
+    """
+
+    def __init__(self, sigma: float, time_s: float, step_s: float, start: tuple[float, float]) -> None:
+        a = step_s / time_s
+        self._keep, self._pass = math.exp(-a), a * math.exp(-a)
+        var_n, cov, var_m = (f * float(gammainc(k, 2.0 * a)) for f, k in ((1.0, 1.0), (0.5, 2.0), (0.5, 3.0)))
+        self._n = math.sqrt(var_n)
+        self._m_of_n = cov / self._n
+        self._m = math.sqrt(var_m - self._m_of_n**2)
+        self._of_x, self._of_y = sigma * math.sqrt(1.5), sigma * (1.0 - math.sqrt(3.0)) * math.sqrt(0.5)
+        self._x, self._y = start[0], 0.5 * (start[0] + start[1])
+
+    @property
+    def value(self) -> float:
+        return self._of_x * self._x + self._of_y * self._y
+
+    def step(self, first: float, second: float) -> None:
+        self._x, self._y = (
+            self._keep * self._x + self._n * first,
+            self._keep * self._y + self._pass * self._x + self._m_of_n * first + self._m * second,
+        )
+
+
+class Wind:
+    """Velocity of the air at the vehicle, moved on step by step; without gusts it draws nothing.
+
+    Args:
+        mean_mps: steady wind, the velocity of the air in NED.
+        gust_wind_mps: wind speed at 20 ft that sets the gusts' intensity; 0 is none.
+        height_m: height for which the gusts' scales are taken.
+        step_s: length of a step.
+        seed: of the gusts, which begin in their stationary distribution.
+    """
+
+    def __init__(
+        self, mean_mps: Vec3, gust_wind_mps: float, height_m: float, step_s: float, seed: np.random.SeedSequence
+    ) -> None:
+        self.velocity_mps = mean_mps
+        self._mean_mps = mean_mps
+        self._gusty = gust_wind_mps > 0.0
+        if not self._gusty:
+            return
+        level = math.hypot(mean_mps[0], mean_mps[1])
+        self._north, self._east = (mean_mps[0] / level, mean_mps[1] / level) if level > 0.0 else (1.0, 0.0)
+        self._rng = np.random.default_rng(seed)
+        self._normals: list[float] = []
+        self._used = 0
+        figures = dryden(gust_wind_mps, height_m, level)
+        one, two, three, four, five = self._draw()
+        self._along = _Along(figures.sigma_mps, figures.time_s, step_s, one)
+        self._across = _Across(figures.sigma_mps, figures.time_s, step_s, (two, three))
+        self._down = _Across(figures.sigma_down_mps, figures.time_down_s, step_s, (four, five))
+        self._tell()
+
+    def _draw(self) -> list[float]:
+        if self._used == len(self._normals):
+            self._normals = self._rng.standard_normal(DRAWS).tolist()
+            self._used = 0
+        self._used += 5
+        return self._normals[self._used - 5 : self._used]
+
+    def _tell(self) -> None:
+        u, v = self._along.value, self._across.value
+        north, east, down = self._mean_mps
+        self.velocity_mps = (
+            north + self._north * u - self._east * v,
+            east + self._east * u + self._north * v,
+            down + self._down.value,
+        )
+
+    def step(self) -> None:
+        """Move on by one step."""
+        if self._gusty:
+            one, two, three, four, five = self._draw()
+            self._along.step(one)
+            self._across.step(two, three)
+            self._down.step(four, five)
+            self._tell()
