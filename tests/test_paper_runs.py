@@ -198,6 +198,9 @@ def test_claims_hold_or_not_by_what_was_measured(result: VariantResult) -> None:
     assert holds(input_violations=1)["inputs"] is False
     assert holds(state_violation_worst_step=0.051)["likelihood"] is False
     assert holds(fallbacks=1)["planned"] is False
+    ages = [1.0 - 1.0 / (RUNS * result.steps), *[0.0] * 11, 1.0 / (RUNS * result.steps)]
+    assert holds(fallbacks=1, age_distribution=ages)["planned"] is True
+    assert holds(fallbacks=2, age_distribution=ages)["planned"] is False
     assert holds(max_age=4)["oldest"] is False
     assert holds(settled_trend=4.0, settled_trend_stderr=1.0)["stable"] is False
     far = replace(result.neighbourhood, arrived=RUNS - 1)
