@@ -36,6 +36,7 @@ font-size:.875rem;color:var(--muted)}
 .legend li{display:flex;align-items:center;gap:.45rem}
 .legend svg{width:26px;height:14px;flex:none}
 table{border-collapse:collapse;width:100%%;font-size:.95rem;font-variant-numeric:tabular-nums}
+.many td:first-child{min-width:6.5rem}
 th,td{text-align:left;padding:.4rem .9rem .4rem 0;vertical-align:top;border-top:1px solid var(--line)}
 tr:first-child>*{border-top:0}
 th{font-weight:600}

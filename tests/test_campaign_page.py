@@ -61,7 +61,7 @@ def outside(steps: int) -> list[int]:
 
 def test_cheaper_and_as_safe_is_yes(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()))
-    assert (found.holds, found.beaten, word_of(found)) == (True, False, "yes")
+    assert (found.holds, found.outright, found.beaten, word_of(found)) == (True, True, False, "yes")
     assert brief(found.comparisons[0]) == "costs 10 % more"
     assert in_words(found)[0].startswith("The SMPC costs less, and breaks limits no more often, than theirs (10 % more")
 
@@ -75,7 +75,7 @@ def test_a_difference_that_pairs_tell_is_told(tmp_path: Path) -> None:
 def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(tmp_path: Path) -> None:
     cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1), input_violations=outside(15))
     found = judged(tmp_path, cheaper)
-    assert (found.holds, found.beaten, word_of(found)) == (False, False, "no")
+    assert (found.holds, found.outright, found.beaten, word_of(found)) == (True, False, False, "yes")
     assert brief(found.comparisons[0]) == "costs 3 % less, breaks limits more often"
     (sentence,) = in_words(found)
     assert "states in 2 % of steps (SMPC 0 %), inputs in 30 % of steps (SMPC 0 %)" in sentence
@@ -89,15 +89,15 @@ def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
-    assert (found.holds, found.beaten) == (False, True)
+    assert (found.holds, found.beaten, word_of(found)) == (False, True, "no")
     assert "theirs costs 50 % less" in in_words(found)[0]
     assert "breaks limits no more often" in in_words(found)[0]
 
 
-def test_cheaper_at_a_higher_violation_rate_is_no(tmp_path: Path) -> None:
+def test_cheaper_at_a_higher_violation_rate_is_not_outright(tmp_path: Path) -> None:
     worse = runs(0, SMPC.tolist(), state_violations=outside(2))
     found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
-    assert (found.holds, found.beaten) == (False, False)
+    assert (found.holds, found.outright, found.beaten) == (True, False, False)
     assert brief(found.comparisons[0]) == "costs 10 % more, keeps limits better"
 
 
@@ -140,8 +140,8 @@ def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None
     assert "Campaign “by hand” 12 cells · seed 7 · uavctl 9.9" in text
     assert "480 runs of 50 steps were flown" in text
     assert "4 cells had no design and were not flown" in text
-    assert "In 0 of 4 cases the SMPC costs less than every baseline" in text
-    assert "in 4 every baseline that costs less breaks limits more often" in text
+    assert "In 4 of 4 cases no baseline is as cheap as the SMPC at equal or lower violation rates; in 0" in text
+    assert "In 0 a baseline costs less and breaks limits no more often." in text
     assert "Not flown: tau: nothing is fast enough." in text
     assert 'name = "by hand"' in text
     assert "lqg <b>" in text
@@ -180,7 +180,7 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
         ([cell(0, "smpc", "smpc")], runs(0, [1.0]), "There is no baseline to compare with."),
         ([cell(0, "smpc", "smpc")], runs(0, [np.nan, np.nan]), "No run ended in order; all 2 failed."),
         ([cell(0, "smpc", "smpc", refused="no")], runs(1, [1.0]), "Not flown: no."),
-        ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [1.0]), *runs(1, [1e300])], "less than every baseline"),
+        ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [1.0]), *runs(1, [1e300])], "no baseline is as cheap"),
         ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [0.0, 0.0]), *runs(1, [0.0, 0.0])], "costs the same"),
     ],
 )  # fmt: skip

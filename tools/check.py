@@ -15,10 +15,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from logs.topics import topics_page
+from uavctl.campaign.reference import campaign_page
 from uavctl.config.reference import render
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = {ROOT / "docs" / "configuration.md": render, ROOT / "docs" / "topics.md": topics_page}
+PAGES = {
+    ROOT / "docs" / "configuration.md": render,
+    ROOT / "docs" / "campaign-keys.md": campaign_page,
+    ROOT / "docs" / "topics.md": topics_page,
+}
 BIN = Path(sys.executable).parent
 _THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
 

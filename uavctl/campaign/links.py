@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +34,13 @@ def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
     steps = chances.shape[1] - 1
     lost = _lost(link, dt_s, chances[:, :steps])
     under_way_s = link.delay_s + link.jitter_s * chances[:, :steps, 2]
-    within = link.delay_s + link.jitter_s < dt_s
+    longest_s = link.delay_s + link.jitter_s
+    if link.model == "trace":
+        under_way_s = _traced(link, chances[:, :steps])
+        lost |= np.isinf(under_way_s)
+        under_way_s[lost] = 0.0
+        longest_s = max(filter(math.isfinite, link.trace_s))
+    within = longest_s < dt_s
     late = np.zeros(lost.shape, np.intp) if within else np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
     captured = np.arange(steps)
     known = np.where(lost, steps, captured + late)  # the step that knows it first
@@ -46,6 +54,14 @@ def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
     return np.maximum.accumulate(found, axis=1)
 
 
+def _traced(link: LinkConfig, chances: Array) -> Array:
+    """Delay [s] of each position (N, T) in the trace, infinite for a lost one; each run begins where it is drawn."""
+    trace = np.array(link.trace_s)
+    first = (chances[:, 0, 0] * len(trace)).astype(np.intp)
+    index = (first[:, np.newaxis] + np.arange(chances.shape[1])) % len(trace)
+    return np.asarray(trace[index], dtype=np.float64)
+
+
 def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
     """Which positions (N, T) never arrive."""
     steps = chances.shape[1]
@@ -55,6 +71,8 @@ def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
         lost = _bursts(link, chances)
     elif link.model == "empirical":
         lost = _gaps(link, chances)
+    elif link.model == "trace":
+        lost = np.zeros(chances.shape[:2], dtype=np.bool_)
     elif link.probability:
         arrives = np.array(link.probability)[np.minimum(np.arange(steps), len(link.probability) - 1)]
         lost = chances[:, :, 1] >= arrives

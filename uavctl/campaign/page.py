@@ -37,9 +37,9 @@ _DIFFERENCES = (
     "interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs less."
 )
 _VERDICT = (
-    "“Yes” where the SMPC costs less than every baseline that flew, and breaks neither state nor input limits more "
-    "often than any. The columns say what each baseline costs, over the SMPC's cost. Less and more are judged by the "
-    "intervals of the differences run by run."
+    "“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is as cheap "
+    "at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and more are judged "
+    "by the intervals of the differences run by run."
 )
 
 
@@ -113,7 +113,7 @@ def _verdict_section(view: View) -> Section:
             rows.append((name, word_of(verdict), *(said.get(baseline, "–") for baseline in baselines)))
         sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in in_words(verdict))
         words.append(f'<p><strong>{escape(name)}</strong></p><ul class="story">{sentences}</ul>')
-    table = _table(("", "less than all", *baselines), rows, frozenset()) if rows else ""
+    table = _table(("", "best at its rate", *baselines), rows, frozenset()) if rows else ""
     body = f"{table}<details><summary>In words, with figures and reasons</summary>{''.join(words)}</details>"
     return Section(_QUESTION, _VERDICT, body)
 

@@ -31,14 +31,14 @@ def story(view: View) -> Iterator[str]:
 def _outcome(judged: Sequence[Verdict]) -> str:
     """How often the SMPC was below all baselines, how often one was below it, and what that one did."""
     holds, beaten = sum(v.holds for v in judged), sum(v.beaten for v in judged)
-    bought = sum(not v.beaten and any(one.cheaper > 0 for one in v.comparisons) for v in judged)
+    outright = sum(v.outright for v in judged)
     text = (
-        f"In {holds} of {count(len(judged), 'case')} the SMPC costs less than every baseline at equal or lower "
-        f"violation rates. In {beaten} a baseline costs less and breaks limits no more often; in {bought} every "
-        "baseline that costs less breaks limits more often."
+        f"In {holds} of {count(len(judged), 'case')} no baseline is as cheap as the SMPC at equal or lower violation "
+        f"rates; in {outright} of these each one costs more and keeps limits no better. In {beaten} a baseline costs "
+        "less and breaks limits no more often."
     )
-    left = len(judged) - holds - beaten - bought
-    return f"{text} In {left} costs cannot be told apart, or a baseline keeps limits better." if left else text
+    left = len(judged) - holds - beaten
+    return f"{text} In {left} the costs of such a baseline and the SMPC cannot be told apart." if left else text
 
 
 def _promise(view: View) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Whether the SMPC costs less than each baseline at equal or lower violation rates; where not, why."""
+"""Whether a baseline is as cheap as the SMPC at equal or lower violation rates, and what each one pays for what."""
 
 from __future__ import annotations
 
@@ -70,7 +70,12 @@ class Verdict:
 
     @property
     def holds(self) -> bool:
-        """Whether the SMPC costs less than every baseline that flew, at equal or lower violation rates."""
+        """Whether each baseline costs more, or breaks limits more often: none is as cheap at equal or lower rates."""
+        return bool(self.comparisons) and all(one.cheaper < 0 or one.safer for one in self.comparisons)
+
+    @property
+    def outright(self) -> bool:
+        """Whether the SMPC costs less than each baseline, and breaks limits no more often than any."""
         return bool(self.comparisons) and all(one.holds for one in self.comparisons)
 
     @property

@@ -74,7 +74,7 @@ def description(field: FieldInfo) -> str:
 
 def render() -> str:
     """The whole page, as Markdown."""
-    return "\n".join((_HEAD, *_tables(Config, "")))
+    return "\n".join((_HEAD, *tables(Config, "")))
 
 
 def _limits(meta: Meta) -> str:
@@ -91,7 +91,8 @@ def _bounds(meta: Meta) -> tuple[tuple[str, float | None], ...]:
     return ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))
 
 
-def _tables(section: type[Section], path: str) -> Iterator[str]:
+def tables(section: type[Section], path: str) -> Iterator[str]:
+    """A section's keys and those of its tables, as Markdown; `path` is what its keys begin with."""
     fields = msgspec.structs.fields(section)
     title = f"`[{path}]`" if path else "Top level"
     yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
@@ -105,9 +106,9 @@ def _tables(section: type[Section], path: str) -> Iterator[str]:
         name = f"{path}.{field.encode_name}" if path else field.encode_name
         one = element(field.type)
         if one is not None:
-            yield from _tables(one, f"[{name}]")
+            yield from tables(one, f"[{name}]")
         elif is_section(field.type):
-            yield from _tables(field.type, name)
+            yield from tables(field.type, name)
 
 
 def _default(field: FieldInfo) -> str:

@@ -1,0 +1,20 @@
+"""The reference page of a campaign's keys, made from the types; `make docs` writes it."""
+
+from __future__ import annotations
+
+from uavctl.campaign.spec import CampaignSpec
+from uavctl.config.reference import tables
+
+_HEAD = """# Keys of a campaign
+
+This page is generated from the types in `uavctl/campaign/spec.py` (`make docs`); do not edit it.
+
+A campaign is a TOML file; `docs/campaigns/` has complete ones, and [campaigns.md](campaigns.md) says how to fly and
+read them. Every `set` is a list of overrides of the flight configuration, as `--set` takes them
+([configuration.md](configuration.md)).
+"""
+
+
+def campaign_page() -> str:
+    """The whole page, as Markdown."""
+    return "\n".join((_HEAD, *tables(CampaignSpec, "")))
