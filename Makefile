@@ -4,13 +4,22 @@ VENV := .venv
 # One stamp: the environment is made again only when what goes into it changes.
 STAMP := $(VENV)/.installed
 
-.PHONY: fly test docs clean
+# MAVSDK 3 and 4 have one name, so each client has an environment of its own.
+CLIENTS := .venv-clients
+
+.PHONY: fly test test-clients docs clean
 
 fly: $(STAMP)
 	$(VENV)/bin/uavctl loopback --udp --config room
 
 test: $(STAMP)
 	$(VENV)/bin/python tools/check.py
+
+test-clients: $(STAMP) $(CLIENTS)/.installed
+	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \
+	UAVCTL_MAVSDK3_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk3/bin/python \
+	UAVCTL_MAVPROXY_PYTHON=$(CURDIR)/$(CLIENTS)/mavproxy/bin/python \
+	$(VENV)/bin/python -m pytest -n 0 tests/clients
 
 docs: $(STAMP)
 	$(VENV)/bin/python tools/check.py --write-docs
@@ -22,5 +31,13 @@ $(STAMP): pyproject.toml constraints.txt
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[dev]'
 	touch $(STAMP)
 
+$(CLIENTS)/.installed: constraints-clients.txt
+	for client in mavsdk mavsdk3 mavproxy; do $(PYTHON) -m venv $(CLIENTS)/$$client; done
+	$(CLIENTS)/mavsdk/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt mavsdk==4.1.0
+	$(CLIENTS)/mavsdk3/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt mavsdk==3.17.4
+	$(CLIENTS)/mavproxy/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt --no-deps MAVProxy
+	$(CLIENTS)/mavproxy/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt pyserial pymavlink
+	touch $@
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

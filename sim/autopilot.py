@@ -1,73 +1,97 @@
 """The simulated MAVLink vehicle: bytes in, bytes out.
 
 Its bytes are made and read with pymavlink's dialect directly, not with the controller's codec. It shows what was
-observed of the real autopilots: the table of `personality.py`, the state machine of `pilot.py`, and
-the rules for setpoints below.
+observed of the real autopilots: the table of `personality.py`, the rules for setpoints in `setpoints.py`, the state
+machine of `pilot.py`, the estimate of `estimator.py`, and the commands, parameters and streams in the files of these
+names. What is not known is not answered, as the real ones do.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from enum import Enum, auto
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.personality import ACCEPTED, DENIED, FAILED, PERSONALITIES, UNSUPPORTED, Role, px4_custom
-from sim.pilot import CRASHED, WARNING, Phase, Pilot
-from sim.vehicle import Vehicle
+from sim.commands import Commands, Request
+from sim.craft import Craft, SteeredPlant
+from sim.estimator import Estimator
+from sim.failsafe import Failsafes
+from sim.geodesy import Origin
+from sim.parameters import Kind, Parameters
+from sim.personality import PERSONALITIES
+from sim.pilot import CRASHED, WARNING, Pilot
+from sim.setpoints import Ask, interpret
+from sim.telemetry import HOME_POSITION, Message, Telemetry, Vehicle
+from sim.vehicle import Vehicle as Plant
 from uavctl.config.types import Config
-from uavctl.data import Vec3
 
 SECOND_NS = 1_000_000_000
 SYSTEM_ID, COMPONENT_ID = 1, 1
 # Age of the autopilot at the start of the simulation, so that its clock is neither zero nor ours.
 UPTIME_NS = 20 * SECOND_NS
-TAKEOFF_MAX_M = 100.0
-SHORTEST_INTERVAL_NS = 1_000_000
-
-HEARTBEAT, LOCAL_POSITION, LANDED = 0, 32, 245  # message ids
-PERIODS_NS = {HEARTBEAT: SECOND_NS, LANDED: SECOND_NS, LOCAL_POSITION: SECOND_NS // 10}
-
-IGNORE_POSITION_VELOCITY, IGNORE_ACCEL, FORCE = 0x3F, 0x1C0, 0x200  # POSITION_TARGET_TYPEMASK
-ARMED_FLAG, CUSTOM_MODE_FLAG = 128, 1  # MAV_MODE_FLAG
-
-
-class _Setpoint(Enum):
-    """What a setpoint without a usable acceleration is."""
-
-    REFUSED = auto()  # nothing: it does not count for the stream
-    STOP = auto()  # it makes the vehicle stop
-    FATAL = auto()  # the program dies of it
+NO_INDEX = 65535  # param_index of a parameter that is not in the list
+HASH = "_HASH_CHECK"
+# MAV_DATA_STREAM, as ArduPilot groups its messages; 0 is all.
+DATA_STREAMS = {
+    2: (1, 24),
+    3: (85,),
+    6: (32, 33),
+    10: (30,),
+    11: (74,),
+    12: (193, 147),
+}
 
 
 class Autopilot:
-    """A vehicle with the personality named by `config.sim.autopilot`; see `Pilot` for `airborne`."""
+    """A vehicle with the personality named by `config.sim.autopilot`; see `Pilot` for `airborne`.
 
-    def __init__(self, config: Config, vehicle: Vehicle, start_ns: int, *, airborne: bool) -> None:
-        self._kind = PERSONALITIES[config.sim.autopilot]
-        self._vehicle = vehicle
-        self._boot_ns = start_ns - UPTIME_NS
+    Args:
+        config: the configuration.
+        vehicle: what flies: the linear plant, or a vehicle with loops of its own.
+        start_ns: time of the start.
+        airborne: whether it starts in the air.
+
+    Attributes:
+        parameters: its parameters.
+        estimator: its estimate.
+        pilot: its state machine.
+        telemetry: its streams.
+    """
+
+    def __init__(self, config: Config, vehicle: Plant | Craft, start_ns: int, *, airborne: bool) -> None:
+        kind = self._kind = PERSONALITIES[config.sim.autopilot]
+        craft: Craft = SteeredPlant(vehicle) if isinstance(vehicle, Plant) else vehicle
+        boot_ns = self._boot_ns = start_ns - UPTIME_NS
+        self._craft = craft
         self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
         self._out: list[bytes] = []
-        self._due_ns = dict.fromkeys(PERIODS_NS, start_ns)
-        self._period_ns = dict(PERIODS_NS)
-        timeout_ns = round(config.sim.setpoint_timeout_s * 1e9)
-        self.pilot = Pilot(self._kind, vehicle, start_ns, timeout_ns=timeout_ns, airborne=airborne)
-        self._streams = {HEARTBEAT: self._heartbeat, LANDED: self._landed, LOCAL_POSITION: self._position}
+        self.parameters = Parameters(kind.name)
+        if config.sim.setpoint_timeout_s is not None:
+            self.parameters.set(kind.timeout, config.sim.setpoint_timeout_s)
+        self.estimator = Estimator(kind, self.parameters, craft)
+        self.pilot = Pilot(kind, craft, self.parameters, self.estimator, boot_ns, airborne=airborne)
+        whole = Vehicle(kind, craft, self.pilot, self.estimator, self.parameters, Origin(*kind.origin_deg_m), boot_ns)
+        self.telemetry = Telemetry(whole, start_ns)
+        self._commands = Commands(whole, self.telemetry, self._send)
+        self._failsafes = Failsafes(kind, self.pilot, self.parameters, self.estimator, craft.battery)
+        self._was_armed = airborne
         self._handlers: dict[str, Callable[[Any, int], None]] = {
+            "ATT_POS_MOCAP": self.estimator.take,
+            "COMMAND_INT": self._on_command,
             "COMMAND_LONG": self._on_command,
+            "HEARTBEAT": self._on_heartbeat,
+            "MISSION_REQUEST_LIST": self._on_mission_list,
+            "ODOMETRY": self.estimator.take,
+            "PARAM_REQUEST_LIST": self._on_parameter_list,
+            "PARAM_REQUEST_READ": self._on_parameter_read,
+            "PARAM_SET": self._on_parameter_set,
+            "REQUEST_DATA_STREAM": self._on_data_stream,
+            "SET_GPS_GLOBAL_ORIGIN": self._on_origin,
             "SET_MODE": self._on_set_mode,
             "SET_POSITION_TARGET_LOCAL_NED": self._on_setpoint,
             "TIMESYNC": self._on_timesync,
-        }
-        self._commands: dict[int, Callable[[Any, int], int]] = {
-            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-            mavlink.MAV_CMD_DO_SET_MODE: self._do_set_mode,
-            mavlink.MAV_CMD_NAV_LAND: self._land,
-            mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            "VISION_POSITION_ESTIMATE": self.estimator.take,
         }
 
     @property
@@ -80,20 +104,19 @@ class Autopilot:
         """Time of the next thing to do of itself [ns]; None after a crash."""
         if self.pilot.crashed:
             return None
-        times = [due_ns for kind, due_ns in self._due_ns.items() if self._period_ns[kind] > 0]
-        pilot_ns = self.pilot.next_ns
-        return min(times if pilot_ns is None else [*times, pilot_ns], default=None)
+        parts = self.telemetry, self.pilot, self.estimator, self._failsafes
+        return min((part.next_ns for part in parts if part.next_ns is not None), default=None)
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
         """Do what is due at `at_ns`, the vehicle being there; returns the datagrams sent."""
         if self.pilot.crashed:
             return ()
+        self.estimator.run(at_ns)
         self.pilot.run(at_ns)
-        for kind, send in self._streams.items():
-            if self._period_ns[kind] > 0 and self._due_ns[kind] <= at_ns:
-                self._due_ns[kind] += self._period_ns[kind]
-                send(at_ns)
-        return self._flush()
+        self._failsafes.run(at_ns)
+        for msg in self.telemetry.due(at_ns):
+            self._send(msg)
+        return self._flush(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> tuple[bytes, ...]:
         """Take one datagram, the vehicle being at `at_ns`; returns the answers. Bad bytes never raise."""
@@ -103,15 +126,20 @@ class Autopilot:
             handler = self._handlers.get(msg.get_type())
             if handler is not None and not self.pilot.crashed:
                 handler(msg, at_ns)
-        return self._flush()
+        return self._flush(at_ns)
 
     # What it sends
 
-    def _send(self, msg: mavlink.MAVLink_message) -> None:
+    def _send(self, msg: Message) -> None:
         self._out.append(bytes(msg.pack(self._mav)))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
 
-    def _flush(self) -> tuple[bytes, ...]:
+    def _flush(self, at_ns: int) -> tuple[bytes, ...]:
+        if self.pilot.armed and not self._was_armed:  # home is where it was armed: both tell it
+            home = self.telemetry.make(HOME_POSITION, at_ns)
+            if home is not None:
+                self._send(home)
+        self._was_armed = self.pilot.armed
         for severity, text in self.pilot.texts:
             self._send(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
         out = tuple(self._out)
@@ -119,28 +147,16 @@ class Autopilot:
         self._out.clear()
         return out
 
-    def _heartbeat(self, _at_ns: int) -> None:
-        pilot = self.pilot
-        status = mavlink.MAV_STATE_STANDBY
-        if pilot.phase is not Phase.GROUND:
-            status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
-        base = pilot.mode.base | (ARMED_FLAG if pilot.armed else 0)
-        kind = mavlink.MAV_TYPE_QUADROTOR, self._kind.autopilot
-        self._send(mavlink.MAVLink_heartbeat_message(*kind, base, pilot.mode.custom, status, 3))
-
-    def _landed(self, _at_ns: int) -> None:
-        self._send(mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, self.pilot.phase.value))
-
-    def _position(self, at_ns: int) -> None:
-        boot_ms = (at_ns - self._boot_ns) // 1_000_000 % 2**32
-        where, speed = self._vehicle.position_m, self._vehicle.velocity_mps
-        self._send(mavlink.MAVLink_local_position_ned_message(boot_ms, *where, *speed))
-
     # What it receives
 
     @staticmethod
     def _for_me(msg: Any) -> bool:
         return msg.target_system in (0, SYSTEM_ID) and getattr(msg, "target_component", 0) in (0, COMPONENT_ID)
+
+    def _on_heartbeat(self, msg: Any, at_ns: int) -> None:
+        px4 = self._kind.name == "px4"
+        if msg.type == mavlink.MAV_TYPE_GCS if px4 else msg.get_srcSystem() == self.parameters["SYSID_MYGCS"]:
+            self._failsafes.station_ns = at_ns
 
     def _on_timesync(self, msg: Any, at_ns: int) -> None:
         if msg.tc1 == 0:
@@ -148,12 +164,11 @@ class Autopilot:
 
     def _on_command(self, msg: Any, at_ns: int) -> None:
         if self._for_me(msg):
-            command = self._commands.get(msg.command)
-            self._acknowledge(msg, msg.command, UNSUPPORTED if command is None else command(msg, at_ns))
+            self._acknowledge(msg, msg.command, self._commands.do(Request.of(msg), at_ns))
 
     def _on_set_mode(self, msg: Any, at_ns: int) -> None:
         if self._for_me(msg):
-            result = self._change(msg.custom_mode, at_ns) if msg.base_mode & CUSTOM_MODE_FLAG else UNSUPPORTED
+            result = self._commands.change(msg.base_mode, msg.custom_mode, at_ns)
             self._acknowledge(msg, self._kind.set_mode_ack, result)
 
     def _acknowledge(self, msg: Any, command: int, result: int) -> None:
@@ -163,67 +178,74 @@ class Autopilot:
     def _on_setpoint(self, msg: Any, at_ns: int) -> None:
         if not self._for_me(msg):
             return
-        match self._acceleration(msg):
-            case _Setpoint.REFUSED:
-                pass
-            case _Setpoint.STOP:
-                self.pilot.setpoint(None, at_ns)
-            case _Setpoint.FATAL:
-                self.pilot.crash("a setpoint was not a number")
-            case (_, _, _) as accel:
-                self.pilot.setpoint(accel, at_ns)
-
-    def _acceleration(self, msg: Any) -> Vec3 | _Setpoint:
-        """What a setpoint asks for, by the rules of each autopilot; yaw and yaw rate are not looked at."""
-        px4 = self._kind.name == "px4"
-        if px4 and msg.type_mask & FORCE:
-            self.pilot.texts.append((WARNING, "force setpoint not supported"))
-            return _Setpoint.REFUSED
-        if msg.coordinate_frame not in self._kind.frames:
-            if not px4:
-                return _Setpoint.STOP
-            self.pilot.texts.append((WARNING, f"setpoint refused: frame {msg.coordinate_frame}"))
-            return _Setpoint.REFUSED
-        if ~msg.type_mask & IGNORE_POSITION_VELOCITY or msg.type_mask & IGNORE_ACCEL:
-            return _Setpoint.STOP
-        accel = (msg.afx, msg.afy, msg.afz)
-        if all(map(math.isfinite, accel)):
-            return accel
-        return _Setpoint.FATAL if self._kind.dies_of_nan and self.pilot.external else _Setpoint.STOP
-
-    # Commands, each giving a MAV_RESULT
-
-    def _arm_disarm(self, msg: Any, at_ns: int) -> int:
-        if msg.param1 == 1.0:
-            return self.pilot.arm(at_ns)
-        return self.pilot.disarm() if msg.param1 == 0.0 else UNSUPPORTED
-
-    def _do_set_mode(self, msg: Any, at_ns: int) -> int:
-        if not all(0.0 <= number < 2**8 for number in (msg.param1, msg.param2, msg.param3)):  # not a number neither
-            return DENIED
-        base, main, sub = int(msg.param1), int(msg.param2), int(msg.param3)
-        if not base & CUSTOM_MODE_FLAG:
-            return UNSUPPORTED
-        return self._change(px4_custom(main, sub) if self._kind.name == "px4" else main, at_ns)
-
-    def _change(self, custom: int, at_ns: int) -> int:
-        mode = self._kind.by_number(custom)
-        return self._kind.unknown_mode if mode is None else self.pilot.change(mode, at_ns)
-
-    def _land(self, _msg: Any, at_ns: int) -> int:
-        return self.pilot.change(self._kind.by_role(Role.LAND), at_ns)
-
-    def _take_off(self, msg: Any, at_ns: int) -> int:
-        return self.pilot.take_off(msg.param7 if 0.0 < msg.param7 <= TAKEOFF_MAX_M else None, at_ns)
-
-    def _set_interval(self, msg: Any, at_ns: int) -> int:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: param1 the message, param2 [µs], 0 its usual one, -1 none."""
-        kind, interval_us = msg.param1, msg.param2
-        if kind not in PERIODS_NS or not (interval_us == -1.0 or 0.0 <= interval_us <= 1e9):
-            return FAILED
-        if interval_us > 0.0:
-            self._period_ns[int(kind)] = max(int(interval_us) * 1000, SHORTEST_INTERVAL_NS)
+        setpoint = interpret(self._kind, msg, self.estimator.position_m, self._craft.attitude)
+        if setpoint.ask is Ask.REFUSED:
+            self.pilot.texts.append((WARNING, setpoint.text))
         else:
-            self._period_ns[int(kind)] = PERIODS_NS[int(kind)] if interval_us == 0.0 else 0
-        self._due_ns[int(kind)] = at_ns + 1
-        return ACCEPTED
+            self.pilot.setpoint(setpoint, at_ns)
+
+    def _on_origin(self, msg: Any, at_ns: int) -> None:
+        """The origin of the estimate: a place on the globe for what GPS would have given; it stays local zero."""
+        valid = abs(msg.latitude) <= 900_000_000 and abs(msg.longitude) <= 1_800_000_000
+        if msg.target_system in (0, SYSTEM_ID) and valid and not self.estimator.uses_gps:
+            self.estimator.origin = True
+            origin = self.telemetry.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, at_ns)
+            if origin is not None:
+                self._send(origin)
+
+    def _on_mission_list(self, msg: Any, _at_ns: int) -> None:
+        if self._for_me(msg):  # there are no missions
+            to = msg.get_srcSystem(), msg.get_srcComponent()
+            self._send(mavlink.MAVLink_mission_count_message(*to, 0, msg.mission_type))
+
+    def _on_data_stream(self, msg: Any, at_ns: int) -> None:
+        """ArduPilot only: streams by groups, at a rate [Hz]."""
+        if not self._for_me(msg) or self._kind.name == "px4" or msg.start_stop not in (0, 1):
+            return
+        wanted = DATA_STREAMS.values() if msg.req_stream_id == 0 else [DATA_STREAMS.get(msg.req_stream_id, ())]
+        runs = msg.start_stop == 1 and msg.req_message_rate > 0
+        interval_us = 1e6 / msg.req_message_rate if runs else -1.0
+        for kind in (one for group in wanted for one in group):
+            self.telemetry.set_interval(kind, interval_us, at_ns)
+
+    # Parameters
+
+    def _on_parameter_list(self, msg: Any, _at_ns: int) -> None:
+        if self._for_me(msg):
+            for name in self.parameters.names:
+                self._send_parameter(name)
+            if self._kind.name == "px4":
+                self._send_digest()
+
+    def _on_parameter_read(self, msg: Any, _at_ns: int) -> None:
+        if not self._for_me(msg):
+            return
+        names = self.parameters.names
+        if 0 <= msg.param_index < len(names):
+            self._send_parameter(names[msg.param_index])
+        elif msg.param_index == -1 and msg.param_id in self.parameters:
+            self._send_parameter(msg.param_id)
+        elif msg.param_index == -1 and msg.param_id == HASH and self._kind.name == "px4":
+            self._send_digest()
+
+    def _on_parameter_set(self, msg: Any, _at_ns: int) -> None:
+        """Answered with the value that holds now, whatever was asked; PX4 wants the right type."""
+        name = msg.param_id
+        if not self._for_me(msg) or name not in self.parameters:
+            return
+        px4 = self._kind.name == "px4"
+        if px4 and msg.param_type != self.parameters.kind(name):
+            self.pilot.texts.append((WARNING, f"param types mismatch param: {name}"))
+        elif not self.parameters.set(name, self.parameters.decoded(name, msg.param_value)):
+            self.pilot.texts.append((WARNING, f"value not simulated: {name}"))
+        self._send_parameter(name)
+
+    def _send_parameter(self, name: str) -> None:
+        p = self.parameters
+        place = len(p.names), p.names.index(name)
+        self._send(mavlink.MAVLink_param_value_message(name.encode(), p.encoded(name), p.kind(name), *place))
+
+    def _send_digest(self) -> None:
+        value = self.parameters.digest
+        count = len(self.parameters.names)
+        self._send(mavlink.MAVLink_param_value_message(HASH.encode(), value, Kind.UINT32, count, NO_INDEX))

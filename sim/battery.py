@@ -20,9 +20,13 @@ class Battery:
 
     def __init__(self, airframe: Airframe, *, charge: float = 1.0) -> None:
         self._airframe = airframe
-        self.used_c = (1.0 - charge) * airframe.capacity_c
+        self.charge(charge)
         self.current_a = 0.0
         self.voltage_v = self.open_circuit_v
+
+    def charge(self, share: float) -> None:
+        """Have this charge, 0 to 1."""
+        self.used_c = (1.0 - share) * self._airframe.capacity_c
 
     @property
     def remaining(self) -> float:

@@ -7,12 +7,16 @@ effect is on or off. So two runs with one seed differ only by the effects that d
 from __future__ import annotations
 
 import heapq
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from sim.spans import within
 from uavctl.config.link import LinkConfig
 
+OVERSIZE_BYTES = 5000
 _TO_DRAW = -1  # no run of losses is under way: the next packet begins one (of 0 or more)
 
 
@@ -25,15 +29,29 @@ class Counters:
     duplicated: int = 0
     corrupted: int = 0
     truncated: int = 0
+    oversized: int = 0
+
+
+class _Fate(NamedTuple):
+    """What becomes of a packet."""
+
+    lost: bool
+    delays_s: tuple[float, ...]  # of it, and of its duplicate
+    data: bytes
+    corrupted: bool
+    truncated: bool
+    oversized: bool
 
 
 class Channel:
     """One direction of a radio link.
 
     Loss is Bernoulli, Gilbert-Elliott (the chain starts in the good state and steps before each packet) or
-    empirical (a run of losses is drawn after each arrival, and before the first packet), and total within a
-    blackout. What gets through is delayed by `delay_s` plus a uniform draw up to `jitter_s`, so packets may
-    overtake each other. A duplicate has its own delay. A bit flip and a cut act on a packet before it is doubled.
+    empirical (a run of losses is drawn after each arrival, and before the first packet) or that of a trace (from its
+    first packet on, and over again), and total within a blackout. What gets through is delayed by `delay_s` plus a
+    uniform draw up to `jitter_s`, or as the trace was, so packets may overtake each other. A duplicate has its own
+    delay, but with a trace. A bit flip, a cut and padding act on a packet before it is doubled. What arrives in a span
+    of `held` is kept until its end.
 
     Args:
         link: The section `[link]`.
@@ -53,40 +71,42 @@ class Channel:
         self._link = link
         self._start_ns = start_ns
         self._step_ns = step_ns or 0
-        children = [np.random.default_rng(child) for child in seed.spawn(5)]
-        self._loss, self._delay, self._duplicate, self._corrupt, self._truncate = children
+        children = [np.random.default_rng(child) for child in seed.spawn(6)]
+        self._loss, self._delay, self._duplicate, self._corrupt, self._truncate, self._oversize = children
         self._bad = False
         self._runs = np.cumsum(link.gaps)
         self._to_lose = _TO_DRAW
-        self._pending: list[tuple[int, int, bytes]] = []
+        self._number = 0  # of the next packet
+        self._pending: list[tuple[int, int, int, bytes]] = []  # (arrival, unheld arrival, order, data)
         self._order = 0
         self.counters = Counters()
 
     def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
         """Send a packet at `at_ns`; a `certain` one is not lost."""
-        link, counters = self._link, self.counters
+        counters, fate = self.counters, self._draw(at_ns, data)
         counters.sent += 1
-        lost = self._loses(at_ns) and not certain
-        delays = self._delay.random(2)
-        doubled = self._duplicate.random() < link.duplicate
-        data, corrupted = self._flip(data)
-        data, truncated = self._cut(data)
-        if lost:
+        if fate.lost and not certain:
             counters.lost += 1
             return
-        counters.corrupted += corrupted
-        counters.truncated += truncated
-        counters.duplicated += doubled
-        for draw in delays[: 1 + doubled]:
+        counters.corrupted += fate.corrupted
+        counters.truncated += fate.truncated
+        counters.oversized += fate.oversized
+        counters.duplicated += len(fate.delays_s) - 1
+        for delay_s in fate.delays_s:
             self._order += 1
-            arrival_ns = at_ns + round((link.delay_s + link.jitter_s * float(draw)) * 1e9)
-            heapq.heappush(self._pending, (arrival_ns, self._order, data))
+            # A packet that a trace loses has no delay of its own, but may be a certain one.
+            arrival_ns = at_ns + (round(delay_s * 1e9) if math.isfinite(delay_s) else 0)
+            heapq.heappush(self._pending, (self._released(arrival_ns), arrival_ns, self._order, fate.data))
+
+    def pass_over(self, at_ns: int) -> None:
+        """Nothing is sent at `at_ns` where a packet was due; what comes after goes as if it had been."""
+        self._draw(at_ns, b"")
 
     def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
         """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
         due = []
         while self._pending and self._pending[0][0] <= to_ns:
-            arrival_ns, _, data = heapq.heappop(self._pending)
+            arrival_ns, *_, data = heapq.heappop(self._pending)
             due.append((arrival_ns, data))
         return due
 
@@ -95,12 +115,33 @@ class Channel:
         """Time of the next arrival [ns], None if nothing is under way."""
         return self._pending[0][0] if self._pending else None
 
+    def _draw(self, at_ns: int, data: bytes) -> _Fate:
+        link = self._link
+        lost = self._loses(at_ns)
+        delays = [link.delay_s + link.jitter_s * float(draw) for draw in self._delay.random(2)]
+        if link.model == "trace":
+            delays = [link.trace_s[self._number % len(link.trace_s)]] * 2
+            lost |= math.isinf(delays[0])
+        self._number += 1
+        doubled = self._duplicate.random() < link.duplicate
+        data, corrupted = self._flip(data)
+        data, truncated = self._cut(data)
+        oversized = bool(self._oversize.random() < link.oversize)
+        data = data.ljust(OVERSIZE_BYTES, b"\0") if oversized else data
+        return _Fate(lost, tuple(delays[: 1 + doubled]), data, corrupted, truncated, oversized)
+
+    def _released(self, arrival_ns: int) -> int:
+        """When a packet that comes at `arrival_ns` is let through."""
+        for begin, end in sorted(self._link.held):
+            if begin * 1e9 <= arrival_ns - self._start_ns < end * 1e9:
+                arrival_ns = self._start_ns + round(end * 1e9)
+        return arrival_ns
+
     def _loses(self, at_ns: int) -> bool:
         link = self._link
         step, draw = self._loss.random(2)
         since_ns = at_ns - self._start_ns
-        dark = any(begin * 1e9 <= since_ns <= end * 1e9 for begin, end in link.blackout)
-        return bool(draw < self._probability(since_ns, step)) or dark
+        return bool(draw < self._probability(since_ns, step)) or within(link.blackout, since_ns)
 
     def _probability(self, since_ns: int, step: float) -> float:
         """Probability that the next packet is lost; the channel's own state moves on by the draw `step`."""
@@ -113,6 +154,8 @@ class Channel:
                 self._to_lose = int(np.searchsorted(self._runs, step * self._runs[-1], side="right"))
             self._to_lose -= 1
             return 0.0 if self._to_lose == _TO_DRAW else 1.0
+        if link.model == "trace":
+            return 0.0
         if link.probability:
             number = -(-since_ns // self._step_ns)  # step k ends at k Δt, that instant included
             return 1.0 - link.probability[min(max(number, 0), len(link.probability) - 1)]

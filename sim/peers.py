@@ -9,29 +9,33 @@ import numpy as np
 
 from sim.autopilot import Autopilot
 from sim.channel import Channel
+from sim.faults import Faults, with_spans
 from sim.mocap import Cameras
+from sim.quadrotor import STEP_S, Quadrotor
 from sim.script import Script, ScriptedChannel
-from sim.vehicle import Vehicle
+from sim.spans import within
+from sim.vehicle import Vehicle, linear_model
+from sim.wind import Wind
 from uavctl.config.types import Config
 from uavctl.data import Truth
 
 VEHICLE, MOCAP = "vehicle", "mocap"
-VEHICLES = {"linear": Vehicle}
 Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
 
 
 class Peers:
     """Vehicle, autopilot, cameras and the radio channel that carries positions.
 
-    The vehicle's link is a wire: no loss, no delay. Positions go through the channel. With
-    `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel.
+    The vehicle's link is a wire: no loss (but for `link.uplink_blackout`), no delay. Positions go through the channel.
+    With `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel.
 
     `on_truth` gets one `Truth` for every boundary start_ns + k Δt: the state x(k), and the input that acts
     from there on. It is therefore called when time moves *past* the boundary: what arrives at the
     boundary's own instant is already in it, what arrives later (on real sockets, a fraction of a
     millisecond) is not.
 
-    With a `script`, plant, start, disturbances and the channel are its, not those of the configuration.
+    With a `script`, plant, start, disturbances and the channel are its, not those of the configuration: what flies
+    is the linear plant.
     """
 
     def __init__(
@@ -44,9 +48,15 @@ class Peers:
         on_truth: Callable[[Truth], None] | None = None,
         script: Script | None = None,
     ) -> None:
+        config = with_spans(config)
         for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
-        self.vehicle = VEHICLES[config.sim.plant](config, for_vehicle, start_ns, script)
+        self.vehicle: Vehicle | Quadrotor
+        if config.sim.plant == "quadrotor" and script is None:
+            self.vehicle = quadrotor(config, for_vehicle, start_ns)
+        else:
+            self.vehicle = Vehicle(config, for_vehicle, start_ns, script)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
+        self._faults = Faults(config, self.vehicle, self.autopilot, start_ns)
         self.channel: Channel | ScriptedChannel
         if script is None:
             self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
@@ -54,6 +64,8 @@ class Peers:
             self.channel = ScriptedChannel(script.delays_ns)
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
         self._airborne = airborne
+        self._start_ns = start_ns
+        self._deaf = config.link.uplink_blackout
         self._mocap_link = VEHICLE if shared_link else MOCAP
         self._on_truth = on_truth
         self._truth_ns = start_ns  # boundary of the next truth
@@ -68,6 +80,7 @@ class Peers:
     def next_ns(self) -> int:
         """Time of the next event [ns]: something to send, a sample, or the vehicle's own doing."""
         times = [self._cameras.next_ns, self._truth_ns + 1, self.autopilot.next_ns, self.channel.next_ns]
+        times.append(self._faults.next_ns)
         if self._wire:
             times.append(self._wire[0][0])
         return min(at_ns for at_ns in times if at_ns is not None)
@@ -83,7 +96,7 @@ class Peers:
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
         self._run(at_ns)
-        if link == VEHICLE:
+        if link == VEHICLE and not within(self._deaf, at_ns - self._start_ns):
             self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
     def truth(self) -> Truth:
@@ -111,20 +124,24 @@ class Peers:
 
     def _run(self, to_ns: int) -> None:
         while True:
-            autopilot_ns = self.autopilot.next_ns
-            at_ns = min(self._cameras.next_ns, to_ns if autopilot_ns is None else autopilot_ns)
-            if at_ns > to_ns:
-                break
-            at_ns = max(at_ns, self.now_ns)
+            autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
+            times = [self._cameras.next_ns, to_ns, autopilot_ns, fault_ns]
+            at_ns = max(min(one for one in times if one is not None), self.now_ns)
             self._move(at_ns)
             busy = False
+            if fault_ns is not None and fault_ns <= at_ns:
+                self._faults.run(at_ns)
+                busy = True
             if autopilot_ns is not None and autopilot_ns <= at_ns:
                 self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
                 busy = True
             if self._cameras.next_ns <= at_ns:
-                sample = self._cameras.capture(self.vehicle.position_m, self.vehicle.velocity_mps)
-                # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
-                self.channel.push(*sample, certain=self._airborne and not self.channel.counters.sent)
+                craft = self.vehicle
+                sample = self._cameras.capture(craft.position_m, craft.velocity_mps, craft.attitude)
+                if sample is None:
+                    self.channel.pass_over(at_ns)
+                else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
+                    self.channel.push(*sample, certain=self._airborne and not self.channel.counters.sent)
                 busy = True
             if not busy:
                 break
@@ -140,3 +157,17 @@ class Peers:
         self._truth_ns += self.vehicle.model.dt_ns
         if self._on_truth is not None:
             self._on_truth(self.truth())
+
+
+def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
+    """The quadrotor of a configuration, in its wind; the seed is that of the gusts."""
+    sim = config.sim
+    return Quadrotor(
+        linear_model(config.plant),
+        sim.autopilot,
+        Wind(sim.wind.velocity_mps, sim.wind.gust_wind_mps, sim.wind.height_m, STEP_S, seed),
+        start_ns,
+        position_m=sim.start_position_m,
+        velocity_mps=sim.start_velocity_mps,
+        charge=sim.quadrotor.charge,
+    )

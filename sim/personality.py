@@ -30,6 +30,7 @@ class Mode:
     custom: int
     base: int
     role: Role
+    needs_position: bool = True
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,19 @@ class Personality:
     autopilot: int  # MAV_AUTOPILOT
     modes: tuple[Mode, ...]
     ground: str  # mode after boot
-    frames: frozenset[int]  # MAV_FRAMEs in which an acceleration is taken (yaw and tilt are zero here)
+    frames: frozenset[int]  # MAV_FRAMEs in which setpoints are taken
     needs_stream: bool  # external mode is refused without setpoints
-    leaves_on_silence: bool  # silence ends the external mode (else it brakes and stays)
-    dies_of_nan: bool
+    timeout: str  # parameter with the silence [s] after which setpoints have stopped
+    preflight_timeout: str  # parameter with the time [s] after which it disarms itself if it does not take off
+    refused_arming: int  # MAV_RESULT
+    refused_disarming: int  # MAV_RESULT
     unknown_mode: int  # MAV_RESULT for a mode that it has not
     set_mode_ack: int  # command number that answers SET_MODE
     armed_text: str
     disarmed_text: str
+    preflight_text: str  # when it disarms itself before take-off
+    version: int  # flight_sw_version of AUTOPILOT_VERSION
+    origin_deg_m: tuple[float, float, float]  # latitude, longitude, altitude of its simulated field
 
     def mode(self, name: str) -> Mode:
         """The mode of this name."""
@@ -74,18 +80,23 @@ PX4 = Personality(
         Mode("OFFBOARD", px4_custom(6, 0), 17, Role.EXTERNAL),
         Mode("AUTO.LOITER", px4_custom(4, 3), 29, Role.HOLD),
         Mode("AUTO.TAKEOFF", px4_custom(4, 2), 29, Role.TAKEOFF),
-        Mode("AUTO.LAND", px4_custom(4, 6), 29, Role.LAND),
+        Mode("AUTO.LAND", px4_custom(4, 6), 29, Role.LAND, needs_position=False),
         Mode("POSCTL", px4_custom(3, 0), 81, Role.HOLD),
     ),
     ground="AUTO.LOITER",
     frames=frozenset({1, 8}),
     needs_stream=True,
-    leaves_on_silence=True,
-    dies_of_nan=False,
+    timeout="COM_OF_LOSS_T",
+    preflight_timeout="COM_DISARM_PRFLT",
+    refused_arming=TEMPORARILY_REJECTED,
+    refused_disarming=DENIED,
     unknown_mode=DENIED,
     set_mode_ack=176,
     armed_text="Armed by external command",
     disarmed_text="Disarmed by landing",
+    preflight_text="Disarmed by auto preflight disarming",
+    version=0x01080000,
+    origin_deg_m=(47.397742, 8.545594, 488.0),
 )
 
 ARDUPILOT = Personality(
@@ -94,19 +105,24 @@ ARDUPILOT = Personality(
     modes=(
         Mode("GUIDED", 4, 89, Role.EXTERNAL),
         Mode("LOITER", 5, 89, Role.HOLD),
-        Mode("LAND", 9, 89, Role.LAND),
+        Mode("LAND", 9, 89, Role.LAND, needs_position=False),
         Mode("BRAKE", 17, 89, Role.HOLD),
-        Mode("STABILIZE", 0, 81, Role.HOLD),
+        Mode("STABILIZE", 0, 81, Role.HOLD, needs_position=False),
     ),
     ground="STABILIZE",
     frames=frozenset({1, 7, 8, 9}),
     needs_stream=False,
-    leaves_on_silence=False,
-    dies_of_nan=True,
+    timeout="GUID_TIMEOUT",
+    preflight_timeout="DISARM_DELAY",
+    refused_arming=FAILED,
+    refused_disarming=FAILED,
     unknown_mode=FAILED,
     set_mode_ack=11,
     armed_text="Arming motors",
     disarmed_text="Disarming motors",
+    preflight_text="Disarming motors",
+    version=0x040602FF,
+    origin_deg_m=(-35.363262, 149.165237, 584.0),
 )
 
 PERSONALITIES = {"px4": PX4, "ardupilot": ARDUPILOT}

@@ -1,4 +1,4 @@
-"""What the simulated autopilot decides: modes, arming, phases of flight, and whose acceleration is flown.
+"""What the simulated autopilot decides: modes, arming, phases of flight, and whose setpoint is flown.
 
 No bytes here: `autopilot.py` translates. There is no free fall, so disarming in the air is refused,
 forced or not.
@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from enum import Enum
 
-from sim.personality import ACCEPTED, DENIED, FAILED, TEMPORARILY_REJECTED, Mode, Personality, Role
-from sim.steering import BRAKE_MPS2, brake, climb, descend
-from sim.vehicle import Vehicle
+from sim.arming import reasons
+from sim.craft import Craft, SteeredPlant
+from sim.estimator import Estimator
+from sim.helm import Helm
+from sim.parameters import Parameters
+from sim.personality import ACCEPTED, FAILED, TEMPORARILY_REJECTED, Mode, Personality, Role
+from sim.setpoints import STOP, Ask, Setpoint
 from uavctl.data import Vec3
 
 SECOND_NS = 1_000_000_000
-STEER_NS = 20_000_000  # period of the vehicle's own braking, climbing and landing
+WATCH_NS = 20_000_000  # how often a climb or a descent is looked at
 STREAM_NS = SECOND_NS // 2  # PX4: setpoints must come faster than 2 Hz before OFFBOARD
 DISARM_NS = 2 * SECOND_NS  # from touching the floor to disarming
 NO_DOWN_NS = 5 * SECOND_NS  # length of a take-off or landing of a plant that has no vertical axis
@@ -22,6 +26,7 @@ TAKEOFF_HEIGHT_M = 2.5  # PX4's MIS_TAKEOFF_ALT
 TAKEOFF_DONE_M = 0.1
 CRASHED = "CRASHED"
 CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
+FORCED = 21196.0  # param2 of arming that skips the checks
 
 
 class Phase(Enum):
@@ -42,26 +47,44 @@ class Pilot:
     Attributes:
         texts: (severity, text) of what is to be said, in order; the caller empties it.
         crashed: why the autopilot's program died, None while it lives.
-        failsafe: whether the external mode was lost to silence.
+        failsafe: whether a failsafe chose the mode.
+        helm: knows which setpoint is flown.
+        home_m: where it was armed last, local NED.
     """
 
-    def __init__(self, kind: Personality, vehicle: Vehicle, start_ns: int, *, timeout_ns: int, airborne: bool) -> None:
+    def __init__(
+        self,
+        kind: Personality,
+        craft: Craft,
+        parameters: Parameters,
+        estimator: Estimator,
+        boot_ns: int,
+        *,
+        airborne: bool,
+    ) -> None:
         self._kind = kind
-        self._vehicle = vehicle
-        self._timeout_ns = timeout_ns
-        self._steer_ns = start_ns
+        self._craft = craft
+        self._steered = craft if isinstance(craft, SteeredPlant) else None
+        self._parameters = parameters
+        self._estimator = estimator
+        self._boot_ns = boot_ns
+        self._watch_ns = craft.now_ns
         self._phase_end_ns: int | None = None  # end of a timed climb or descent, or of the wait for disarming
+        self._disarm_text = kind.preflight_text
         self._takeoff_m = TAKEOFF_HEIGHT_M
         self._setpoints_ns: tuple[int | None, int | None] = (None, None)  # the last but one, the last
-        self._accel: Vec3 | None = (0.0, 0.0, 0.0) if airborne else None  # None: its own law
+        self._returns = False  # whether setpoints that come again end the failsafe
         self.texts: list[tuple[int, str]] = []
         self.crashed: str | None = None
         self.failsafe = False
         self.armed = airborne
         self.phase = Phase.AIR if airborne else Phase.GROUND
         self.mode: Mode = kind.by_role(Role.EXTERNAL) if airborne else kind.mode(kind.ground)
+        flown = Setpoint(Ask.ACCELERATION) if airborne else None
+        self.helm = Helm(kind, craft, parameters, estimator, flown)
+        self.home_m: Vec3 = (0.0, 0.0, 0.0)
         if not airborne:
-            vehicle.rest()
+            craft.rest()
 
     @property
     def external(self) -> bool:
@@ -69,24 +92,31 @@ class Pilot:
         return self.mode.role is Role.EXTERNAL and self.armed and self.phase is Phase.AIR
 
     @property
-    def _steers(self) -> bool:
-        """Whether the vehicle finds its acceleration by itself."""
-        return self.phase is not Phase.GROUND and not (self.external and self._accel is not None)
-
-    @property
     def _deadline_ns(self) -> int | None:
         """When silence has lasted too long; None when it does not matter."""
         last_ns = self._setpoints_ns[1]
-        matters = self.external and (self._accel is not None or self._kind.leaves_on_silence)
-        return last_ns + self._timeout_ns if matters and last_ns is not None else None
+        if last_ns is None or not self.external:
+            return None
+        if self._kind.name == "px4":
+            if self._parameters["COM_OBL_RC_ACT"] < 4:  # needs a radio: seen to go on as if nothing were
+                return None
+        elif self.helm.obeyed is None or self.helm.obeyed.ask is Ask.POSITION:  # a position is kept
+            return None
+        return last_ns + max(round(self._parameters[self._kind.timeout] * 1e9), 0)
 
     @property
     def next_ns(self) -> int | None:
         """Time of the next thing to do of itself [ns]."""
         times = [at_ns for at_ns in (self._phase_end_ns, self._deadline_ns) if at_ns is not None]
-        if self._steers:
-            times.append(self._steer_ns)
+        if self._watches:
+            times.append(self._watch_ns)
+        if self._steered is not None and self._steered.next_ns is not None:
+            times.append(self._steered.next_ns)
         return min(times, default=None)
+
+    @property
+    def _watches(self) -> bool:
+        return self.phase in (Phase.CLIMB, Phase.DESCENT) and self._craft.has_down
 
     def run(self, at_ns: int) -> None:
         """Do what is due at `at_ns`, the vehicle being there."""
@@ -94,42 +124,65 @@ class Pilot:
             self._on_silence(at_ns)
         if self._phase_end_ns is not None and self._phase_end_ns <= at_ns:
             self._end_phase(at_ns)
-        if self._steers and self._steer_ns <= at_ns:
-            self._steer(at_ns)
+        if self._watches and self._watch_ns <= at_ns:
+            self._watch(at_ns)
+        steered = self._steered
+        if steered is not None and steered.next_ns is not None and steered.next_ns <= at_ns:
+            steered.steer()
 
-    def setpoint(self, accel: Vec3 | None, at_ns: int) -> None:
-        """Take a setpoint; None is one that asks for nothing flyable, on which the vehicle stops."""
+    def setpoint(self, setpoint: Setpoint, at_ns: int) -> None:
+        """Take a setpoint of a kind that counts for the stream."""
+        if setpoint.ask is Ask.FATAL:
+            if self.external:
+                self.crash("a setpoint was not a number")
+            return
         self._setpoints_ns = (self._setpoints_ns[1], at_ns)
-        if self.failsafe:  # as recorded: setpoints that come again end PX4's failsafe by themselves
+        if self._returns:  # as recorded: setpoints that come again end PX4's failsafe by themselves
             self._enter(self._kind.by_role(Role.EXTERNAL), at_ns)
         if self.external:
-            self._obey(accel, at_ns)
+            self.helm.obey(setpoint)
 
     def crash(self, why: str) -> None:
         """The autopilot's program dies; nothing is decided, said or answered from now on."""
         self.crashed = why
-        self._vehicle.accelerate((0.0, 0.0, 0.0))
+        self._craft.accelerate((0.0, 0.0, 0.0))
 
     # Commands, each giving a MAV_RESULT
 
-    def arm(self, at_ns: int) -> int:
-        """Arm, on the floor or (without effect) when armed already."""
-        if not self.armed:
-            self.armed = True
-            self._phase_end_ns = None
-            self.texts.append((INFO, self._kind.armed_text))
-            if self.mode.role is Role.TAKEOFF:
-                self._climb(at_ns)
+    def arm(self, at_ns: int, *, forced: bool = False) -> int:
+        """Arm, on the floor or (without effect) when armed already; forced skips the checks."""
+        if self.armed:
+            return ACCEPTED
+        why = reasons(
+            self._kind, self.mode, self._parameters, self._estimator, self._craft.battery, at_ns - self._boot_ns
+        )
+        if why and not forced:
+            self.texts.extend((CRITICAL, text) for text in why)
+            return self._kind.refused_arming
+        self.armed = True
+        self.home_m = self._estimator.position_m
+        self._phase_end_ns, self._disarm_text = self._self_disarm_ns(at_ns), self._kind.preflight_text
+        self.texts.append((INFO, self._kind.armed_text))
+        if self.mode.role is Role.TAKEOFF:
+            self._climb(at_ns)
         return ACCEPTED
+
+    def _self_disarm_ns(self, at_ns: int) -> int | None:
+        wait_s = self._parameters[self._kind.preflight_timeout]
+        return at_ns + round(wait_s * 1e9) if wait_s > 0.0 else None
 
     def disarm(self) -> int:
         """Disarm, on the floor only."""
         if self.phase is not Phase.GROUND:
             self.texts.append((CRITICAL, "Disarming denied: not landed"))
-            return FAILED if self._kind.name == "ardupilot" else DENIED
-        self.armed = False
-        self._phase_end_ns = None
+            return self._kind.refused_disarming
+        self._disarm()
         return ACCEPTED
+
+    def _disarm(self) -> None:
+        self.armed = self.failsafe = self._returns = False
+        self._phase_end_ns = None
+        self._craft.rest()
 
     def take_off(self, height_m: float | None, at_ns: int) -> int:
         """Climb to a height above the floor [m]; PX4 changes to its take-off mode, ArduPilot stays GUIDED."""
@@ -143,12 +196,22 @@ class Pilot:
         return ACCEPTED
 
     def change(self, mode: Mode, at_ns: int) -> int:
-        """Change the mode; PX4's OFFBOARD needs a stream of setpoints before."""
+        """Change the mode; PX4's OFFBOARD needs a stream of setpoints before, and most modes a position."""
+        px4 = self._kind.name == "px4"
+        if mode.needs_position and not self._estimator.position_ok and (self.armed or not px4):
+            what = "switching to this mode is currently not available" if px4 else f"{mode.name} requires position"
+            self.texts.append((WARNING, f"Mode change failed: {what}"))
+            return TEMPORARILY_REJECTED if px4 else FAILED
         if mode.role is Role.EXTERNAL and self._kind.needs_stream and not self._streaming(at_ns):
             self.texts.append((CRITICAL, "OFFBOARD refused: no setpoints above 2 Hz"))
             return TEMPORARILY_REJECTED
         self._enter(mode, at_ns)
         return ACCEPTED
+
+    def fail(self, role: Role, at_ns: int, *, returns: bool = False) -> None:
+        """A failsafe changes the mode; with `returns`, setpoints that come again end it."""
+        self._enter(self._kind.by_role(role), at_ns)
+        self.failsafe, self._returns = True, returns
 
     def _streaming(self, at_ns: int) -> bool:
         before_ns, last_ns = self._setpoints_ns
@@ -160,71 +223,67 @@ class Pilot:
 
     def _enter(self, mode: Mode, at_ns: int) -> None:
         self.mode = mode
-        self.failsafe = False
+        self.failsafe = self._returns = False
         if self.phase is Phase.GROUND:
             if mode.role is Role.TAKEOFF and self.armed:
                 self._climb(at_ns)
             return
         lands = mode.role is Role.LAND
         self.phase = Phase.DESCENT if lands else Phase.AIR
-        self._phase_end_ns = at_ns + NO_DOWN_NS if lands and not self._vehicle.has_down else None
-        self._obey(None, at_ns)
+        self._phase_end_ns = at_ns + NO_DOWN_NS if lands and not self._craft.has_down else None
+        self._fly_itself(at_ns)
 
     def _climb(self, at_ns: int) -> None:
-        self._vehicle.grounded = False
+        self._craft.grounded = False
         self.phase = Phase.CLIMB
-        self._phase_end_ns = None if self._vehicle.has_down else at_ns + NO_DOWN_NS
-        self._obey(None, at_ns)
+        self._phase_end_ns = None if self._craft.has_down else at_ns + NO_DOWN_NS
+        self._fly_itself(at_ns)
 
     def _end_phase(self, at_ns: int) -> None:
         self._phase_end_ns = None
         if self.phase is Phase.GROUND:
-            self.armed = False
-            self.texts.append((INFO, self._kind.disarmed_text))
+            self.texts.append((INFO, self._disarm_text))
+            self._disarm()
         elif self.phase is Phase.CLIMB:
             self._climbed(at_ns)
         else:
+            self._touch(at_ns)
+
+    def _watch(self, at_ns: int) -> None:
+        self._watch_ns = at_ns + WATCH_NS
+        if self.phase is Phase.CLIMB:
+            if self._estimator.position_m[2] <= TAKEOFF_DONE_M - self._takeoff_m:
+                self._climbed(at_ns)
+        elif self._craft.landed:
             self._touch(at_ns)
 
     def _climbed(self, at_ns: int) -> None:
         self._enter(self._kind.by_role(Role.HOLD) if self.mode.role is Role.TAKEOFF else self.mode, at_ns)
 
     def _touch(self, at_ns: int) -> None:
-        self._vehicle.rest()
+        if self._steered is not None:  # its plant would fall through the floor
+            self._craft.rest()
         self.phase = Phase.GROUND
-        self._phase_end_ns = at_ns + DISARM_NS
+        self.helm.obeyed = None
+        self._phase_end_ns, self._disarm_text = at_ns + DISARM_NS, self._kind.disarmed_text
         self.texts.append((INFO, "Landing detected"))
 
     def _on_silence(self, at_ns: int) -> None:
-        if self._kind.leaves_on_silence:
-            self._enter(self._kind.by_role(Role.HOLD), at_ns)
-            self.failsafe = True
+        if self._kind.name == "px4":
+            lands = self._parameters["COM_OBL_RC_ACT"] == 4
+            self.fail(Role.LAND if lands else Role.HOLD, at_ns, returns=True)
             self.texts.append((CRITICAL, "Failsafe activated"))
         else:
-            self._obey(None, at_ns)
+            self._fly_itself(at_ns)
 
-    # Motion
-
-    def _obey(self, accel: Vec3 | None, at_ns: int) -> None:
-        """Fly this acceleration, or with None what the vehicle finds by itself."""
-        self._accel = accel
-        if accel is None:
-            self._steer(at_ns)
+    def _fly_itself(self, at_ns: int) -> None:
+        """Fly what the phase asks for."""
+        self.helm.obeyed = None
+        if self.phase is Phase.CLIMB:
+            self._craft.take_off(self._takeoff_m)
+        elif self.phase is Phase.DESCENT:
+            self._craft.land()
         else:
-            self._vehicle.accelerate(accel)
-
-    def _steer(self, at_ns: int) -> None:
-        self._steer_ns = at_ns + STEER_NS
-        where, speed = self._vehicle.position_m, self._vehicle.velocity_mps
-        north, east, down = brake(speed, BRAKE_MPS2)
-        if self.phase is Phase.CLIMB and self._vehicle.has_down:
-            if where[2] <= TAKEOFF_DONE_M - self._takeoff_m:
-                self._climbed(at_ns)
-                return
-            down = climb(where[2], speed[2], -self._takeoff_m)
-        elif self.phase is Phase.DESCENT and self._vehicle.has_down:
-            if where[2] >= 0.0:
-                self._touch(at_ns)
-                return
-            down = descend(speed[2])
-        self._vehicle.accelerate((north, east, down))
+            self.helm.obey(STOP)
+        if self._watches:
+            self._watch(at_ns)

@@ -41,6 +41,7 @@ class Quadrotor:
         position_m: position at the start, NED.
         velocity_mps: velocity at the start, NED.
         airframe: whose figures it has.
+        charge: of the battery at the start.
     """
 
     def __init__(
@@ -53,16 +54,17 @@ class Quadrotor:
         position_m: Vec3 = ZERO,
         velocity_mps: Vec3 = ZERO,
         airframe: Airframe = CRAZYFLIE_2,
+        charge: float = 1.0,
     ) -> None:
         self.model = model
-        self.battery = Battery(airframe)
+        self.battery = Battery(airframe, charge=charge)
         self.cascade = Cascade(autopilot, STEP_S)
         self.now_ns = start_ns
         self._airframe = airframe
         self._body = Body.of(airframe)
         self._rotors = Rotors(airframe, STEP_S)
         self._loop = AttitudeLoop(airframe, self.cascade.tuning.attitude_gain_1ps, STEP_S)
-        self._wind = wind
+        self.wind = wind
         self._motion = Motion(position_m, velocity_mps, LEVEL, ZERO)
         self._grid_ns = start_ns
         self._touched_ns: int | None = None
@@ -119,7 +121,7 @@ class Quadrotor:
     @property
     def wind_mps(self) -> Vec3:
         """Velocity of the air in NED [m/s]."""
-        return self._wind.velocity_mps
+        return self.wind.velocity_mps
 
     @property
     def acceleration_mps2(self) -> Vec3:
@@ -128,7 +130,7 @@ class Quadrotor:
             return ZERO
         wrench = self._rotors.wrench(self._rotors.speeds_rps)
         motion = self._motion
-        return acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self._wind.velocity_mps)
+        return acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps)
 
     @property
     def landed(self) -> bool:
@@ -235,7 +237,7 @@ class Quadrotor:
             raise ValueError(f"time cannot go back from {self.now_ns} to {to_ns} ns")
         while self._grid_ns + STEP_NS <= to_ns:
             self._grid_ns += STEP_NS
-            self._wind.step()
+            self.wind.step()
             if self._grounded:
                 self._rotors.step()
                 self.battery.drain(0.0, STEP_S)
@@ -247,7 +249,7 @@ class Quadrotor:
         motion = self._motion
         self._control(motion if self._errors is None else _mistaken(motion, *self._errors))
         wrenches = self._rotors.step()
-        self._motion = step(self._body, motion, wrenches, self._wind.velocity_mps, STEP_S)
+        self._motion = step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
         self.battery.drain(wrenches[0].thrust_n, STEP_S)
         self._meet_the_floor(motion)
 

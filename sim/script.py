@@ -40,18 +40,25 @@ class ScriptedChannel:
 
     def __init__(self, delays_ns: tuple[int | None, ...]) -> None:
         self._delays_ns = delays_ns
+        self._number = 0  # of the next packet
         self._pending: list[tuple[int, int, bytes]] = []
         self.counters = Counters()
 
     def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
         """Send a packet at `at_ns`; a `certain` one is not lost, and not late if it was to be lost."""
-        number = self.counters.sent
+        number = self._number
+        self._number += 1
         self.counters.sent += 1
         delay_ns = self._delays_ns[number] if number < len(self._delays_ns) else None
         if delay_ns is None and not certain:
             self.counters.lost += 1
             return
         heapq.heappush(self._pending, (at_ns + (delay_ns or 0), number, data))
+
+    def pass_over(self, at_ns: int) -> None:
+        """Nothing is sent where a packet was due: the next one is told what goes for the packet after."""
+        del at_ns
+        self._number += 1
 
     def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
         """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""

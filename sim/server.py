@@ -1,11 +1,12 @@
-"""The simulated peers on real sockets, in real time."""
+"""The simulated peers on real sockets, in real time or a multiple of it."""
 
 from __future__ import annotations
 
+import math
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
@@ -18,7 +19,7 @@ from uavctl.config.types import Config
 from uavctl.data import Truth
 
 # Longest sleep, so that `stop` is asked often enough.
-NAP_NS = 50_000_000
+NAP_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,16 @@ def grid_start(now_ns: int, dt_ns: int) -> int:
     return -(-now_ns // dt_ns) * dt_ns
 
 
+@dataclass(frozen=True)
+class Seat:
+    """One simulated vehicle: its configuration, its URLs (equal ones are one connection), and who hears the truth."""
+
+    config: Config
+    vehicle: str
+    mocap: str
+    on_truth: Callable[[Truth], None]
+
+
 def serve(
     config: Config,
     vehicle_url: str,
@@ -46,63 +57,111 @@ def serve(
     on_truth: Callable[[Truth], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Run the peers until `stop()` or the end of the duration; what was missed is caught up in virtual time.
+    """Run the peers of one vehicle in real time; see `serve_all`."""
+    seat = Seat(config, vehicle_url, mocap_url, on_truth)
+    serve_all((seat,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop)
+
+
+def serve_all(
+    seats: Sequence[Seat],
+    *,
+    duration_s: float | None,
+    airborne: bool,
+    on_ready: Callable[[Ready], None],
+    stop: Callable[[], bool],
+    speed: float = 1.0,
+) -> None:
+    """Run the peers of each seat until `stop()` or the end of the duration.
+
+    What was missed is caught up in virtual time.
 
     Args:
-        config: the whole configuration.
-        vehicle_url: udpout (PX4 sends *to* the client's port), udpin, or tcpin.
-        mocap_url: the same for the cameras; an equal URL is one connection.
-        duration_s: length of the run [s], None for ever.
+        seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin.
+        duration_s: length of the run, in simulated time [s], None for ever.
         airborne: start flying in the external mode, else on the floor and disarmed.
-        on_ready: called once, the ports being open.
-        on_truth: gets every `Truth`, see `Peers`.
+        on_ready: called once for each vehicle, all ports being open.
         stop: asked at least every 50 ms.
+        speed: simulated time per real time.
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
     """
-    shared = vehicle_url == mocap_url
-    ports: dict[str, Port] = {}
+    opened: list[dict[str, Port]] = []
     try:
-        ports[VEHICLE] = open_port(vehicle_url)
-        if not shared:
-            ports[MOCAP] = open_port(mocap_url)
-        dt_ns = round(config.plant.dt_s * 1e9)
-        start_ns = grid_start(time.monotonic_ns(), dt_ns)
-        end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
-        peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth)
-        on_ready(Ready(ports[VEHICLE].url, ports[VEHICLE if shared else MOCAP].url, start_ns))
-        _run(peers, ports, end_ns, stop)
+        for seat in seats:
+            ports: dict[str, Port] = {}
+            opened.append(ports)
+            ports[VEHICLE] = open_port(seat.vehicle)
+            if seat.mocap != seat.vehicle:
+                ports[MOCAP] = open_port(seat.mocap)
+        # One grid for all: a multiple of every step.
+        dt_ns = math.lcm(*(round(seat.config.plant.dt_s * 1e9) for seat in seats))
+        clock = _Clock(grid_start(time.monotonic_ns(), dt_ns), speed)
+        end_ns = None if duration_s is None else clock.start_ns + round(duration_s * 1e9)
+        worlds = [_world(seat, ports, clock.start_ns, airborne) for seat, ports in zip(seats, opened, strict=True)]
+        for ports in opened:
+            on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
+        _run(worlds, clock, end_ns, stop)
     finally:
-        for port in ports.values():
-            port.close()
+        for ports in opened:
+            for port in ports.values():
+                port.close()
 
 
-def _run(peers: Peers, ports: dict[str, Port], end_ns: int | None, stop: Callable[[], bool]) -> None:
+@dataclass(frozen=True)
+class _Clock:
+    """Simulated time, `speed` times as quick as real time from `start_ns` on."""
+
+    start_ns: int
+    speed: float
+
+    def now_ns(self) -> int:
+        return self.start_ns + round((time.monotonic_ns() - self.start_ns) * self.speed)
+
+    def left_s(self, until_ns: int) -> float:
+        """Real time until a simulated time."""
+        return max(0, until_ns - self.now_ns()) * 1e-9 / self.speed
+
+
+_World = tuple[Peers, dict[str, Port]]
+
+
+def _world(seat: Seat, ports: dict[str, Port], start_ns: int, airborne: bool) -> _World:
+    shared = seat.mocap == seat.vehicle
+    return Peers(seat.config, start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth), ports
+
+
+def _run(worlds: Sequence[_World], clock: _Clock, end_ns: int | None, stop: Callable[[], bool]) -> None:
+    sockets = [port for _, ports in worlds for port in ports.values()]
     while not stop():
-        now_ns = time.monotonic_ns()
+        now_ns = clock.now_ns()
         if end_ns is not None and now_ns >= end_ns:
             break
-        if now_ns >= peers.now_ns:  # else the start of the grid is still to come
-            for _, link, data in peers.advance(now_ns):
-                ports[link].write(data)
-        until_ns = min(peers.next_ns, now_ns + NAP_NS, end_ns or peers.next_ns)
-        _wait(ports, until_ns)
-        for link, port in ports.items():
-            for data in port.read():
-                at_ns = time.monotonic_ns()
-                if at_ns >= peers.now_ns:
-                    peers.receive(link, data, at_ns)
-    peers.flush()
+        for peers, ports in worlds:
+            if now_ns >= peers.now_ns:  # else the start of the grid is still to come
+                for _, link, data in peers.advance(now_ns):
+                    ports[link].write(data)
+        until_ns = min(peers.next_ns for peers, _ in worlds)
+        if end_ns is not None:
+            until_ns = min(until_ns, end_ns)
+        _wait(sockets, min(clock.left_s(until_ns), NAP_S))
+        for peers, ports in worlds:
+            for link, port in ports.items():
+                for data in port.read():
+                    at_ns = clock.now_ns()
+                    if at_ns >= peers.now_ns:
+                        peers.receive(link, data, at_ns)
+    for peers, _ in worlds:
+        peers.flush()
 
 
-def _wait(ports: dict[str, Port], until_ns: int) -> None:
-    """Sleep until a time or the first incoming bytes; select(2), since epoll's sleep is in milliseconds."""
-    sockets: list[socket.socket] = [one for port in ports.values() for one in port.sockets()]
+def _wait(ports: Sequence[Port], longest_s: float) -> None:
+    """Sleep for a time or until the first incoming bytes; select(2), since epoll's sleep is in milliseconds."""
+    sockets: list[socket.socket] = [one for port in ports for one in port.sockets()]
     with SelectSelector() as selector:
         for one in sockets:
             selector.register(one, EVENT_READ)
-        selector.select(max(0, until_ns - time.monotonic_ns()) * 1e-9)
+        selector.select(longest_s)
 
 
 def serve_in_child(

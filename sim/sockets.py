@@ -1,10 +1,11 @@
-"""The simulator's own sockets: datagrams in and out over UDP or one TCP client; nothing blocks."""
+"""The simulator's own sockets: datagrams in and out over UDP or TCP; nothing blocks."""
 
 from __future__ import annotations
 
 import socket
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -12,6 +13,7 @@ from uavctl.errors import ConnectionSpecError
 
 LARGEST_DATAGRAM = 65535
 LARGEST_BACKLOG = 1 << 16  # a TCP client that leaves more unread is dropped [bytes]
+MOST_CLIENTS = 8  # of a TCP port
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01
 # What a peer that is not there, or not there any more, does to a socket.
@@ -92,15 +94,44 @@ class UdpPort:
         self._socket.close()
 
 
+@dataclass
+class _Client:
+    """One connection to a `TcpPort`."""
+
+    socket: socket.socket
+    stream: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
+    backlog: bytearray = field(default_factory=bytearray)  # to go
+
+    def read(self) -> bool:
+        """Take all that has come; False when the client is gone."""
+        try:
+            while data := self.socket.recv(LARGEST_DATAGRAM):
+                self.stream += data
+        except BlockingIOError:
+            return True
+        except GONE:
+            pass
+        return False
+
+    def write(self, data: bytes) -> bool:
+        """Send in order what the socket takes now; False when the client is gone or leaves too much unread."""
+        self.backlog += data
+        try:
+            del self.backlog[: self.socket.send(self.backlog)]
+        except BlockingIOError:
+            return len(self.backlog) <= LARGEST_BACKLOG
+        except GONE:
+            return False
+        return True
+
+
 class TcpPort:
-    """A listening TCP socket with one client at a time, as ArduPilot's simulator has on port 5760."""
+    """A listening TCP socket, as ArduPilot's simulator has on port 5760; every client gets everything."""
 
     def __init__(self, address: tuple[str, int]) -> None:
-        self._listener = socket.create_server(address, backlog=1)
+        self._listener = socket.create_server(address, backlog=MOST_CLIENTS)
         self._listener.setblocking(False)
-        self._client: socket.socket | None = None
-        self._stream = bytearray()
-        self._backlog = bytearray()
+        self._clients: list[_Client] = []
 
     @property
     def url(self) -> str:
@@ -110,53 +141,75 @@ class TcpPort:
 
     def sockets(self) -> tuple[socket.socket, ...]:
         """What to wait for."""
-        return (self._listener,) if self._client is None else (self._client,)
+        return self._listener, *(client.socket for client in self._clients)
 
     def read(self) -> list[bytes]:
-        """Accept a client if there is none; then every whole frame that has come."""
+        """Accept who is there; then every whole frame that has come."""
         with suppress(BlockingIOError):
-            if self._client is None:
-                self._client, _ = self._listener.accept()
-                self._client.setblocking(False)
-                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            while self._client is not None:
-                self._take(self._client)
-        return cut_frames(self._stream)
+            while True:
+                self._accept()
+        frames = []
+        for client in self._clients.copy():
+            stays = client.read()
+            frames += cut_frames(client.stream)
+            if not stays:
+                self._drop(client)
+        return frames
 
-    def _take(self, client: socket.socket) -> None:
-        try:
-            data = client.recv(LARGEST_DATAGRAM)
-        except GONE:
-            data = b""
-        if data:
-            self._stream += data
-        else:
-            self._drop()
+    def _accept(self) -> None:
+        one, _ = self._listener.accept()
+        if len(self._clients) >= MOST_CLIENTS:
+            one.close()
+            return
+        one.setblocking(False)
+        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients.append(_Client(one))
 
     def write(self, data: bytes) -> None:
-        """Send to the client, in order; what the socket does not take at once waits for the next call."""
-        if self._client is None:
-            return
-        self._backlog += data
-        try:
-            del self._backlog[: self._client.send(self._backlog)]
-        except BlockingIOError:
-            if len(self._backlog) > LARGEST_BACKLOG:
-                self._drop()
-        except GONE:
-            self._drop()
+        """Send to every client."""
+        for client in self._clients.copy():
+            if not client.write(data):
+                self._drop(client)
 
-    def _drop(self) -> None:
-        if self._client is not None:
-            self._client.close()
-        self._client = None
-        self._stream.clear()
-        self._backlog.clear()
+    def _drop(self, client: _Client) -> None:
+        client.socket.close()
+        self._clients.remove(client)
 
     def close(self) -> None:
-        """Close the client and the listening socket."""
-        self._drop()
+        """Close the clients and the listening socket."""
+        for client in self._clients.copy():
+            self._drop(client)
         self._listener.close()
+
+
+class Ports:
+    """Several ports as one: what is sent goes out at all of them."""
+
+    def __init__(self, ports: list[Port]) -> None:
+        self._ports = ports
+
+    @property
+    def url(self) -> str:
+        """The URLs, separated by commas."""
+        return ",".join(port.url for port in self._ports)
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """What to wait for."""
+        return tuple(one for port in self._ports for one in port.sockets())
+
+    def read(self) -> list[bytes]:
+        """Everything that has come, at any port."""
+        return [data for port in self._ports for data in port.read()]
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram at every port."""
+        for port in self._ports:
+            port.write(data)
+
+    def close(self) -> None:
+        """Close every port."""
+        for port in self._ports:
+            port.close()
 
 
 def cut_frames(stream: bytearray) -> list[bytes]:
@@ -179,11 +232,22 @@ def cut_frames(stream: bytearray) -> list[bytes]:
 
 
 def open_port(url: str) -> Port:
-    """Open a port from its URL.
+    """Open a port from its URL, or several from URLs separated by commas.
 
     Raises:
         ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
     """
+    opened: list[Port] = []
+    try:
+        for one in url.split(","):
+            opened.append(_open(one.strip()))
+    except ConnectionSpecError:
+        Ports(opened).close()
+        raise
+    return opened[0] if len(opened) == 1 else Ports(opened)
+
+
+def _open(url: str) -> Port:
     kinds: dict[str, Callable[[tuple[str, int]], Port]] = {
         "udpout": lambda address: UdpPort("udpout", address),
         "udpin": lambda address: UdpPort("udpin", address),

@@ -137,7 +137,12 @@ class Vehicle:
 
     w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
     changed. Axes that the plant has not stay at their start position. With a `script`, plant, start and w are its.
+
+    Attributes:
+        attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
     """
+
+    attitude = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(
         self, config: Config, seed: np.random.SeedSequence, start_ns: int, script: Script | None = None

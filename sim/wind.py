@@ -132,6 +132,12 @@ class Wind:
         self._down = _Across(figures.sigma_down_mps, figures.time_down_s, step_s, (four, five))
         self._tell()
 
+    def blow(self, mean_mps: Vec3) -> None:
+        """Change the steady wind; the gusts keep strength, scales and direction."""
+        north, east, down = (v - m for v, m in zip(self.velocity_mps, self._mean_mps, strict=True))
+        self._mean_mps = mean_mps
+        self.velocity_mps = (mean_mps[0] + north, mean_mps[1] + east, mean_mps[2] + down)
+
     def _draw(self) -> list[float]:
         if self._used == len(self._normals):
             self._normals = self._rng.standard_normal(DRAWS).tolist()

@@ -1,15 +1,22 @@
-"""One cache of policy libraries for a whole test run: for all its processes and the commands that they start."""
+"""One cache of policy libraries for a whole test run, and what is collected only when it is asked for by its path."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 import pytest
 
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    # Real clients need interpreters of their own: `make test-clients`.
+    asked = any("clients" in argument for argument in config.args)
+    return True if collection_path.name == "clients" and not asked else None
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -39,6 +39,16 @@ class Client:
             mavlink.MAVLink_set_position_target_local_ned_message(0, system, 1, frame, mask, *zeros, *accel, 0.0, 0.0)
         )
 
+    def position(self, *where: float, frame: int = 1) -> bytes:
+        zeros = [0.0] * 8
+        return self.pack(mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, 0xDF8, *where, *zeros))
+
+    def velocity(self, *speed: float, frame: int = 1) -> bytes:
+        zeros = [0.0] * 5
+        return self.pack(
+            mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, 0xDC7, 0, 0, 0, *speed, *zeros)
+        )
+
     def command(self, command: int, *params: float, system: int = 1) -> bytes:
         seven = (*params, *([0.0] * (7 - len(params))))
         return self.pack(mavlink.MAVLink_command_long_message(system, 1, command, 0, *seven))

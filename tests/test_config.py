@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
+import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
 from uavctl.config.index import key_lines
+from uavctl.config.mission import FenceConfig
 from uavctl.config.reference import render
 from uavctl.errors import ConfigError, DesignError
 
@@ -51,6 +55,17 @@ def test_a_file_is_the_same_as_the_preset(tmp_path: Path) -> None:
 def test_dumped_text_gives_an_equal_configuration(preset: str) -> None:
     config = load_config(preset, ["link.blackout=[[1, 2.5]]", "link.loss=0.1", "estimator.position_std_m=1e-7"])
     assert parse(dump_config(config), "dump").config == config
+
+
+@given(name=st.text(), numbers=st.lists(st.floats(min_value=0.0) | st.just(math.inf), min_size=1))
+@settings(max_examples=200, deadline=None)
+def test_any_text_and_any_number_is_dumped_as_it_is(name: str, numbers: list[float]) -> None:
+    config = load_config("paper")
+    link = msgspec.structs.replace(config.link, trace_s=tuple(numbers), blackout=((0.0, 5e-324), (1e16, 1e300)))
+    fence = (FenceConfig(state=name, side="upper", times_s=(0.0,), values=(1e-7,)),) * 2
+    config = msgspec.structs.replace(config, name=name, link=link, fence=fence)
+    table = tomllib.loads(dump_config(config))
+    assert msgspec.convert(table, Config) == config
 
 
 def test_overrides_take_toml_values_bare_strings_and_the_last_one_wins() -> None:

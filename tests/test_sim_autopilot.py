@@ -62,7 +62,7 @@ def test_a_stream_can_be_asked_for_stopped_and_reset() -> None:
     assert in_a_second() == 0
     assert one.ask(INTERVAL, 32, 0) == 0
     assert in_a_second() == 10
-    for params in ((33, 1000), (32, math.nan), (math.nan, 0), (32, -2)):
+    for params in ((250, 1000), (32, math.nan), (math.nan, 0), (32, -2)):
         assert one.ask(INTERVAL, *params) == 4
 
 

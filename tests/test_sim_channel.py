@@ -131,12 +131,63 @@ def test_blackout_loses_everything_from_its_first_to_its_last_instant() -> None:
     assert ch.counters.lost == 7
 
 
+def test_a_backlog_comes_all_at_once_at_the_end_of_its_span_and_in_order() -> None:
+    ch = channel(start_ns=5 * MS, delay_s=0.005, held=((0.06, 0.08), (0.02, 0.05)))
+    for i in range(10):
+        ch.push(5 * MS + i * 10 * MS, packet(i))
+    # on their way for 5 ms: packets 2, 3, 4 would come at 25, 35, 45 ms, packets 6, 7 at 65, 75 ms
+    got = ch.pop_due(10**18)
+    assert [at_ns // MS - 5 for at_ns, _ in got] == [5, 15, 50, 50, 50, 55, 80, 80, 85, 95]
+    assert numbers(got) == list(range(10))
+    assert ch.counters.lost == 0
+
+
+def test_a_backlog_is_in_the_order_of_arrival_not_of_sending() -> None:
+    free, held = channel(jitter_s=0.1), channel(jitter_s=0.1, held=((0.0, 1.0),))
+    assert numbers(arrivals(held, 50)) == numbers(arrivals(free, 50)) != list(range(50))
+
+
+def test_spans_of_backlog_that_touch_are_one() -> None:
+    ch = channel(held=((0.01, 0.02), (0.02, 0.03)))
+    ch.push(15 * MS, b"a")
+    assert ch.next_ns == 30 * MS
+
+
+def test_oversized_datagrams_are_the_packet_and_padding() -> None:
+    ch = channel(oversize=0.25)
+    got = arrivals(ch, 4000)
+    large = [data for _, data in got if len(data) > 32]
+    assert len(large) == ch.counters.oversized
+    assert abs(len(large) / 4000 - 0.25) < 4 * math.sqrt(0.25 * 0.75 / 4000)
+    assert {len(data) for data in large} == {5000}  # beyond the 4096 bytes that the other end takes
+    assert [data[:32] for _, data in got] == [packet(i) for i in range(4000)]
+
+
+def test_what_is_not_sent_shifts_no_draw() -> None:
+    link: dict[str, Any] = {"loss": 0.3, "jitter_s": 0.2, "duplicate": 0.2, "corrupt": 0.2, "truncate": 0.2}
+    bursts = {"model": "gilbert-elliott", "burst_enter": 0.2, "burst_leave": 0.3}
+    for more in ({}, bursts, {"model": "empirical", "gaps": (0.5, 0.2, 0.3)}):
+        whole, holes = channel(**link, **more), channel(**link, **more)
+        for i in range(400):
+            whole.push(i * 10 * MS, packet(i))
+            if 100 <= i < 200:
+                holes.pass_over(i * 10 * MS)
+            else:
+                holes.push(i * 10 * MS, packet(i))
+        assert holes.counters.sent == 300
+        rest = set(holes.pop_due(10**18))
+        everything = set(whole.pop_due(10**18))
+        assert rest < everything
+
+
 OTHERS: dict[str, dict[str, Any]] = {
     "loss": {"loss": 0.3},
     "bursts": {"model": "gilbert-elliott", "burst_enter": 0.1, "burst_leave": 0.3},
     "duplicate": {"duplicate": 0.2},
     "corrupt": {"corrupt": 0.2},
     "truncate": {"truncate": 0.2},
+    "oversize": {"oversize": 0.2},
+    "held": {"held": ((100.0, 101.0),)},
     "blackout": {"blackout": ((1.0, 2.0),)},
 }
 

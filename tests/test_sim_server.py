@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sim_rig import Client, decode
 
-from sim.server import Ready, grid_start, serve, serve_in_child
+from sim.server import Ready, Seat, grid_start, serve, serve_all, serve_in_child
 from sim.sockets import cut_frames, open_port
 from uavctl.config import Config, load_config
 from uavctl.data import Truth
@@ -175,6 +175,70 @@ def test_tcp_takes_a_client_a_stream_in_pieces_and_the_next_client() -> None:
                 assert tcp_until(sock, "HEARTBEAT").base_mode == 81
 
 
+def test_several_tcp_clients_get_the_same_and_are_all_heard() -> None:
+    mocap, mocap_url = udp()
+    ardupilot = config("sim.autopilot=ardupilot")
+    with mocap, serving(ardupilot, "tcpin://127.0.0.1:0", mocap_url, duration_s=None, airborne=False) as served:
+        assert served.ready is not None
+        address = ("127.0.0.1", int(served.ready.vehicle.rsplit(":", 1)[1]))
+        with (
+            socket.create_connection(address, timeout=2.0) as one,
+            socket.create_connection(address, timeout=2.0) as two,
+        ):
+            for sock in (one, two):
+                tcp_until(sock, "HEARTBEAT")
+            one.sendall(Client().timesync(1))
+            assert tcp_until(one, "TIMESYNC").ts1 == tcp_until(two, "TIMESYNC").ts1 == 1
+            two.sendall(Client().timesync(2))
+            assert tcp_until(one, "TIMESYNC").ts1 == tcp_until(two, "TIMESYNC").ts1 == 2
+            one.close()
+            two.sendall(Client().timesync(3))
+            assert tcp_until(two, "TIMESYNC").ts1 == 3
+
+
+def test_a_tcp_client_that_reads_nothing_is_dropped_and_the_others_stay() -> None:
+    port = open_port("tcpin://127.0.0.1:0")
+    address = ("127.0.0.1", int(port.url.rsplit(":", 1)[1]))
+    with socket.create_connection(address) as lazy, socket.create_connection(address, timeout=2.0) as keen:
+        while len(port.sockets()) < 3:
+            port.read()
+        taken = 0
+        for _ in range(10_000):  # 160 MB: more than any socket keeps
+            port.write(bytes(1 << 14))
+            taken += len(keen.recv(1 << 20))
+            if len(port.sockets()) == 2:
+                break
+        assert len(port.sockets()) == 2 and taken > 1 << 16
+        lazy.settimeout(2.0)
+        port.write(b"end")
+        while not (last := keen.recv(1 << 20)).endswith(b"end"):
+            assert last
+    port.close()
+
+
+def test_px4_sends_to_several_ports_and_listens_at_all_of_them() -> None:
+    one, one_url = udp()
+    two, two_url = udp()
+    mocap, mocap_url = udp()
+    urls = f"{one_url},{two_url}"
+    with one, two, mocap, serving(config(), urls, mocap_url, duration_s=None) as served:
+        assert served.ready is not None and served.ready.vehicle == urls
+        for sock in (one, two):
+            mine = sock.getsockname()[1]
+            beat = listen(sock, is_a("HEARTBEAT"))[-1]
+            sock.sendto(Client().timesync(mine), beat.sender)
+            listen(sock, lambda msg, mine=mine: msg.get_type() == "TIMESYNC" and msg.ts1 == mine)
+
+
+def test_of_several_ports_one_that_cannot_be_opened_closes_the_others() -> None:
+    free, _ = udp()
+    port = free.getsockname()[1]
+    free.close()
+    with pytest.raises(ConnectionSpecError, match="write udpout"):
+        open_port(f"udpin://127.0.0.1:{port},nonsense")
+    open_port(f"udpin://127.0.0.1:{port}").close()
+
+
 def tcp_until(sock: socket.socket, kind: str) -> Any:
     stream = bytearray()
     for _ in range(500):
@@ -236,3 +300,26 @@ def test_a_child_process_tells_through_a_pipe_and_stops_when_told() -> None:
         child.join(5.0)
         assert child.exitcode == 0
         child.close()
+
+
+def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_once() -> None:
+    clients = [udp() for _ in range(4)]
+    told: tuple[list[Truth], list[Truth]] = ([], [])
+    seats = [
+        Seat(config(f"sim.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
+        for i, name in enumerate(("px4", "ardupilot"))
+    ]
+    readies: list[Ready] = []
+    begun_s = time.monotonic()
+    serve_all(seats, duration_s=6.0, airborne=True, on_ready=readies.append, stop=lambda: False, speed=20.0)
+    took_s = time.monotonic() - begun_s
+    assert took_s >= 0.3  # 6 s of simulated time cannot be over sooner
+    assert [(one.vehicle, one.mocap) for one in readies] == [(one.vehicle, one.mocap) for one in seats]
+    assert readies[0].start_ns == readies[1].start_ns
+    for truths in told:
+        assert [one.at_ns - readies[0].start_ns for one in truths[:30]] == [k * S // 5 for k in range(30)]
+    for i, number in ((0, 12), (2, 3)):  # each client hears its own vehicle
+        beat = listen(clients[i][0], is_a("HEARTBEAT"))[-1]
+        assert beat.autopilot == number
+    for sock, _ in clients:
+        sock.close()

@@ -6,7 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from uavctl.config.link import LONGEST_RUN, LinkConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.smpc.link import Arrivals, LinkModel, bernoulli, empirical, gilbert_elliott
@@ -45,10 +47,32 @@ def build_link(config: Config) -> Arrivals:
     if link.model == "empirical":
         gaps = np.array(link.gaps, dtype=np.float64)
         return empirical(gaps / gaps.sum(), packets=packets.in_time, idle=packets.idle)
+    if link.model == "trace":
+        return empirical(_trace_gaps(link), packets=packets.in_time, idle=packets.idle)
     each = np.array(link.probability or (1.0 - link.loss,), dtype=np.float64)
     # Entry k is p(k); a design that goes for every k may count for the step k+t on the least of the entries from t on.
     ahead = np.minimum.accumulate(each[::-1])[::-1][min(1, len(each) - 1) :]
     return bernoulli(1.0 - (1.0 - ahead) ** packets.in_time)
+
+
+def _trace_gaps(link: LinkConfig) -> NDArray[np.float64]:
+    """Shares of the runs of losses in a trace that goes round; longer ones than the chain has states are cut.
+
+    Raises:
+        DesignError: All of its packets are later than the design waits.
+    """
+    delays, longest_s = np.array(link.trace_s), link.delay_s + link.jitter_s
+    (arrived,) = np.nonzero(delays <= longest_s + _ROUNDING)
+    if not arrived.size:
+        raise DesignError(
+            "link.delay_s",
+            f"no position of the trace is on its way for only {longest_s:g} s (delay and jitter) or less, and later "
+            "ones are not counted on",
+            f"set link.delay_s and link.jitter_s to how long the design is to wait (quickest: {delays.min():g} s)",
+        )
+    runs = np.diff(arrived, append=arrived[0] + len(delays)) - 1
+    counts = np.bincount(np.minimum(runs, LONGEST_RUN))
+    return np.asarray(counts / counts.sum(), dtype=np.float64)
 
 
 def promised(link: LinkModel) -> float:

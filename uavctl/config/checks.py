@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from uavctl.config import mission_checks
+from uavctl.config import mission_checks, sim_checks
 from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem as Problem
 from uavctl.config.types import (
@@ -195,19 +195,16 @@ def _target(plant: PlantConfig, sets: SetsConfig, target: TargetConfig) -> Itera
 def _link(link: LinkConfig) -> Iterator[Problem]:
     if link.model == "empirical":
         yield from _gaps(link.gaps)
+    if link.model == "trace":
+        yield from _trace(link.trace_s)
     if link.probability and link.probability[-1] == 0.0:
         yield Problem(
             "link.probability",
             "ends in 0, which is repeated: nothing arrives for ever",
             "add the probability that goes on; use link.blackout to test an outage",
         )
-    for i, (start, end) in enumerate(link.blackout):
-        if not 0 <= start < end:
-            yield Problem(
-                f"link.blackout[{i}]",
-                f"[{start:g}, {end:g}] is not a span of time",
-                "give [from_s, to_s] with 0 <= from_s < to_s",
-            )
+    for name in ("blackout", "held", "uplink_blackout"):
+        yield from sim_checks.spans(f"link.{name}", getattr(link, name))
 
 
 def _gaps(gaps: Floats) -> Iterator[Problem]:
@@ -216,6 +213,16 @@ def _gaps(gaps: Floats) -> Iterator[Problem]:
         yield Problem("link.gaps", 'is missing, and model "empirical" needs it', todo)
     elif abs(math.fsum(gaps) - 1.0) > _SUM:
         yield Problem("link.gaps", f"the entries add up to {math.fsum(gaps):.6g}, probabilities of all runs to 1", todo)
+
+
+def _trace(delays: Floats) -> Iterator[Problem]:
+    if not delays:
+        yield Problem("link.trace_file", 'is missing, and model "trace" needs it', "give a file, or link.trace_s")
+    elif all(math.isinf(delay) for delay in delays):
+        yield Problem("link.trace_s", "every packet is lost", "give a trace in which some arrive")
+    for i, delay in enumerate(delays):
+        if delay < 0.0:
+            yield Problem(f"link.trace_s[{i}]", f"{delay:g} is not a delay", "give seconds, or inf for a lost packet")
 
 
 def _tick(plant: PlantConfig, daemon: DaemonConfig) -> Iterator[Problem]:
@@ -246,6 +253,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("link",), _link),
     (("plant", "daemon"), _tick),
     (("limits",), _limits),
+    (("sim",), sim_checks.sim),
     (("plant", "sets", "mission"), mission_checks.mission),
     (("plant", "sets", "fence"), mission_checks.fences),
     (("solver", "mission"), mission_checks.solver),

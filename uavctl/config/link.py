@@ -6,11 +6,13 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Section
+from uavctl.config.section import Floats, Section, Spans
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 # Each run length is a state of the design's chain.
 LONGEST_RUN = 100
+# A recording holds its configuration.
+LONGEST_TRACE = 20_000
 
 
 class LinkConfig(Section, frozen=True, kw_only=True):
@@ -26,11 +28,12 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         ),
     ] = 0.0
     model: Annotated[
-        Literal["bernoulli", "gilbert-elliott", "empirical"],
+        Literal["bernoulli", "gilbert-elliott", "empirical", "trace"],
         Meta(
             description="how packets are lost, in the design and in the simulator. `bernoulli`: each by itself, with "
             "`loss`, or with `probability` where that is given; `gilbert-elliott`: in bursts, by a channel that is "
-            "good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`)"
+            "good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`); `trace`: one after the "
+            "other as measured (`trace_file`), and late as measured too"
         ),
     ] = "bernoulli"
     probability: Annotated[
@@ -49,6 +52,23 @@ class LinkConfig(Section, frozen=True, kw_only=True):
             "arrived, i = 0, 1, …; they add up to 1",
         ),
     ] = ()
+    trace_file: Annotated[
+        str,
+        Meta(
+            description="with `trace`: CSV file beside this one (given on the command line: in the folder there) with "
+            "one line for each packet in the order of sending: its delay in s, nothing or `inf` for a lost one; of "
+            "several columns, the one headed `delay_s`"
+        ),
+    ] = ""
+    trace_s: Annotated[
+        Floats,
+        Meta(
+            max_length=LONGEST_TRACE,
+            description="with `trace`: the same delays as a list [s]; after the last packet the first one's follows. "
+            "The design takes a position that is on its way for longer than delay_s + jitter_s for lost, and the runs "
+            "of losses as they come in the trace; a campaign begins each run at another packet",
+        ),
+    ] = ()
     burst_enter: Annotated[
         float,
         Meta(ge=0, le=1, description="with `gilbert-elliott`: probability of entering the bad state, each packet"),
@@ -60,14 +80,29 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         float,
         Meta(ge=0, le=1, description="with `gilbert-elliott`: loss in the bad state (`loss` applies in the good one)"),
     ] = 1.0
-    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet [s]")] = 0.0
+    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet, but with `trace` [s]")] = 0.0
     jitter_s: Annotated[
-        float, Meta(ge=0, description="uniform extra delay from 0 to this [s]; packets may overtake each other")
+        float,
+        Meta(ge=0, description="uniform extra delay from 0 to this, likewise [s]; packets may overtake others"),
     ] = 0.0
     duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
     corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
     truncate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet is cut short")] = 0.0
+    oversize: Annotated[
+        float, Meta(ge=0, le=1, description="probability that a packet comes as a datagram of more than 4096 bytes")
+    ] = 0.0
     blackout: Annotated[
-        tuple[tuple[float, float], ...],
+        Spans,
         Meta(description="spans [from_s, to_s] since the start in which every packet is lost [s]"),
+    ] = ()
+    held: Annotated[
+        Spans,
+        Meta(
+            description="spans [from_s, to_s] since the start in which nothing arrives; what was to arrive comes at "
+            "the end, all at once and in the order of arrival [s]"
+        ),
+    ] = ()
+    uplink_blackout: Annotated[
+        Spans,
+        Meta(description="spans [from_s, to_s] since the start in which nothing that we send reaches the vehicle [s]"),
     ] = ()

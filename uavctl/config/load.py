@@ -13,16 +13,18 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin
 
 import msgspec
-import tomlkit
 from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import Problem, check
+from uavctl.config.dump import dump_config as dump_config
 from uavctl.config.index import key_lines
+from uavctl.config.link import LinkConfig
 from uavctl.config.mission import MissionConfig
 from uavctl.config.reference import description, element, is_section, type_text
 from uavctl.config.samples import read_samples
 from uavctl.config.source import Source
+from uavctl.config.trace import read_trace
 from uavctl.config.types import Config, Section
 from uavctl.errors import ConfigError, DesignError
 
@@ -36,7 +38,7 @@ _WORDS = {
     "`str`": "a string",
     "`bool`": "a truth",
 }
-_MAY_BE_INFINITE = "sets."  # an open side; everything else is finite
+_MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; everything else is finite
 _LONGEST_VALUE = 40
 _UNKNOWN = "unknown key"
 
@@ -83,20 +85,18 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     found: list[Problem] = []
     sections: dict[str, Decoded] = {}
     config = decode(Config, table, "", found, sections)
-    mission = sections.get("mission", MissionConfig())
-    if isinstance(mission, MissionConfig):
-        mission, places = read_samples(mission, Path(file).parent, found)
-        sections["mission"], source = mission, replace(source, elsewhere=places)
+    mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
+    if isinstance(mission, MissionConfig) and isinstance(link, LinkConfig):
+        mission, of_mission = read_samples(mission, Path(file).parent, found)
+        typed = any(key == "link.trace_file" for key, _ in source.overrides)
+        link, of_link = read_trace(link, Path() if typed else Path(file).parent, found)
+        sections |= {"mission": mission, "link": link}
+        source = replace(source, elsewhere=of_mission | of_link)
     found.extend(check(sections))
     problems.extend(source.tell(problem) for problem in found)
     if problems or config is None:
         raise ConfigError(tuple(problems))
-    return Loaded(msgspec.structs.replace(cast("Config", config), mission=mission), source)
-
-
-def dump_config(config: Config) -> str:
-    """TOML text with every key; `parse` gives an equal configuration back."""
-    return tomlkit.dumps(msgspec.to_builtins(config))
+    return Loaded(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
 
 
 def explain(source: Source, error: DesignError) -> str:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import msgspec
 
+from uavctl.config.data_file import DataFileError, read_lines, refuse
 from uavctl.config.mission import MissionConfig
 from uavctl.config.problem import Problem
 from uavctl.config.section import Floats
 
-_TOLD = 5  # bad rows that are told one by one
 _WANTED = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
 _WITHOUT, _WITH = 4, 7  # columns
 _LISTS = ("times_s", "positions_m", "velocities_mps")
@@ -38,7 +38,7 @@ def read_samples(mission: MissionConfig, folder: Path, found: list[Problem]) -> 
     path = folder / given.file
     try:
         rows = _rows(path)
-    except _SamplesError as error:
+    except DataFileError as error:
         found.extend(Problem(key, reason, "mend the file") for reason in error.reasons)
         return mission, {}
     motion = msgspec.structs.replace(
@@ -55,32 +55,16 @@ def read_samples(mission: MissionConfig, folder: Path, found: list[Problem]) -> 
     return msgspec.structs.replace(mission, trajectory=motion), places
 
 
-class _SamplesError(Exception):
-    """What is wrong with the file: one reason a line, each with file and line."""
-
-    def __init__(self, reasons: tuple[str, ...]) -> None:
-        super().__init__("\n".join(reasons))
-        self.reasons = reasons
-
-
 def _rows(path: Path) -> list[tuple[int, Floats]]:
     """Line number and values of each row, all of the same width."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise _SamplesError((f"{path}: cannot be read ({error.strerror})",)) from error
-    except UnicodeDecodeError as error:
-        raise _SamplesError((f"{path}: is not UTF-8 text",)) from error
+    lines = read_lines(path)
     rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip()]
     if rows and not any(_number(cell) is not None for cell in rows[0][1]):
         rows = rows[1:]  # a header
     if not rows:
-        raise _SamplesError((f"{path}: has no rows",))
+        raise DataFileError((f"{path}: has no rows",))
     width = len(rows[0][1])
-    wrong = [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, width)]
-    if wrong:
-        more = (f"{path}: {len(wrong) - _TOLD} more",) if len(wrong) > _TOLD else ()
-        raise _SamplesError((*wrong[:_TOLD], *more))
+    refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, width)])
     return [(number, tuple(float(cell) for cell in cells)) for number, cells in rows]
 
 

@@ -7,6 +7,7 @@ import msgspec
 Rows = tuple[tuple[float, ...], ...]
 Floats = tuple[float, ...]
 Position = tuple[float, float, float]
+Spans = tuple[tuple[float, float], ...]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

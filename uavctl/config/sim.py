@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Position, Section
+from uavctl.config.section import Position, Section, Spans
 
 
 class CameraConfig(Section, frozen=True, kw_only=True):
@@ -16,21 +16,121 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     phase_s: Annotated[float, Meta(ge=0, description="time of the first sample; then every 1/rate_hz [s]")] = 0.0
     noise_std_m: Annotated[float, Meta(ge=0, description="noise of a position, each axis [m]")] = 0.0
     latency_s: Annotated[float, Meta(ge=0, description="processing time in the cameras, before the link [s]")] = 0.0
+    jitter_s: Annotated[
+        float,
+        Meta(ge=0, description="uniform extra processing time from 0 to this [s]; samples may overtake each other"),
+    ] = 0.0
     clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
+    clock_drift_ppm: Annotated[
+        float,
+        Meta(ge=-1e5, le=1e5, description="what the cameras' clock gains [millionths]; recorded: 1e4 to 3e4"),
+    ] = 0.0
+    occluded: Annotated[
+        Spans, Meta(description="spans [from_s, to_s] since the start in which the vehicle is not seen: no samples [s]")
+    ] = ()
+    occlusions_per_s: Annotated[
+        float, Meta(ge=0, description="random occlusions beside those: how many a second begin while it is seen [1/s]")
+    ] = 0.0
+    occlusion_s: Annotated[float, Meta(gt=0, description="their mean length; lengths are exponential [s]")] = 0.5
+    swapped: Annotated[
+        Spans,
+        Meta(
+            description="spans [from_s, to_s] since the start in which another body is taken for the vehicle: it "
+            "stands still at other_body_m, level, its nose north [s]"
+        ),
+    ] = ()
+    other_body_m: Annotated[Position, Meta(description="position of that other body, local NED [m]")] = (0.0, 0.0, 0.0)
+    frozen: Annotated[
+        Spans,
+        Meta(
+            description="spans [from_s, to_s] since the start in which the last sample's pose is repeated, to the last "
+            "bit, with new stamps [s]"
+        ),
+    ] = ()
     message: Annotated[
         Literal["vision", "vicon", "mocap", "odometry"],
         Meta(description="MAVLink message; `odometry` carries the velocity too"),
     ] = "vision"
 
 
+class WindConfig(Section, frozen=True, kw_only=True):
+    """Wind of the simulated quadrotor: steady, with Dryden gusts (docs/vehicle.md)."""
+
+    velocity_mps: Annotated[Position, Meta(description="steady wind: velocity of the air, local NED [m/s]")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    gust_wind_mps: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=50,
+            description="wind speed at 20 ft that sets the strength of the gusts (light 7.7, moderate 15.4); 0 is none "
+            "[m/s]",
+        ),
+    ] = 0.0
+    height_m: Annotated[float, Meta(gt=0, description="height for which the gusts' scales are taken [m]")] = 2.0
+
+
+class QuadrotorConfig(Section, frozen=True, kw_only=True):
+    """The simulated quadrotor (docs/vehicle.md)."""
+
+    charge: Annotated[float, Meta(gt=0, le=1, description="charge of the battery at the start")] = 1.0
+
+
+class FaultConfig(Section, frozen=True, kw_only=True):
+    """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
+
+    at_s: Annotated[float, Meta(ge=0, description="when, since the start [s]")]
+    kind: Annotated[
+        Literal[
+            "blackout",
+            "held",
+            "uplink_blackout",
+            "occluded",
+            "swapped",
+            "frozen",
+            "wind",
+            "battery",
+            "parameter",
+            "mode",
+        ],
+        Meta(
+            description="`blackout`, `held`, `uplink_blackout`: a span of these of `[link]`; `occluded`, `swapped`, "
+            "`frozen`: a span of these of `[sim.camera]`; `wind`: the steady wind of the quadrotor changes; `battery`: "
+            "that of the quadrotor has another charge; `parameter`: one of the autopilot's has another value; `mode`: "
+            "the pilot changes the autopilot's mode with the stick"
+        ),
+    ]
+    for_s: Annotated[float, Meta(ge=0, description="length of a span [s]")] = 0.0
+    velocity_mps: Annotated[Position, Meta(description="of the air from then on, with `wind`, local NED [m/s]")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    charge: Annotated[float, Meta(ge=0, le=1, description="of the battery, with `battery`")] = 0.0
+    name: Annotated[str, Meta(description="of the parameter, or of the mode as the autopilot calls it")] = ""
+    value: Annotated[float, Meta(description="of the parameter")] = 0.0
+
+
 class SimConfig(Section, frozen=True, kw_only=True):
     """The simulated side of the wire."""
 
     camera: CameraConfig
-    plant: Annotated[Literal["linear"], Meta(description="simulated vehicle")] = "linear"
+    wind: WindConfig = WindConfig()
+    quadrotor: QuadrotorConfig = QuadrotorConfig()
+    plant: Annotated[
+        Literal["linear", "quadrotor"],
+        Meta(
+            description="simulated vehicle: the plant of `[plant]`, or a quadrotor with rotors, battery, wind and the "
+            "loops of its autopilot"
+        ),
+    ] = "linear"
     autopilot: Annotated[
         Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
     ] = "px4"
+    fault: Annotated[tuple[FaultConfig, ...], Meta(description="what happens in the course of a flight")] = ()
     seed: Annotated[int, Meta(ge=0, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
     start_velocity_mps: Annotated[Position, Meta(description="velocity at the start, local NED [m/s]")] = (

@@ -1,0 +1,130 @@
+"""What SET_POSITION_TARGET_LOCAL_NED asks for, by the rules of each autopilot (as observed of the real ones)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
+
+from sim.craft import ZERO, Quaternion, heading_rad, rotated
+from sim.personality import Personality
+from uavctl.data import Vec3
+
+# POSITION_TARGET_TYPEMASK
+IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCEL, FORCE, IGNORE_YAW = 0x7, 0x38, 0x1C0, 0x200, 0x400
+# Beyond is nothing that a vehicle could fly to; limited there, numbers fit what telemetry carries.
+LARGEST = 1e6
+# MAV_FRAME
+LOCAL_NED, LOCAL_OFFSET_NED, BODY_NED, BODY_OFFSET_NED = 1, 7, 8, 9
+OFFSET_FRAMES = (LOCAL_OFFSET_NED, BODY_NED, BODY_OFFSET_NED)
+BODY_FRAMES = (BODY_NED, BODY_OFFSET_NED)
+
+
+class Ask(Enum):
+    """What a setpoint is about."""
+
+    ACCELERATION = auto()
+    VELOCITY = auto()
+    POSITION = auto()
+    STOP = auto()  # nothing flyable: the vehicle stops
+    REFUSED = auto()  # nothing: it does not count for the stream
+    FATAL = auto()  # the program dies of it
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """What is asked of the vehicle.
+
+    Attributes:
+        ask: what about.
+        vector: acceleration, velocity or position in local NED.
+        yaw_rad: heading to take; None is not asked.
+        text: why it was refused.
+    """
+
+    ask: Ask
+    vector: Vec3 = ZERO
+    yaw_rad: float | None = None
+    text: str = ""
+
+
+STOP = Setpoint(Ask.STOP)
+
+
+def interpret(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion) -> Setpoint:
+    """Read a setpoint.
+
+    Args:
+        kind: whose rules hold.
+        msg: the message.
+        place_m: where the vehicle believes to be; offsets count from there.
+        attitude: of the vehicle; body axes are turned by it.
+    """
+    return _px4(kind, msg, attitude) if kind.name == "px4" else _ardupilot(kind, msg, place_m, attitude)
+
+
+def _fields(msg: Any) -> tuple[Vec3, Vec3, Vec3]:
+    return (
+        (_limited(msg.x), _limited(msg.y), _limited(msg.z)),
+        (_limited(msg.vx), _limited(msg.vy), _limited(msg.vz)),
+        (_limited(msg.afx), _limited(msg.afy), _limited(msg.afz)),
+    )
+
+
+def _limited(number: float) -> float:
+    """A finite number within the limits; what is not finite stays what it is."""
+    return min(max(number, -LARGEST), LARGEST) if math.isfinite(number) else number
+
+
+def _finite(vector: Vec3) -> bool:
+    return all(map(math.isfinite, vector))
+
+
+def _yaw(msg: Any, add_rad: float) -> float | None:
+    if msg.type_mask & IGNORE_YAW or not math.isfinite(msg.yaw):
+        return None
+    return math.remainder(msg.yaw + add_rad, math.tau)
+
+
+def _px4(kind: Personality, msg: Any, attitude: Quaternion) -> Setpoint:
+    """PX4: a field that is ignored or not a number is unset; all three of a kind are needed to fly it."""
+    mask = msg.type_mask
+    if mask & FORCE:
+        return Setpoint(Ask.REFUSED, text="force setpoint not supported")
+    body = msg.coordinate_frame == BODY_NED
+    if msg.coordinate_frame not in kind.frames or (body and mask & IGNORE_POSITION != IGNORE_POSITION):
+        return Setpoint(Ask.REFUSED, text=f"setpoint refused: frame {msg.coordinate_frame}")
+    yaw = _yaw(msg, 0.0)
+    asks = (Ask.POSITION, IGNORE_POSITION), (Ask.VELOCITY, IGNORE_VELOCITY), (Ask.ACCELERATION, IGNORE_ACCEL)
+    for (ask, ignored), vector in zip(asks, _fields(msg), strict=True):
+        if mask & ignored != ignored:  # asked for at least in part
+            if mask & ignored or not _finite(vector):
+                return STOP
+            return Setpoint(ask, rotated(attitude, vector) if body else vector, yaw)
+    return STOP
+
+
+def _ardupilot(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion) -> Setpoint:
+    """ArduPilot: one ignored axis ignores all three; numbers are not checked; the force bit is dropped."""
+    if msg.coordinate_frame not in kind.frames:
+        return STOP
+    heading = heading_rad(attitude) if msg.coordinate_frame in BODY_FRAMES else 0.0
+    position, velocity, accel = _fields(msg)
+    if not msg.type_mask & IGNORE_POSITION:
+        ask, vector = Ask.POSITION, position
+    elif not msg.type_mask & IGNORE_VELOCITY:
+        ask, vector = Ask.VELOCITY, velocity
+    elif not msg.type_mask & IGNORE_ACCEL:
+        ask, vector = Ask.ACCELERATION, accel
+    else:
+        return STOP
+    if not _finite(vector):
+        return Setpoint(Ask.FATAL)
+    north, east, down = vector
+    if heading != 0.0:
+        cos, sin = math.cos(heading), math.sin(heading)
+        north, east = cos * north - sin * east, sin * north + cos * east
+    if ask is Ask.POSITION and msg.coordinate_frame in OFFSET_FRAMES:
+        north, east, down = north + place_m[0], east + place_m[1], down + place_m[2]
+    return Setpoint(ask, (north, east, down), _yaw(msg, heading))

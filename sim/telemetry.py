@@ -1,0 +1,300 @@
+"""What the simulated vehicle tells: its messages, their contents, and how often each goes out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.arming import preflight
+from sim.craft import Craft, heading_rad
+from sim.estimator import GOOD, Estimator
+from sim.geodesy import Origin
+from sim.parameters import Parameters
+from sim.personality import Personality
+from sim.pilot import Phase, Pilot
+from sim.setpoints import IGNORE_ACCEL, IGNORE_POSITION, IGNORE_VELOCITY, Ask
+from uavctl.data import Vec3
+
+SECOND_NS = 1_000_000_000
+SHORTEST_INTERVAL_NS = 1_000_000
+ARMED_FLAG = 128  # MAV_MODE_FLAG
+IGNORE_YAW_RATE = 0x800
+CAPACITY_MAH = 240.0
+HOME_POSITION, AUTOPILOT_VERSION, MESSAGE_INTERVAL = 242, 148, 244  # message ids
+
+Message = Any  # pymavlink's classes have no types
+# MAV_SYS_STATUS_SENSOR
+GYRO, ACCEL, MAG, BARO, GPS, VISION = 1, 2, 4, 8, 32, 128
+CONTROL = 1024 | 2048 | 4096 | 8192 | 16384 | 32768  # rates, attitude, yaw, height, position, motors
+AHRS, BATTERY, PREARM = 1 << 21, 1 << 25, 1 << 28
+# MAV_PROTOCOL_CAPABILITY
+FLOAT, COMMAND_INT, BYTEWISE, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 128, 8192, 131072
+
+# Usual intervals [ms]; 0: only when asked for. A message that is not here is not sent at all.
+COMMON_MS = {
+    0: 1000,  # HEARTBEAT
+    1: 1000,  # SYS_STATUS
+    24: 1000,  # GPS_RAW_INT
+    30: 250,  # ATTITUDE
+    31: 0,  # ATTITUDE_QUATERNION
+    32: 100,  # LOCAL_POSITION_NED
+    33: 250,  # GLOBAL_POSITION_INT
+    49: 0,  # GPS_GLOBAL_ORIGIN
+    74: 1000,  # VFR_HUD
+    85: 1000,  # POSITION_TARGET_LOCAL_NED
+    147: 2000,  # BATTERY_STATUS
+    148: 0,  # AUTOPILOT_VERSION
+    242: 0,  # HOME_POSITION
+    245: 1000,  # EXTENDED_SYS_STATE
+}
+USUAL_MS = {
+    "px4": {**COMMON_MS, 31: 250, 141: 1000, 230: 1000, 242: 2000},
+    "ardupilot": {**COMMON_MS, 193: 1000},
+}
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Everything that telemetry tells of."""
+
+    kind: Personality
+    craft: Craft
+    pilot: Pilot
+    estimator: Estimator
+    parameters: Parameters
+    origin: Origin
+    boot_ns: int
+
+
+class Telemetry:
+    """Streams of one vehicle.
+
+    Attributes:
+        streams: message id to what makes it; None from it is nothing to tell yet.
+        next_ns: time of the next message, None if none is due ever.
+    """
+
+    def __init__(self, vehicle: Vehicle, start_ns: int) -> None:
+        self._v = vehicle
+        self._usual_ns = {kind: ms * 1_000_000 for kind, ms in USUAL_MS[vehicle.kind.name].items()}
+        self._period_ns = dict(self._usual_ns)
+        self._due_ns = dict.fromkeys(self._usual_ns, start_ns)
+        self.next_ns = self._soonest_ns()
+        makers: dict[int, Callable[[int], Message | None]] = {
+            0: self._heartbeat,
+            1: self._status,
+            24: self._gps,
+            30: self._attitude,
+            31: self._quaternion,
+            32: self._local,
+            33: self._global,
+            49: self._origin,
+            74: self._hud,
+            85: self._target,
+            141: self._altitude,
+            147: self._battery,
+            148: self._version,
+            193: self._ekf,
+            230: self._estimator,
+            242: self._home,
+            245: self._landed,
+        }
+        self.streams = {kind: makers[kind] for kind in self._usual_ns}
+
+    def _soonest_ns(self) -> int | None:
+        return min((due for kind, due in self._due_ns.items() if self._period_ns[kind] > 0), default=None)
+
+    def due(self, at_ns: int) -> list[Message]:
+        """The messages that are due."""
+        if self.next_ns is None or self.next_ns > at_ns:
+            return []
+        made = []
+        for kind, make in self.streams.items():
+            if self._period_ns[kind] > 0 and self._due_ns[kind] <= at_ns:
+                self._due_ns[kind] += self._period_ns[kind]
+                made.append(make(at_ns))
+        self.next_ns = self._soonest_ns()
+        return [msg for msg in made if msg is not None]
+
+    def make(self, kind: int, at_ns: int) -> Message | None:
+        """One message now; None if there is nothing to tell, or no such message."""
+        return self.streams[kind](at_ns) if kind in self.streams else None
+
+    def interval_us(self, kind: int) -> int:
+        """Interval of a message as MESSAGE_INTERVAL tells it: -1 not sent, 0 not known."""
+        if kind not in self.streams:
+            return 0
+        return self._period_ns[kind] // 1000 or -1
+
+    def set_interval(self, kind: float, interval_us: float, at_ns: int) -> bool:
+        """Change an interval: 0 is the usual one, -1 none; False if that is not possible."""
+        if kind not in self.streams or not (interval_us == -1.0 or 0.0 <= interval_us <= 1e9):
+            return False
+        number = int(kind)
+        if interval_us > 0.0:
+            self._period_ns[number] = max(int(interval_us) * 1000, SHORTEST_INTERVAL_NS)
+        else:
+            self._period_ns[number] = self._usual_ns[number] if interval_us == 0.0 else 0
+        self._due_ns[number] = at_ns + 1
+        self.next_ns = self._soonest_ns()
+        return True
+
+    # What it tells
+
+    def _boot_ms(self, at_ns: int) -> int:
+        return (at_ns - self._v.boot_ns) // 1_000_000 % 2**32
+
+    def _boot_us(self, at_ns: int) -> int:
+        return (at_ns - self._v.boot_ns) // 1000
+
+    def _heartbeat(self, _at_ns: int) -> Message:
+        pilot = self._v.pilot
+        status = mavlink.MAV_STATE_STANDBY
+        if pilot.phase is not Phase.GROUND:
+            status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
+        base = pilot.mode.base | (ARMED_FLAG if pilot.armed else 0)
+        kind = mavlink.MAV_TYPE_QUADROTOR, self._v.kind.autopilot
+        return mavlink.MAVLink_heartbeat_message(*kind, base, pilot.mode.custom, status, 3)
+
+    def _status(self, at_ns: int) -> Message:
+        v, battery = self._v, self._v.craft.battery
+        estimator = v.estimator
+        present = GYRO | ACCEL | MAG | BARO | CONTROL | AHRS | BATTERY | PREARM
+        present |= (GPS if estimator.uses_gps else 0) | (VISION if estimator.uses_external else 0)
+        healthy = present & ~(AHRS | VISION | PREARM)
+        if estimator.position_ok:
+            healthy |= present & (AHRS | VISION)
+        if not preflight(v.kind, v.parameters, estimator, battery, at_ns - v.boot_ns):
+            healthy |= PREARM
+        power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
+        return mavlink.MAVLink_sys_status_message(present, present, healthy, 250, *power, 0, 0, 0, 0, 0, 0)
+
+    def _gps(self, at_ns: int) -> Message:
+        v = self._v
+        if not v.estimator.uses_gps:
+            return mavlink.MAVLink_gps_raw_int_message(self._boot_us(at_ns), 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0)
+        north, east, _ = v.craft.velocity_mps
+        course = round(math.degrees(math.atan2(east, north)) * 100.0) % 36000
+        where = v.origin.degrees_e7(v.craft.position_m)
+        speed = min(round(100.0 * math.hypot(north, east)), 65534)
+        return mavlink.MAVLink_gps_raw_int_message(
+            self._boot_us(at_ns), 3, *where, v.origin.altitude_mm(v.craft.position_m), 121, 200, speed, course, 10
+        )
+
+    def _euler(self) -> Vec3:
+        w, x, y, z = self._v.craft.attitude
+        roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
+        return roll, pitch, heading_rad(self._v.craft.attitude)
+
+    def _attitude(self, at_ns: int) -> Message:
+        return mavlink.MAVLink_attitude_message(self._boot_ms(at_ns), *self._euler(), *self._v.craft.rates_rps)
+
+    def _quaternion(self, at_ns: int) -> Message:
+        craft = self._v.craft
+        return mavlink.MAVLink_attitude_quaternion_message(self._boot_ms(at_ns), *craft.attitude, *craft.rates_rps)
+
+    def _local(self, at_ns: int) -> Message | None:
+        estimator = self._v.estimator
+        if not estimator.begun:
+            return None
+        boot_ms = self._boot_ms(at_ns)
+        return mavlink.MAVLink_local_position_ned_message(boot_ms, *estimator.position_m, *estimator.velocity_mps)
+
+    def _heading_cdeg(self) -> int:
+        return round(math.degrees(heading_rad(self._v.craft.attitude)) * 100.0) % 36000
+
+    def _height_m(self) -> float:
+        return self._v.pilot.home_m[2] - self._v.estimator.position_m[2]
+
+    def _global(self, at_ns: int) -> Message | None:
+        v = self._v
+        if not v.estimator.geographic:
+            return None
+        where = v.estimator.position_m
+        speed = (min(max(round(100.0 * each), -32768), 32767) for each in v.estimator.velocity_mps)
+        place = *v.origin.degrees_e7(where), v.origin.altitude_mm(where), clipped_mm(self._height_m())
+        return mavlink.MAVLink_global_position_int_message(self._boot_ms(at_ns), *place, *speed, self._heading_cdeg())
+
+    def _origin(self, at_ns: int) -> Message | None:
+        v = self._v
+        if not v.estimator.geographic:
+            return None
+        zero = (0.0, 0.0, 0.0)
+        place = *v.origin.degrees_e7(zero), v.origin.altitude_mm(zero)
+        return mavlink.MAVLink_gps_global_origin_message(*place, self._boot_us(at_ns))
+
+    def _home(self, at_ns: int) -> Message | None:
+        v, home = self._v, self._v.pilot.home_m
+        if not v.estimator.geographic:
+            return None
+        place = *v.origin.degrees_e7(home), v.origin.altitude_mm(home)
+        level = [1.0, 0.0, 0.0, 0.0]
+        return mavlink.MAVLink_home_position_message(*place, *home, level, 0.0, 0.0, 0.0, self._boot_us(at_ns))
+
+    def _hud(self, _at_ns: int) -> Message:
+        v = self._v
+        north, east, down = v.estimator.velocity_mps
+        speed = math.hypot(north, east)
+        height = v.origin.altitude_m - v.estimator.position_m[2]
+        throttle = 50 if v.pilot.phase is not Phase.GROUND else 0
+        return mavlink.MAVLink_vfr_hud_message(speed, speed, self._heading_cdeg() // 100, throttle, height, -down)
+
+    def _altitude(self, at_ns: int) -> Message:
+        v = self._v
+        local = -v.estimator.position_m[2]
+        amsl = v.origin.altitude_m + local
+        heights = amsl, amsl, local, self._height_m(), math.nan, math.nan
+        return mavlink.MAVLink_altitude_message(self._boot_us(at_ns), *heights)
+
+    def _target(self, at_ns: int) -> Message | None:
+        obeyed = self._v.pilot.helm.obeyed
+        if obeyed is None:
+            return None
+        zero: Vec3 = (0.0, 0.0, 0.0)
+        asks = (Ask.POSITION, IGNORE_POSITION), (Ask.VELOCITY, IGNORE_VELOCITY), (Ask.ACCELERATION, IGNORE_ACCEL)
+        mask = IGNORE_YAW_RATE | sum(ignored for ask, ignored in asks if ask is not obeyed.ask)
+        nine = [number for ask, _ in asks for number in (obeyed.vector if ask is obeyed.ask else zero)]
+        return mavlink.MAVLink_position_target_local_ned_message(
+            self._boot_ms(at_ns), 1, mask, *nine, obeyed.yaw_rad or 0.0, 0.0
+        )
+
+    def _battery(self, _at_ns: int) -> Message:
+        battery = self._v.craft.battery
+        volts = [round(1000.0 * battery.voltage_v), *([65535] * 9)]
+        used = round((1.0 - battery.remaining) * CAPACITY_MAH)
+        return mavlink.MAVLink_battery_status_message(
+            0, 0, 1, 32767, volts, round(100.0 * battery.current_a), used, -1, round(100.0 * battery.remaining)
+        )
+
+    def _version(self, _at_ns: int) -> Message:
+        px4 = self._v.kind.name == "px4"
+        can = FLOAT | COMMAND_INT | LOCAL_TARGETS | MAVLINK2 | (BYTEWISE if px4 else CAST)
+        version = self._v.kind.version
+        return mavlink.MAVLink_autopilot_version_message(
+            can, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0x5541564354, [0] * 18
+        )
+
+    def _ekf(self, _at_ns: int) -> Message:
+        flags = self._v.estimator.flags
+        variance = 0.05 if flags & GOOD == GOOD else 1.0
+        return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
+
+    def _estimator(self, at_ns: int) -> Message:
+        estimator = self._v.estimator
+        ratio, accuracy = (0.1, 0.05) if estimator.position_ok else (2.0, 10.0)
+        return mavlink.MAVLink_estimator_status_message(
+            self._boot_us(at_ns), estimator.flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
+        )
+
+    def _landed(self, _at_ns: int) -> Message:
+        return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, self._v.pilot.phase.value)
+
+
+def clipped_mm(metres: float) -> int:
+    """Millimetres that fit 32 bits."""
+    return min(max(round(1000.0 * metres), -(2**31)), 2**31 - 1)

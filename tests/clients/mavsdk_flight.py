@@ -1,0 +1,113 @@
+"""A flight by an unmodified MAVSDK (4 or later), as JSON on stdout; runs in an interpreter that has `mavsdk`.
+
+Usage: mavsdk_flight.py CONNECTION_URL
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.action import Action
+from mavsdk.plugins.info import Info
+from mavsdk.plugins.offboard import AccelerationNed, Offboard, OffboardError, PositionNedYaw, VelocityNedYaw
+from mavsdk.plugins.param import Param
+from mavsdk.plugins.telemetry import Telemetry
+
+LIMIT_S = 30.0
+
+
+def wait(what: str, is_true: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
+    """Poll until something is true; gives what it is."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        found = is_true()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise SystemExit(f"waited {limit_s} s in vain: {what}")
+
+
+def place(telemetry: Telemetry) -> tuple[float, float, float]:
+    """Local position as telemetry has it."""
+    at = telemetry.position_velocity_ned().position
+    return at.north_m, at.east_m, at.down_m
+
+
+def speed(telemetry: Telemetry) -> float:
+    """Northward speed as telemetry has it."""
+    return float(telemetry.position_velocity_ned().velocity.north_m_s)
+
+
+def fly(url: str) -> dict[str, Any]:
+    """Connect, look, arm, climb, fly offboard, land; what was seen."""
+    seen: dict[str, Any] = {}
+    mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    mavsdk.add_any_connection(url)
+    system = wait("a vehicle", lambda: mavsdk.first_autopilot(1.0))
+    telemetry, action, offboard, param = Telemetry(system), Action(system), Offboard(system), Param(system)
+    texts: list[str] = []
+    telemetry.subscribe_status_text(lambda text, _: texts.append(text.text))
+
+    seen["version"] = Info(system).get_version().flight_sw_major
+    seen["parameters"] = {one.name: one.value for one in param.get_all_params().float_params}
+    seen["integers"] = {one.name: one.value for one in param.get_all_params().int_params}
+    wait("health", telemetry.health_all_ok)
+    seen["healthy"] = telemetry.health_all_ok()
+    seen["armable"] = telemetry.health().is_armable
+    wait("a battery", lambda: telemetry.battery().voltage_v > 0.0)
+    seen["battery_v"] = telemetry.battery().voltage_v
+    wait("satellites", lambda: telemetry.gps_info().num_satellites)
+    seen["satellites"] = telemetry.gps_info().num_satellites
+    seen["home_deg"] = [telemetry.home().latitude_deg, telemetry.home().longitude_deg]
+
+    telemetry.set_rate_position_velocity_ned(20.0)
+    action.set_takeoff_altitude(2.0)
+    action.arm()
+    wait("armed", telemetry.armed)
+    action.takeoff()
+    wait("in the air", telemetry.in_air)
+    wait("height", lambda: place(telemetry)[2] < -1.85)
+    seen["climbed_m"] = -place(telemetry)[2]
+    wait("landed state", lambda: telemetry.landed_state().name == "IN_AIR")
+    wait("the end of the climb", lambda: telemetry.flight_mode().name in ("HOLD", "OFFBOARD"))
+
+    offboard.set_position_ned(PositionNedYaw(1.0, 0.5, -2.0, 0.0))
+    time.sleep(0.3)  # OFFBOARD wants a stream of setpoints before, not only the first
+    try:
+        offboard.start()
+    except OffboardError as error:
+        raise SystemExit(f"offboard refused: {error}, {texts}") from error
+    wait("offboard", lambda: telemetry.flight_mode().name == "OFFBOARD")
+    wait("the position", lambda: math.dist(place(telemetry), (1.0, 0.5, -2.0)) < 0.25)
+    seen["reached_m"] = place(telemetry)
+
+    offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
+    time.sleep(1.0)
+    before = speed(telemetry)
+    offboard.set_acceleration_ned(AccelerationNed(0.5, 0.0, 0.0))
+    time.sleep(2.0)
+    seen["gained_mps"] = speed(telemetry) - before
+    offboard.set_acceleration_ned(AccelerationNed(-0.5, 0.0, 0.0))
+    time.sleep(1.5)
+    offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
+    wait("a stop", lambda: abs(speed(telemetry)) < 0.15)
+    if seen["version"] == 1:
+        offboard.stop()
+        wait("hold", lambda: telemetry.flight_mode().name == "HOLD")
+
+    action.land()
+    wait("the floor", lambda: telemetry.landed_state().name == "ON_GROUND")
+    wait("disarmed", lambda: not telemetry.armed())
+    seen["landed"] = not telemetry.in_air()
+    seen["texts"] = texts
+    return seen
+
+
+if __name__ == "__main__":
+    json.dump(fly(sys.argv[1]), sys.stdout)

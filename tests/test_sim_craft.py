@@ -1,0 +1,76 @@
+"""The linear plant made to fly by itself: the laws under take-off, positions and velocities, and what misleads them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from sim_rig import CALM, bench
+
+from sim.craft import SteeredPlant, heading_rad, rotated
+from sim.peers import Peers
+from sim.vehicle import Vehicle
+from uavctl.config import load_config
+
+AT = "sim.start_position_m=[0.0,0.0,-1.5]"
+
+
+def craft() -> SteeredPlant:
+    vehicle = Peers(load_config("room", [*CALM, AT]), 0).vehicle
+    assert isinstance(vehicle, Vehicle)
+    return SteeredPlant(vehicle)
+
+
+def fly(one: SteeredPlant, seconds: float) -> None:
+    end_ns = one.now_ns + round(seconds * 1e9)
+    while one.next_ns is not None and one.next_ns <= end_ns:
+        one._plant.advance(one.next_ns)
+        one.steer()
+    one._plant.advance(end_ns)
+
+
+def test_it_goes_to_a_position_and_stays() -> None:
+    one = craft()
+    one.go_to((1.0, -2.0, -2.0))
+    fly(one, 12.0)
+    assert one.position_m == pytest.approx((1.0, -2.0, -2.0), abs=0.02)
+    assert math.hypot(*one.velocity_mps) < 0.02
+
+
+def test_far_away_positions_are_approached_at_the_cruising_and_climbing_speeds() -> None:
+    one = craft()
+    one.go_to((1e6, 0.0, -1e6))
+    fly(one, 8.0)
+    # Drag of 0.3 1/s holds the proportional law short of what it wants by a seventh or so.
+    assert one.velocity_mps[0] == pytest.approx(5.0 * 2.0 / 2.3, rel=0.05)
+    assert one.velocity_mps[2] == pytest.approx(-1.0 * 2.0 / 2.3, rel=0.05)
+
+
+def test_an_error_of_what_it_believes_moves_where_it_stays() -> None:
+    one = craft()
+    one.mislead((0.5, 0.0, 0.0), (0.0, 0.0, 0.0))
+    one.go_to((0.0, 0.0, -1.5))
+    fly(one, 12.0)
+    assert one.position_m == pytest.approx((-0.5, 0.0, -1.5), abs=0.02)
+
+
+def test_setpoints_of_position_and_velocity_fly_the_linear_plant() -> None:
+    one = bench("ardupilot")
+    one.send(one.client.position(1.0, 0.0, -2.0))
+    one.wait(10.0)
+    assert one.peers.vehicle.position_m == pytest.approx((1.0, 0.0, -2.0), abs=0.02)
+    for _ in range(40):
+        one.send(one.client.velocity(0.0, 0.5, 0.0))
+        one.wait(0.1)
+    assert one.peers.vehicle.velocity_mps[1] == pytest.approx(0.5 * 2.0 / 2.3, abs=0.02)
+
+
+def test_quaternions_turn_as_their_rotation_does() -> None:
+    half = math.sqrt(0.5)
+    east = (half, 0.0, 0.0, half)  # nose to the east
+    assert heading_rad(east) == pytest.approx(math.pi / 2)
+    assert rotated(east, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
+    assert rotated(east, (0.0, 1.0, 0.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)
+    down = (half, 0.0, -half, 0.0)  # nose down
+    assert rotated(down, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
+    assert rotated(down, (0.0, 0.0, 1.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)

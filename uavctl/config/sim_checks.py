@@ -1,0 +1,58 @@
+"""Checks of the simulated side's configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from uavctl.config.problem import Problem
+from uavctl.config.section import Spans
+from uavctl.config.sim import FaultConfig, QuadrotorConfig, SimConfig, WindConfig
+
+
+def spans(key: str, given: Spans) -> Iterator[Problem]:
+    """Spans of time since the start that are none."""
+    for i, (start, end) in enumerate(given):
+        if not 0 <= start < end:
+            yield Problem(
+                f"{key}[{i}]",
+                f"[{start:g}, {end:g}] is not a span of time",
+                "give [from_s, to_s] with 0 <= from_s < to_s",
+            )
+
+
+def sim(config: SimConfig) -> Iterator[Problem]:
+    """All problems of `[sim]`."""
+    for name in ("occluded", "swapped", "frozen"):
+        yield from spans(f"sim.camera.{name}", getattr(config.camera, name))
+    yield from faults("sim.fault", config.fault, config.plant)
+    if config.plant == "linear":
+        for key, same in (("wind", config.wind == WindConfig()), ("quadrotor", config.quadrotor == QuadrotorConfig())):
+            if not same:
+                yield Problem(
+                    f"sim.{key}",
+                    'has no effect with plant "linear", whose disturbance is that of [plant]',
+                    'remove it, or set sim.plant = "quadrotor"',
+                )
+    elif config.start_position_m[2] >= 0.0:
+        yield Problem(
+            "sim.start_position_m[2]",
+            f"{config.start_position_m[2]:g} m is not above the floor z = 0, where the quadrotor would stand",
+            "give a number below 0 (local NED: up is negative)",
+        )
+
+
+def faults(key: str, given: tuple[FaultConfig, ...], plant: str) -> Iterator[Problem]:
+    """All problems of a list of faults that happen to a plant of this kind."""
+    for i, fault in enumerate(given):
+        yield from _fault(f"{key}[{i}]", fault, plant)
+
+
+def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[Problem]:
+    if fault.kind in ("wind", "battery"):
+        if plant == "linear":
+            yield Problem(f"{key}.kind", f'plant "linear" has no {fault.kind}', 'set sim.plant = "quadrotor"')
+    elif fault.kind in ("parameter", "mode"):
+        if not fault.name:
+            yield Problem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
+    elif fault.for_s == 0.0:
+        yield Problem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")
