@@ -27,7 +27,7 @@ from sim.vehicle import Vehicle as Plant
 from uavctl.config.types import Config
 
 SECOND_NS = 1_000_000_000
-SYSTEM_ID, COMPONENT_ID = 1, 1
+COMPONENT_ID = 1
 # Age of the autopilot at the start of the simulation, so that its clock is neither zero nor ours.
 UPTIME_NS = 20 * SECOND_NS
 NO_INDEX = 65535  # param_index of a parameter that is not in the list
@@ -53,20 +53,23 @@ class Autopilot:
         airborne: whether it starts in the air.
 
     Attributes:
+        craft: what flies.
         parameters: its parameters.
         estimator: its estimate.
         pilot: its state machine.
         telemetry: its streams.
+        text: the last STATUSTEXT that it sent, empty before the first.
+        steered_by: (system, component) id of whom the last setpoint that counts came from, None before the first.
     """
 
     def __init__(self, config: Config, vehicle: Plant | Craft, start_ns: int, *, airborne: bool) -> None:
         kind = self._kind = PERSONALITIES[config.sim.autopilot]
         craft: Craft = SteeredPlant(vehicle) if isinstance(vehicle, Plant) else vehicle
         boot_ns = self._boot_ns = start_ns - UPTIME_NS
-        self._craft = craft
-        self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
+        self.craft = craft
+        self._mav = mavlink.MAVLink(None, config.sim.system_id, COMPONENT_ID)
         self._out: list[bytes] = []
-        self.parameters = Parameters(kind.name)
+        self.parameters = Parameters(kind.name, config.sim.system_id)
         if config.sim.setpoint_timeout_s is not None:
             self.parameters.set(kind.timeout, config.sim.setpoint_timeout_s)
         self.estimator = Estimator(kind, self.parameters, craft)
@@ -76,6 +79,8 @@ class Autopilot:
         self._commands = Commands(whole, self.telemetry, self._send)
         self._failsafes = Failsafes(kind, self.pilot, self.parameters, self.estimator, craft.battery)
         self._was_armed = airborne
+        self.text = ""
+        self.steered_by: tuple[int, int] | None = None
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "ATT_POS_MOCAP": self.estimator.take,
             "COMMAND_INT": self._on_command,
@@ -142,6 +147,7 @@ class Autopilot:
         self._was_armed = self.pilot.armed
         for severity, text in self.pilot.texts:
             self._send(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
+            self.text = text
         out = tuple(self._out)
         self.pilot.texts.clear()
         self._out.clear()
@@ -149,9 +155,9 @@ class Autopilot:
 
     # What it receives
 
-    @staticmethod
-    def _for_me(msg: Any) -> bool:
-        return msg.target_system in (0, SYSTEM_ID) and getattr(msg, "target_component", 0) in (0, COMPONENT_ID)
+    def _for_me(self, msg: Any) -> bool:
+        ours = msg.target_system in (0, self._mav.srcSystem)
+        return ours and getattr(msg, "target_component", 0) in (0, COMPONENT_ID)
 
     def _on_heartbeat(self, msg: Any, at_ns: int) -> None:
         px4 = self._kind.name == "px4"
@@ -178,16 +184,17 @@ class Autopilot:
     def _on_setpoint(self, msg: Any, at_ns: int) -> None:
         if not self._for_me(msg):
             return
-        setpoint = interpret(self._kind, msg, self.estimator.position_m, self._craft.attitude)
+        setpoint = interpret(self._kind, msg, self.estimator.position_m, self.craft.attitude)
         if setpoint.ask is Ask.REFUSED:
             self.pilot.texts.append((WARNING, setpoint.text))
         else:
+            self.steered_by = msg.get_srcSystem(), msg.get_srcComponent()
             self.pilot.setpoint(setpoint, at_ns)
 
     def _on_origin(self, msg: Any, at_ns: int) -> None:
         """The origin of the estimate: a place on the globe for what GPS would have given; it stays local zero."""
         valid = abs(msg.latitude) <= 900_000_000 and abs(msg.longitude) <= 1_800_000_000
-        if msg.target_system in (0, SYSTEM_ID) and valid and not self.estimator.uses_gps:
+        if self._for_me(msg) and valid and not self.estimator.uses_gps:
             self.estimator.origin = True
             origin = self.telemetry.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, at_ns)
             if origin is not None:

@@ -7,6 +7,7 @@ import msgspec
 from sim.autopilot import Autopilot
 from sim.personality import PERSONALITIES
 from sim.quadrotor import Quadrotor
+from sim.spans import within
 from sim.vehicle import Vehicle
 from uavctl.config.sim import FaultConfig
 from uavctl.config.types import Config
@@ -14,6 +15,7 @@ from uavctl.errors import ConfigError
 
 OF_LINK = ("blackout", "held", "uplink_blackout")
 OF_CAMERA = ("occluded", "swapped", "frozen")
+LASTING = ("wind", "parameter")
 
 
 def with_spans(config: Config) -> Config:
@@ -27,6 +29,19 @@ def with_spans(config: Config) -> Config:
         elif fault.kind in OF_CAMERA:
             camera = replace(camera, **{fault.kind: (*getattr(camera, fault.kind), span)})
     return replace(config, link=link, sim=replace(config.sim, camera=camera))
+
+
+def active(config: Config, since_ns: int) -> tuple[str, ...]:
+    """What is amiss at a time since the start [ns]: the spans that it lies in, and the lasting changes made by then.
+
+    Args:
+        config: as `with_spans` gives it.
+        since_ns: the time.
+    """
+    sections = ((config.link, OF_LINK), (config.sim.camera, OF_CAMERA))
+    spans = [name for section, names in sections for name in names if within(getattr(section, name), since_ns)]
+    lasting = [one for one in config.sim.fault if one.kind in LASTING and one.at_s * 1e9 <= since_ns]
+    return tuple(dict.fromkeys([*spans, *(f"{one.kind} {one.name}".rstrip() for one in lasting)]))
 
 
 class Faults:

@@ -126,6 +126,7 @@ ARDUPILOT_PARAMETERS = {
     "WP_YAW_BEHAVIOR": _byte(2, 0, 1, 2, 3),  # 0 holds the heading, else the nose follows travel
 }
 TABLES: dict[str, Mapping[str, Parameter]] = {"px4": PX4_PARAMETERS, "ardupilot": ARDUPILOT_PARAMETERS}
+OWN_ID = {"px4": "MAV_SYS_ID", "ardupilot": "SYSID_THISMAV"}
 
 
 class Parameters:
@@ -135,8 +136,10 @@ class Parameters:
         names: in order; a parameter's index is its place.
     """
 
-    def __init__(self, autopilot: Literal["px4", "ardupilot"]) -> None:
-        self._table = TABLES[autopilot]
+    def __init__(self, autopilot: Literal["px4", "ardupilot"], system_id: int = 1) -> None:
+        name = OWN_ID[autopilot]
+        table = TABLES[autopilot]
+        self._table = {**table, name: _told(system_id, table[name].kind)}
         self._bytewise = autopilot == "px4"
         self._values = {name: _stored(one.value, one.kind) for name, one in self._table.items()}
         self.names = tuple(sorted(self._table))

@@ -9,7 +9,8 @@ import numpy as np
 
 from sim.autopilot import Autopilot
 from sim.channel import Channel
-from sim.faults import Faults, with_spans
+from sim.faults import Faults, active, with_spans
+from sim.look import Look
 from sim.mocap import Cameras
 from sim.quadrotor import STEP_S, Quadrotor
 from sim.script import Script, ScriptedChannel
@@ -48,7 +49,7 @@ class Peers:
         on_truth: Callable[[Truth], None] | None = None,
         script: Script | None = None,
     ) -> None:
-        config = with_spans(config)
+        config = self._config = with_spans(config)
         for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
         self.vehicle: Vehicle | Quadrotor
         if config.sim.plant == "quadrotor" and script is None:
@@ -65,7 +66,6 @@ class Peers:
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
         self._airborne = airborne
         self._start_ns = start_ns
-        self._deaf = config.link.uplink_blackout
         self._mocap_link = VEHICLE if shared_link else MOCAP
         self._on_truth = on_truth
         self._truth_ns = start_ns  # boundary of the next truth
@@ -96,7 +96,7 @@ class Peers:
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
         self._run(at_ns)
-        if link == VEHICLE and not within(self._deaf, at_ns - self._start_ns):
+        if link == VEHICLE and not within(self._config.link.uplink_blackout, at_ns - self._start_ns):
             self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
     def truth(self) -> Truth:
@@ -110,6 +110,27 @@ class Peers:
             sent=self.channel.counters.sent,
             lost=self.channel.counters.lost,
             mode=self.autopilot.mode_name,
+        )
+
+    def look(self) -> Look:
+        """What can be seen of the vehicle now."""
+        pilot, counters = self.autopilot.pilot, self.channel.counters
+        setpoint_ns = pilot.setpoint_ns
+        return Look(
+            system_id=self._config.sim.system_id,
+            time_s=(self.now_ns - self._start_ns) * 1e-9,
+            mode=self.autopilot.mode_name,
+            armed=pilot.armed,
+            phase=pilot.phase.name.lower(),
+            position_m=self.vehicle.position_m,
+            velocity_mps=self.vehicle.velocity_mps,
+            battery=self.autopilot.craft.battery.remaining,
+            steered_by=self.autopilot.steered_by,
+            setpoint_age_s=None if setpoint_ns is None else (self.now_ns - setpoint_ns) * 1e-9,
+            sent=counters.sent,
+            lost=counters.lost,
+            faults=active(self._config, self.now_ns - self._start_ns),
+            text=self.autopilot.text,
         )
 
     def flush(self, to_ns: int | None = None) -> None:

@@ -87,6 +87,11 @@ class Pilot:
             craft.rest()
 
     @property
+    def setpoint_ns(self) -> int | None:
+        """When the last setpoint that counts came [ns]."""
+        return self._setpoints_ns[1]
+
+    @property
     def external(self) -> bool:
         """Whether setpoints are flown."""
         return self.mode.role is Role.EXTERNAL and self.armed and self.phase is Phase.AIR
@@ -94,7 +99,7 @@ class Pilot:
     @property
     def _deadline_ns(self) -> int | None:
         """When silence has lasted too long; None when it does not matter."""
-        last_ns = self._setpoints_ns[1]
+        last_ns = self.setpoint_ns
         if last_ns is None or not self.external:
             return None
         if self._kind.name == "px4":

@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from selectors import EVENT_READ, SelectSelector
 
+from sim.look import Look
 from sim.peers import MOCAP, VEHICLE, Peers
 from sim.sockets import Port, open_port
 from uavctl.config.types import Config
@@ -20,6 +21,7 @@ from uavctl.data import Truth
 
 # Longest sleep, so that `stop` is asked often enough.
 NAP_S = 0.05
+LOOK_S = 0.25  # real time between two looks
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def serve_all(
     on_ready: Callable[[Ready], None],
     stop: Callable[[], bool],
     speed: float = 1.0,
+    on_look: Callable[[tuple[Look, ...]], None] | None = None,
 ) -> None:
     """Run the peers of each seat until `stop()` or the end of the duration.
 
@@ -82,6 +85,7 @@ def serve_all(
         on_ready: called once for each vehicle, all ports being open.
         stop: asked at least every 50 ms.
         speed: simulated time per real time.
+        on_look: gets a look at all the vehicles four times a second of real time, and one at the end; it must not wait.
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
@@ -101,7 +105,7 @@ def serve_all(
         worlds = [_world(seat, ports, clock.start_ns, airborne) for seat, ports in zip(seats, opened, strict=True)]
         for ports in opened:
             on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
-        _run(worlds, clock, end_ns, stop)
+        _run(worlds, clock, end_ns, stop, on_look)
     finally:
         for ports in opened:
             for port in ports.values():
@@ -131,9 +135,19 @@ def _world(seat: Seat, ports: dict[str, Port], start_ns: int, airborne: bool) ->
     return Peers(seat.config, start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth), ports
 
 
-def _run(worlds: Sequence[_World], clock: _Clock, end_ns: int | None, stop: Callable[[], bool]) -> None:
+def _run(
+    worlds: Sequence[_World],
+    clock: _Clock,
+    end_ns: int | None,
+    stop: Callable[[], bool],
+    on_look: Callable[[tuple[Look, ...]], None] | None,
+) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
+    look_s = time.monotonic()  # time of the next look
     while not stop():
+        if on_look is not None and time.monotonic() >= look_s:
+            on_look(tuple(peers.look() for peers, _ in worlds))
+            look_s = time.monotonic() + LOOK_S
         now_ns = clock.now_ns()
         if end_ns is not None and now_ns >= end_ns:
             break
@@ -153,6 +167,8 @@ def _run(worlds: Sequence[_World], clock: _Clock, end_ns: int | None, stop: Call
                         peers.receive(link, data, at_ns)
     for peers, _ in worlds:
         peers.flush()
+    if on_look is not None:
+        on_look(tuple(peers.look() for peers, _ in worlds))
 
 
 def _wait(ports: Sequence[Port], longest_s: float) -> None:

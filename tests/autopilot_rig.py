@@ -53,7 +53,7 @@ class Flight:
         self.name: Name = name
         airframe = {"airframe": WITH_SIH_DRAG} if name == "px4" else {}  # the one of the recorded flights
         self.vehicle: Quadrotor = quadrotor(name, wind=steady(wind), at=(0.0, 0.0, -5.0), speed=speed, **airframe)
-        config = load_config("room", [f"sim.autopilot={name}", f"sim.setpoint_timeout_s={TIMEOUT_S[name]}"])
+        config = load_config("room", [f"sim.autopilot={name}"])
         self.autopilot = Autopilot(config, self.vehicle, 0, airborne=airborne)
         self.client = Client()
         self.seen: list[tuple[int, Any]] = []
@@ -163,9 +163,6 @@ class Flight:
     @property
     def heading_deg(self) -> float:
         return math.degrees(heading_rad(self.vehicle.attitude))
-
-
-TIMEOUT_S = {"px4": 1.0, "ardupilot": 3.0}  # COM_OF_LOSS_T, GUID_TIMEOUT as recorded
 
 
 def external(kind: str, usec: int, vehicle: Quadrotor) -> Any:

@@ -166,7 +166,8 @@ def test_the_command_serves_a_file_of_faults_at_a_multiple_of_real_time(
         assert (
             run(["sim", *links, "--duration", "4", "--speed", "10", "--airborne", "--faults", str(file), "--json"]) == 0
         )
-        assert json.loads(capsys.readouterr().out) == {"vehicle": url, "mocap": url}
+        (told,) = json.loads(capsys.readouterr().out)["vehicles"]
+        assert told == {"system_id": 1, "vehicle": url, "mocap": url}
         modes: list[int] = []
         while len(modes) < 4:
             modes += [msg.custom_mode >> 16 for msg in decode(client.recv(4096)) if msg.get_type() == "HEARTBEAT"]

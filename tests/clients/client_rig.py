@@ -39,7 +39,7 @@ def simulator(autopilot: str, vehicle: str, *options: str) -> Iterator[str]:
     )
     try:
         assert process.stdout is not None
-        yield str(json.loads(process.stdout.readline())["vehicle"])
+        yield str(json.loads(process.stdout.readline())["vehicles"][0]["vehicle"])
     finally:
         process.send_signal(signal.SIGINT)
         try:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 
+from sim.fleet import fleet
 from sim.server import Ready, Seat, serve_all
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common
+from uavctl.cli.common import DEFAULTS, POSITIVE, Common, messages
 from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.sim_view import watching
 from uavctl.config.fault_file import with_faults
 from uavctl.data import Truth
 
@@ -19,6 +23,7 @@ VEHICLES = {
     "px4": "udpout://127.0.0.1:14540,udpout://127.0.0.1:14550",
     "ardupilot": "tcpin://127.0.0.1:5760",
 }
+MOST_VEHICLES = 10
 
 
 def sim(
@@ -45,31 +50,55 @@ def sim(
     faults: Annotated[
         Path | None, Parameter(help="TOML file of what happens, as [[fault]] tables with the keys of [[sim.fault]]")
     ] = None,
+    vehicles: Annotated[
+        int,
+        Parameter(
+            help="how many at once, 1 to 10. Each has the system id and the seed of the one before plus one, starts "
+            "1 m east of it, and its ports lie 1 (UDP) or 10 (TCP) higher",
+            validator=validators.Number(gte=1, lte=MOST_VEHICLES),
+        ),
+    ] = 1,
+    view: Annotated[
+        bool, Parameter(negative=(), help="show on standard error what happens; without a terminal a line a second")
+    ] = False,
 ) -> int:
-    """Serve the simulated vehicle; one line says when the ports are open."""
+    """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     config = common.with_overrides(overrides).load().config
     if faults is not None:
         config = with_faults(config, faults)
 
-    def ready(ports: Ready) -> None:
-        document = {"vehicle": ports.vehicle, "mocap": ports.mocap}
-        line = (
-            msgspec.json.encode(document).decode() if common.json else " ".join(f"{k} {v}" for k, v in document.items())
-        )
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
-
     def forget(truth: Truth) -> None:
         del truth
 
-    with stop_on_signals() as stopped:
+    seats = fleet(config, vehicle or VEHICLES[config.sim.autopilot], mocap, vehicles, forget)
+    opened: list[Ready] = []
+
+    def ready(ports: Ready) -> None:
+        opened.append(ports)
+        if len(opened) == len(seats):
+            _announce(seats, opened, as_json=common.json)
+
+    watch = watching(messages()) if view else nullcontext()
+    with stop_on_signals() as stopped, watch as on_look:
         serve_all(
-            (Seat(config, vehicle or VEHICLES[config.sim.autopilot], mocap, forget),),
+            seats,
             duration_s=duration,
             airborne=airborne,
             on_ready=ready,
             stop=stopped,
             speed=speed,
+            on_look=on_look,
         )
     return 0
+
+
+def _announce(seats: Sequence[Seat], opened: Sequence[Ready], *, as_json: bool) -> None:
+    listed = [
+        {"system_id": seat.config.sim.system_id, "vehicle": ports.vehicle, "mocap": ports.mocap}
+        for seat, ports in zip(seats, opened, strict=True)
+    ]
+    lines = [" ".join(f"{key} {value}" for key, value in one.items()) for one in listed]
+    text = msgspec.json.encode({"vehicles": listed}).decode() if as_json else "\n".join(lines)
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()

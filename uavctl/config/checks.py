@@ -254,6 +254,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("plant", "daemon"), _tick),
     (("limits",), _limits),
     (("sim",), sim_checks.sim),
+    (("sim", "daemon"), sim_checks.ids),
     (("plant", "sets", "mission"), mission_checks.mission),
     (("plant", "sets", "fence"), mission_checks.fences),
     (("solver", "mission"), mission_checks.solver),

@@ -14,7 +14,7 @@ _DELETE = "\x7f"  # the one character that JSON leaves as it is and TOML wants e
 
 
 def dump_config(config: Config) -> str:
-    """TOML text with every key; `parse` gives an equal configuration back."""
+    """TOML text with every key that has a value (TOML knows no null); `parse` gives an equal configuration back."""
     return "\n".join(_lines(msgspec.to_builtins(config), "")) + "\n"
 
 
@@ -22,7 +22,7 @@ def _lines(table: Mapping[str, Any], path: str) -> Iterator[str]:
     """The plain keys of a table, then the tables in it: TOML wants them in this order."""
     inner = {key: value for key, value in table.items() if _is_table(value)}
     for key, value in table.items():
-        if key not in inner:
+        if key not in inner and value is not None:
             yield f"{key} = {_text(value)}"
     for key, value in inner.items():
         name = f"{path}.{key}" if path else key

@@ -53,7 +53,7 @@ def type_text(annotation: Any) -> str:
     if origin is Literal:
         return " or ".join(f'"{choice}"' for choice in arguments)
     if origin in (Union, types.UnionType):
-        return ", or ".join(type_text(argument) for argument in arguments)
+        return ", or ".join(type_text(argument) for argument in arguments if argument is not types.NoneType)
     if element(annotation) is not None:
         return "list of tables"
     if origin is tuple:
@@ -114,4 +114,6 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
 def _default(field: FieldInfo) -> str:
     if field.default is NODEFAULT:
         return "required"
+    if field.default is None:
+        return "none"
     return f"`{msgspec.json.encode(field.default).decode()}`"

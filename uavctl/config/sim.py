@@ -131,6 +131,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
         Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
     ] = "px4"
     fault: Annotated[tuple[FaultConfig, ...], Meta(description="what happens in the course of a flight")] = ()
+    system_id: Annotated[int, Meta(ge=1, le=250, description="MAVLink system id of the simulated vehicle")] = 1
     seed: Annotated[int, Meta(ge=0, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
     start_velocity_mps: Annotated[Position, Meta(description="velocity at the start, local NED [m/s]")] = (
@@ -139,5 +140,9 @@ class SimConfig(Section, frozen=True, kw_only=True):
         0.0,
     )
     setpoint_timeout_s: Annotated[
-        float, Meta(gt=0, description="silence after which the vehicle leaves the mode that takes setpoints [s]")
-    ] = 1.0
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(
+            description="silence after which setpoints count as gone [s]; without it the autopilot's own: 1 s with PX4 "
+            "(COM_OF_LOSS_T), 3 s with ArduPilot (GUID_TIMEOUT)"
+        ),
+    ] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem
 from uavctl.config.section import Spans
 from uavctl.config.sim import FaultConfig, QuadrotorConfig, SimConfig, WindConfig
@@ -38,6 +39,14 @@ def sim(config: SimConfig) -> Iterator[Problem]:
             "sim.start_position_m[2]",
             f"{config.start_position_m[2]:g} m is not above the floor z = 0, where the quadrotor would stand",
             "give a number below 0 (local NED: up is negative)",
+        )
+
+
+def ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[Problem]:
+    """Two on one link that cannot be told apart."""
+    if sim.system_id == daemon.system_id:
+        yield Problem(
+            "sim.system_id", f"{sim.system_id} is that of the daemon too (daemon.system_id)", "give another number"
         )
 
 

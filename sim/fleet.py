@@ -1,0 +1,87 @@
+"""Several simulated vehicles from one configuration, each with ports of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from urllib.parse import urlsplit
+
+import msgspec
+
+from sim.server import Seat
+from uavctl.config.types import Config
+from uavctl.data import Truth
+from uavctl.errors import ConfigError, ConnectionSpecError
+
+LARGEST_ID = 250
+APART_M = 1.0
+TCP_PORTS = 10  # from one vehicle to the next, as ArduPilot's simulator counts instances; UDP counts by one
+
+
+def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]) -> tuple[Seat, ...]:
+    """Seats of `count` vehicles, the first as configured.
+
+    Each of the others has the system id and the seed of the one before plus one, starts 1 m east of it, and its
+    ports lie one (UDP) or ten (TCP) higher; port 0, any free one, stays 0. What is configured to happen happens to all.
+
+    Args:
+        config: of the first.
+        vehicle: URLs of the first one's link.
+        mocap: URLs of its cameras.
+        count: how many.
+        on_truth: hears the truth of all.
+
+    Raises:
+        ConfigError: the system ids run out.
+        ConnectionSpecError: two vehicles would have one port.
+    """
+    last = config.sim.system_id + count - 1
+    if last > LARGEST_ID:
+        raise ConfigError(
+            (f"sim.system_id: {count} vehicles would go up to {last}; set {LARGEST_ID + 1 - count} or less",)
+        )
+    seats = tuple(Seat(_another(config, i), _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
+    taken: dict[str, int] = {}
+    for i, seat in enumerate(seats):
+        for url in _fixed(seat):
+            if taken.setdefault(url, i) != i:
+                raise ConnectionSpecError(
+                    f"{url}: vehicles {taken[url] + 1} and {i + 1} would both have it; choose ports further apart"
+                )
+    return seats
+
+
+def _another(config: Config, number: int) -> Config:
+    sim = config.sim
+    north, east, down = sim.start_position_m
+    replace = msgspec.structs.replace
+    other = replace(
+        sim,
+        system_id=sim.system_id + number,
+        seed=sim.seed + number,
+        start_position_m=(north, east + APART_M * number, down),
+    )
+    return replace(config, sim=other)
+
+
+def _shifted(urls: str, number: int) -> str:
+    return ",".join(_higher(url.strip(), number) for url in urls.split(","))
+
+
+def _higher(url: str, number: int) -> str:
+    """The URL with a higher port; one that is none stays as it is, for `open_port` to refuse."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        return url
+    if not port or parts.hostname is None:
+        return url
+    step = TCP_PORTS if parts.scheme == "tcpin" else 1
+    return f"{parts.scheme}://{parts.hostname}:{port + step * number}"
+
+
+def _fixed(seat: Seat) -> Iterator[str]:
+    """The URLs of a seat, but for those that stand for any free port."""
+    for url in {*seat.vehicle.split(","), *seat.mocap.split(",")}:
+        if not url.endswith(":0"):
+            yield url
