@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from sim.airframe import CRAZYFLIE_2, Airframe
+from sim.battery import Battery
 from sim.quadrotor import STEP_NS, STEP_S, Quadrotor
 from sim.vehicle import linear_model
 from sim.wind import Wind
@@ -135,3 +137,20 @@ def fitted(flown: Array, setpoints: Array, axis: int, window: tuple[float, float
                 best = Response(float(dead), float(lag), float(linear[0]), float(linear[1]), rms)
     assert best is not None
     return best
+
+
+BOTH: tuple[Autopilot, ...] = ("px4", "ardupilot")
+
+
+def tilt(vehicle: Quadrotor) -> float:
+    _, x, y, _ = vehicle.attitude
+    return math.acos(1.0 - 2.0 * (x * x + y * y))
+
+
+def allowing(speed_rps: float) -> Battery:
+    """A battery that allows this rotor speed."""
+    return Battery(replace(CRAZYFLIE_2, speed_at_0v_rps=speed_rps, speed_per_v_rps=0.0))
+
+
+def gusty(seed: int) -> Wind:
+    return Wind((1.0, 0.5, 0.0), 8.0, 5.0, STEP_S, np.random.SeedSequence(seed))

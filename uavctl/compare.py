@@ -186,11 +186,7 @@ def seeded_states(limits: Polytope, target: Array, count: int, seed: int) -> tup
 
     A state that is not limited on both sides stays at the target's.
     """
-    lower, upper = np.full(len(target), -np.inf), np.full(len(target), np.inf)
-    for row, side in zip(limits.c, limits.b, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size == 1:
-            (upper if row[used[0]] > 0 else lower)[used[0]] = side / row[used[0]]
+    lower, upper = limits.bounds
     open_side = ~(np.isfinite(lower) & np.isfinite(upper))
     lower[open_side] = upper[open_side] = target[open_side]
     rng = np.random.default_rng(seed)

@@ -13,9 +13,10 @@ from uavctl.data import SolveStatus
 from uavctl.errors import UavctlError
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.assemble import KEPT
-from uavctl.smpc.components import Component, decompose
+from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import PartSolver
 from uavctl.smpc.design import Design
+from uavctl.smpc.region import state_box
 
 Array = NDArray[np.float64]
 
@@ -75,7 +76,10 @@ def _box_states(
     found = np.zeros((count, design.plant.n_x))
     share = 1.0
     for component in decompose(design):
-        solver, (lower, upper) = PartSolver(design, component), _box(design, component)
+        solver, (lower, upper) = (
+            PartSolver(design, component),
+            state_box(component, design.target[component.states], _SPREAD),
+        )
         tried, done, misses = 0, 0, 0
         while done < count:
             x = design.target.copy()
@@ -95,18 +99,6 @@ def _box_states(
                 )
         share *= done / tried
     return list(found), share
-
-
-def _box(design: Design, component: Component) -> tuple[Array, Array]:
-    """Bounding box of a component's state set; around the target where there is no limit."""
-    around = _SPREAD * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
-    home = design.target[component.states]
-    lower, upper = home - around, home + around
-    for row, side in zip(component.c_x, component.b_x, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size == 1:
-            (upper if row[used[0]] > 0 else lower)[used[0]] = side / row[used[0]]
-    return lower, upper
 
 
 def closed_loops(

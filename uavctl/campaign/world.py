@@ -83,7 +83,7 @@ def fly(scene: Scene, controller: BatchController, newest: Counts, disturbances:
     states[:, 0] = scene.start
     failed = np.zeros(runs, dtype=np.bool_)
     every = np.arange(runs)
-    low, high = _box(scene.input_set, plant.n_u)
+    low, high = scene.input_set.bounds
     controller.begin(runs)
     for k in range(steps):
         news = News(k, newest[:, k], states[every, newest[:, k]], inputs[:, :k])
@@ -109,15 +109,3 @@ def _outside(limits: Polytope, points: Array) -> Flags:
     """Which points (…, n) break a row of the set."""
     room = limits.b * (1.0 + _ROUNDING * np.sign(limits.b)) + _ROUNDING
     return np.asarray((points @ limits.c.T > room).any(axis=-1), dtype=np.bool_)
-
-
-def _box(limits: Polytope, n: int) -> tuple[Array, Array]:
-    """The largest box around which the actuators saturate each by itself (n,), (n,)."""
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    for row, side in zip(limits.c, limits.b, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size == 1 and row[used[0]] > 0:
-            high[used[0]] = min(high[used[0]], side / row[used[0]])
-        elif used.size == 1:
-            low[used[0]] = max(low[used[0]], side / row[used[0]])
-    return low, high

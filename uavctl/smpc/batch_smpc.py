@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer, Outlook, Solver
+from uavctl.smpc.assemble import KEPT
 from uavctl.smpc.batch import News, predict
 from uavctl.smpc.design import Design
 from uavctl.smpc.plant import Plant
@@ -113,7 +114,6 @@ class BatchSmpc:
         self._design, self._decider, self._plant = design, decider, plant
         self._brake = brake_gain_1ps
         self._input_of_accel = np.linalg.pinv(plant.accel_map)
-        self._slack = 1e-6  # below: the QPs' rounding
         self.begin(0)
 
     def begin(self, runs: int) -> None:
@@ -152,7 +152,7 @@ class BatchSmpc:
         tally = self.tally
         tally.decisions[who] += 1
         tally.infeasible[who] += ~answers.solved
-        tally.slack_used[who] += answers.solved & (answers.slack > self._slack)
+        tally.slack_used[who] += answers.solved & (answers.slack > KEPT)
         tally.largest_gap[found] = np.maximum(tally.largest_gap[found], answers.gap[answers.solved])
 
     def _braking(self, x: Array) -> Array:

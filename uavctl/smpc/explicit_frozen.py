@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.components import Component
 from uavctl.smpc.explicit_regions import LEFT, Critical, Parametric, critical_regions
 from uavctl.smpc.frozen import Frozen
 from uavctl.smpc.meanqp import Kind, MeanProblem
 from uavctl.smpc.mixture import Mixture
 from uavctl.smpc.qp import OPEN, SOFT
+from uavctl.smpc.region import state_box
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -75,7 +75,7 @@ class FrozenTable:
         self._program = self._parametric()
         self._residual = self._problem.residual_p @ self._of_x1
         self._pairs = np.triu_indices(target.size + 1)
-        low, high = _box(part, target)
+        low, high = state_box(part, target, _SPREAD)
         self._pieces = [self._piece(region) for region in critical_regions(self._program, low, high, target)]
         self._shape = (self._problem.horizon.steps, part.b.shape[1])
 
@@ -175,16 +175,3 @@ def _parameters(problem: MeanProblem, target: Array) -> Array:
     """Parameters p of the mean problem as a map of x1 (n_p, 1 + n_x)."""
     origin = problem.parameters(np.zeros(target.size), target)
     return np.column_stack([origin, *(problem.parameters(unit, target) - origin for unit in np.eye(target.size))])
-
-
-def _box(part: Component, target: Array) -> tuple[Array, Array]:
-    """The states that are looked up: the bounding box of the limits, and what is around the target without any."""
-    around = _SPREAD * np.sqrt(np.diagonal(part.sigma_x + part.estimate_cov))
-    low, high = target - around, target + around
-    for row, side in zip(part.c_x, part.b_x, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size == 1 and row[used[0]] > 0:
-            high[used[0]] = side / row[used[0]]
-        elif used.size == 1:
-            low[used[0]] = side / row[used[0]]
-    return low, high

@@ -66,7 +66,8 @@ class PlanMap:
         self._shape_u, self._shape_x = (steps, plant.n_u), (steps + 1, plant.n_x)
         self._of_x, self._of_u = _prediction(plant.a, plant.b, steps)
         self._tables = [_backoffs(design, mixture) for mixture in mixtures]
-        low, high, self._oblique = _box(design)
+        low, high = design.input_set.bounds
+        self._oblique = bool((np.count_nonzero(design.input_set.c, axis=1) != 1).any())
         self._low, self._high = np.tile(low, steps), np.tile(high, steps)
         self._plan = self._plan_matrix()
         self._inputs, self._states, self._reference = slices([steps * plant.n_u, (steps + 1) * plant.n_x, plant.n_x])
@@ -209,21 +210,6 @@ def _prediction(a: Array, b: Array, steps: int) -> tuple[Array, Array]:
         of_u[then] = a @ of_u[now]
         of_u[then, t * n_u : (t + 1) * n_u] += b
     return of_x, of_u
-
-
-def _box(design: Design) -> tuple[Array, Array, bool]:
-    """Bounds of each input, and whether there are rows of more than one input."""
-    n_u = design.plant.n_u
-    low, high, oblique = np.full(n_u, -np.inf), np.full(n_u, np.inf), False
-    for row, side in zip(design.input_set.c, design.input_set.b, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size != 1:
-            oblique = True
-        elif row[used[0]] > 0:
-            high[used[0]] = min(high[used[0]], side / row[used[0]])
-        else:
-            low[used[0]] = max(low[used[0]], side / row[used[0]])
-    return low, high, oblique
 
 
 def _backoffs(design: Design, mixture: Mixture) -> Array:

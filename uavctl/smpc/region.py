@@ -10,6 +10,7 @@ from uavctl.smpc.components import Component
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import horizon_of
 from uavctl.smpc.meanqp import Kind, MeanProblem
+from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
 
@@ -20,18 +21,23 @@ _SPREAD = 3.0  # standard deviations around the target, for states without limit
 _FOLLOWS, _TIGHTENS, _TIGHTER = 0.4, 0.4, 0.4
 
 
+def state_box(component: Component, home: Array, spread: float) -> tuple[Array, Array]:
+    """Bounding box of a component's state set (n_x,), (n_x,).
+
+    Where there is no limit: `spread` standard deviations of the settled state around `home` (n_x,).
+    """
+    around = spread * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
+    low, high = Polytope(component.c_x, component.b_x).bounds
+    return np.where(np.isfinite(low), low, home - around), np.where(np.isfinite(high), high, home + around)
+
+
 class Region:
     """States and targets of one component that a library is made for: its box, and what lies around its targets."""
 
     def __init__(self, design: Design, component: Component) -> None:
         self._part, self._design = component, design
-        around = _SPREAD * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
         home = design.target[component.states]
-        self._lower, self._upper = home - around, home + around
-        for row, side in zip(component.c_x, component.b_x, strict=True):
-            (used,) = np.nonzero(row)
-            if used.size == 1:
-                (self._upper if row[used[0]] > 0 else self._lower)[used[0]] = side / row[used[0]]
+        self._lower, self._upper = state_box(component, home, _SPREAD)
         self._home = component.coordinates @ home
         values, vectors = np.linalg.eigh(component.sigma_x)
         self._root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -34,6 +34,21 @@ class Polytope:
                 limits.append(-low)
         return cls(np.array(rows).reshape(-1, len(lower)), np.array(limits))
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Limits of each variable (n,), (n,), by the rows of that variable alone; infinite where there is none."""
+        low, high = np.full(self.c.shape[1], -np.inf), np.full(self.c.shape[1], np.inf)
+        for row, side in zip(self.c, self.b, strict=True):
+            (used,) = np.nonzero(row)
+            if used.size != 1:
+                continue
+            (i,) = used
+            if row[i] > 0:
+                high[i] = min(high[i], side / row[i])
+            else:
+                low[i] = max(low[i], side / row[i])
+        return low, high
+
     def margin(self, x: Array) -> Array:
         """b - C x (m,): negative where a limit is broken."""
         margin: Array = self.b - self.c @ x

@@ -63,7 +63,7 @@ class _PartMpc:
         self._plan_x, self._plan_z = np.split(inputs_of.reshape(-1, rows.shape[1]), [n_x], axis=1)
         soft = np.arange(len(rows)) < problem.horizon * part.rows_x.size
         self._open = np.full(len(rows), -OPEN)
-        low, high = problem.input_box
+        low, high = problem.input_set.bounds
         self._low, self._high = ((side - problem.u_target)[part.inputs] for side in (low, high))
         self._program = QuadraticProgram(
             2.0 * np.eye(self._of_z.shape[1]),

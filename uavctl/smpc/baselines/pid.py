@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines.problem import Problem, box
+from uavctl.smpc.baselines.problem import Problem
 from uavctl.smpc.batch import News
 
 Array = NDArray[np.float64]
@@ -48,10 +48,10 @@ class CascadedPid:
         plant = problem.plant
         self._problem, self._gains = problem, gains
         self._position, self._velocity = list(plant.position_index), list(plant.velocity_index)
-        low, high = box(problem.state_set, plant.n_x)
+        low, high = problem.state_set.bounds
         self._slowest, self._fastest = np.minimum(low[self._velocity], 0.0), np.maximum(high[self._velocity], 0.0)
         self._accel_of_input, self._input_of_accel = plant.accel_map, np.linalg.pinv(plant.accel_map)
-        self._low, self._high = problem.input_box
+        self._low, self._high = problem.input_set.bounds
         self.begin(0)
 
     def begin(self, runs: int) -> None:

@@ -44,11 +44,6 @@ class Problem:
     slack_linear: float
     slack_quadratic: float
 
-    @property
-    def input_box(self) -> tuple[Array, Array]:
-        """Limits of each input by itself (n_u,), (n_u,), infinite where there is none."""
-        return box(self.input_set, self.plant.n_u)
-
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -84,21 +79,6 @@ def parts(problem: Problem) -> tuple[Part, ...]:
 
 def _rows(limits: Polytope, variables: NDArray[np.bool_]) -> Index:
     return np.flatnonzero(np.any(limits.c[:, variables] != 0, axis=1) & np.isfinite(limits.b))
-
-
-def box(limits: Polytope, n: int) -> tuple[Array, Array]:
-    """The largest box (n,), (n,) around a set of which only rows of a single variable are looked at."""
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    for row, side in zip(limits.c, limits.b, strict=True):
-        (used,) = np.nonzero(row)
-        if used.size != 1:
-            continue
-        (i,) = used
-        if row[i] > 0:
-            high[i] = min(high[i], side / row[i])
-        else:
-            low[i] = max(low[i], side / row[i])
-    return low, high
 
 
 def deviations(limits: Polytope, covariance: Array) -> Array:
