@@ -84,11 +84,14 @@ class AttitudeLoop:
         """Torque [N m] that turns the body towards an attitude; `integrate` is false at the rotors' limits."""
         w, x, y, z = motion.attitude
         a, b, c, d = attitude
-        ew = w * a + x * b + y * c + z * d
-        scale = 2.0 * self._gain if ew >= 0.0 else -2.0 * self._gain
-        p = scale * (w * b - x * a - y * d + z * c)
-        q = scale * (w * c + x * d - y * a - z * b)
-        r = 0.25 * scale * (w * d - x * c + y * b - z * a)
+        ew, ex = w * a + x * b + y * c + z * d, w * b - x * a - y * d + z * c
+        ey, ez = w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a
+        # As the autopilots do it: the shortest turn that points the thrust first, whatever the heading still lacks.
+        upright = math.sqrt(ew * ew + ez * ez)
+        if upright > 0.0:
+            ex, ey = (ew * ex - ey * ez) / upright, (ew * ey + ex * ez) / upright
+        p, q = 2.0 * self._gain * ex, 2.0 * self._gain * ey
+        r = math.copysign(0.5, ew) * self._gain * ez
         size = math.sqrt(p * p + q * q)
         if size > MAX_RATE_RPS:
             p, q = p * MAX_RATE_RPS / size, q * MAX_RATE_RPS / size

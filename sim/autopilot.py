@@ -23,6 +23,7 @@ from sim.personality import PERSONALITIES
 from sim.pilot import CRASHED, WARNING, Pilot
 from sim.setpoints import Ask, interpret
 from sim.telemetry import HOME_POSITION, Message, Telemetry, Vehicle
+from sim.timesync import TimeSync
 from sim.vehicle import Vehicle as Plant
 from uavctl.config.types import Config
 
@@ -30,12 +31,12 @@ SECOND_NS = 1_000_000_000
 COMPONENT_ID = 1
 # Age of the autopilot at the start of the simulation, so that its clock is neither zero nor ours.
 UPTIME_NS = 20 * SECOND_NS
-NO_INDEX = 65535  # param_index of a parameter that is not in the list
+NO_INDEX = 65535  # param_index that is none
 HASH = "_HASH_CHECK"
 # MAV_DATA_STREAM, as ArduPilot groups its messages; 0 is all.
 DATA_STREAMS = {
     2: (1, 24),
-    3: (85,),
+    3: (65,),
     6: (32, 33),
     10: (30,),
     11: (74,),
@@ -69,12 +70,16 @@ class Autopilot:
         self.craft = craft
         self._mav = mavlink.MAVLink(None, config.sim.system_id, COMPONENT_ID)
         self._out: list[bytes] = []
-        self.parameters = Parameters(kind.name, config.sim.system_id)
+        # Who changes the mode with the stick has one.
+        radio = kind.radio or any(fault.kind == "mode" for fault in config.sim.fault)
+        self.parameters = Parameters(kind.name, config.sim.system_id, radio=radio)
         if config.sim.setpoint_timeout_s is not None:
             self.parameters.set(kind.timeout, config.sim.setpoint_timeout_s)
-        self.estimator = Estimator(kind, self.parameters, craft)
-        self.pilot = Pilot(kind, craft, self.parameters, self.estimator, boot_ns, airborne=airborne)
-        whole = Vehicle(kind, craft, self.pilot, self.estimator, self.parameters, Origin(*kind.origin_deg_m), boot_ns)
+        self._sync = TimeSync()
+        self.estimator = Estimator(kind, self.parameters, craft, self._age_ns)
+        self.pilot = Pilot(kind, craft, self.parameters, self.estimator, boot_ns, airborne=airborne, radio=radio)
+        origin = Origin(*kind.origin_deg_m)
+        whole = Vehicle(kind, craft, self.pilot, self.estimator, self.parameters, origin, boot_ns, radio)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
         self._failsafes = Failsafes(kind, self.pilot, self.parameters, self.estimator, craft.battery)
@@ -167,6 +172,13 @@ class Autopilot:
     def _on_timesync(self, msg: Any, at_ns: int) -> None:
         if msg.tc1 == 0:
             self._send(mavlink.MAVLink_timesync_message(at_ns - self._boot_ns, msg.ts1))
+        else:
+            self._sync.take(msg.ts1, msg.tc1, at_ns - self._boot_ns)
+
+    def _age_ns(self, stamp_ns: int, at_ns: int) -> int:
+        """How old PX4 takes an external position to be."""
+        now_ns = at_ns - self._boot_ns
+        return now_ns - self._sync.moved_ns(stamp_ns, now_ns)
 
     def _on_command(self, msg: Any, at_ns: int) -> None:
         if self._for_me(msg):
@@ -231,7 +243,7 @@ class Autopilot:
         if 0 <= msg.param_index < len(names):
             self._send_parameter(names[msg.param_index])
         elif msg.param_index == -1 and msg.param_id in self.parameters:
-            self._send_parameter(msg.param_id)
+            self._send_parameter(msg.param_id, by_name=True)
         elif msg.param_index == -1 and msg.param_id == HASH and self._kind.name == "px4":
             self._send_digest()
 
@@ -245,11 +257,13 @@ class Autopilot:
             self.pilot.texts.append((WARNING, f"param types mismatch param: {name}"))
         elif not self.parameters.set(name, self.parameters.decoded(name, msg.param_value)):
             self.pilot.texts.append((WARNING, f"value not simulated: {name}"))
-        self._send_parameter(name)
+        self._send_parameter(name, by_name=True)
 
-    def _send_parameter(self, name: str) -> None:
+    def _send_parameter(self, name: str, *, by_name: bool = False) -> None:
+        """Tell a parameter; ArduPilot leaves out the index where it was asked by name."""
         p = self.parameters
-        place = len(p.names), p.names.index(name)
+        nameless = by_name and self._kind.name == "ardupilot"
+        place = len(p.names), NO_INDEX if nameless else p.names.index(name)
         self._send(mavlink.MAVLink_param_value_message(name.encode(), p.encoded(name), p.kind(name), *place))
 
     def _send_digest(self) -> None:

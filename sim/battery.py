@@ -6,8 +6,6 @@ import math
 
 from sim.airframe import Airframe
 
-EMPTY_V = 3.0  # where the Crazyflie's firmware counts the battery as empty
-
 
 class Battery:
     """A voltage source that sinks with the charge used, behind a resistance, feeding a load of given power.
@@ -34,6 +32,11 @@ class Battery:
         return max(1.0 - self.used_c / self._airframe.capacity_c, 0.0)
 
     @property
+    def empty(self) -> bool:
+        """Whether nothing is left: its protection has switched off."""
+        return self.used_c >= self._airframe.capacity_c
+
+    @property
     def open_circuit_v(self) -> float:
         """Voltage without load, linear between the tenths of the table."""
         table = self._airframe.open_circuit_v
@@ -49,8 +52,12 @@ class Battery:
     def drain(self, thrust_n: float, duration_s: float) -> None:
         """Feed the electronics and this thrust for a time.
 
-        U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more.
+        U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more, and nothing
+        once it is empty.
         """
+        if self.empty:
+            self.voltage_v = self.current_a = 0.0
+            return
         power_w = self._airframe.electronics_w + self._airframe.power_per_thrust_wpn * thrust_n
         source_v = self.open_circuit_v
         left = source_v * source_v - 4.0 * self._airframe.resistance_ohm * power_w

@@ -17,14 +17,14 @@ from typing import Literal
 from sim.airframe import GRAVITY_MPS2
 from sim.attitude import Lean, lean
 from sim.rigid_body import Motion
+from sim.steering import BRAKE_MPS2, CLIMB_MPS, CRUISE_MPS, LAND_MPS
 from uavctl.data import Vec3
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 # Reference: within these limits a velocity is reached with a gain such that the jerk limit is met by itself.
-REFERENCE_ACCEL_MPS2 = 2.5  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
+REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
 REFERENCE_GAIN_1PS = 2.0
 REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
-CRUISE_MPS, CLIMB_MPS, LAND_MPS = 5.0, 1.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class Cascade:
 
 
 def _approach(distance_m: float, limit_mps: float) -> float:
-    """Speed at a distance from which a stop is still gentle: proportional when near, a braking parabola when far."""
+    """Speed at a distance from which a stop takes half of the limit: proportional when near, a parabola when far."""
     near = REFERENCE_ACCEL_MPS2 / (2.0 * REFERENCE_POSITION_1PS**2)
     if distance_m <= near:
         return min(REFERENCE_POSITION_1PS * distance_m, limit_mps)

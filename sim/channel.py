@@ -32,6 +32,36 @@ class Counters:
     oversized: int = 0
 
 
+class UnderWay:
+    """The packets of a channel that have not arrived yet.
+
+    Attributes:
+        counters: What happened so far.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._pending: list[tuple[int, int, int, bytes]] = []  # (arrival, unheld arrival, order, data)
+        self._order = 0
+
+    def _let_through(self, arrival_ns: int, unheld_ns: int, data: bytes) -> None:
+        self._order += 1
+        heapq.heappush(self._pending, (arrival_ns, unheld_ns, self._order, data))
+
+    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
+        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
+        due = []
+        while self._pending and self._pending[0][0] <= to_ns:
+            arrival_ns, *_, data = heapq.heappop(self._pending)
+            due.append((arrival_ns, data))
+        return due
+
+    @property
+    def next_ns(self) -> int | None:
+        """Time of the next arrival [ns], None if nothing is under way."""
+        return self._pending[0][0] if self._pending else None
+
+
 class _Fate(NamedTuple):
     """What becomes of a packet."""
 
@@ -43,7 +73,7 @@ class _Fate(NamedTuple):
     oversized: bool
 
 
-class Channel:
+class Channel(UnderWay):
     """One direction of a radio link.
 
     Loss is Bernoulli, Gilbert-Elliott (the chain starts in the good state and steps before each packet) or
@@ -68,6 +98,7 @@ class Channel:
     ) -> None:
         if link.probability and step_ns is None:
             raise ValueError("link.probability goes by steps, so their length is needed")
+        super().__init__()
         self._link = link
         self._start_ns = start_ns
         self._step_ns = step_ns or 0
@@ -77,9 +108,6 @@ class Channel:
         self._runs = np.cumsum(link.gaps)
         self._to_lose = _TO_DRAW
         self._number = 0  # of the next packet
-        self._pending: list[tuple[int, int, int, bytes]] = []  # (arrival, unheld arrival, order, data)
-        self._order = 0
-        self.counters = Counters()
 
     def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
         """Send a packet at `at_ns`; a `certain` one is not lost."""
@@ -93,27 +121,13 @@ class Channel:
         counters.oversized += fate.oversized
         counters.duplicated += len(fate.delays_s) - 1
         for delay_s in fate.delays_s:
-            self._order += 1
             # A packet that a trace loses has no delay of its own, but may be a certain one.
             arrival_ns = at_ns + (round(delay_s * 1e9) if math.isfinite(delay_s) else 0)
-            heapq.heappush(self._pending, (self._released(arrival_ns), arrival_ns, self._order, fate.data))
+            self._let_through(self._released(arrival_ns), arrival_ns, fate.data)
 
     def pass_over(self, at_ns: int) -> None:
         """Nothing is sent at `at_ns` where a packet was due; what comes after goes as if it had been."""
         self._draw(at_ns, b"")
-
-    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
-        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
-        due = []
-        while self._pending and self._pending[0][0] <= to_ns:
-            arrival_ns, *_, data = heapq.heappop(self._pending)
-            due.append((arrival_ns, data))
-        return due
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next arrival [ns], None if nothing is under way."""
-        return self._pending[0][0] if self._pending else None
 
     def _draw(self, at_ns: int, data: bytes) -> _Fate:
         link = self._link

@@ -8,6 +8,7 @@ the recorded loss of the cameras (ArduCopter: nothing is said for 7.2 s while th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from sim.craft import ZERO, Craft, rotated, tuple_minus
@@ -22,6 +23,8 @@ LOST_NS = 7_200_000_000  # ArduPilot: from the last sample to flags 0x25
 FUSE_S = 0.2  # time constant with which samples pull the estimate
 GATE_M = 1.0  # a sample further off is not believed
 PX4_GAP_NS = 200_000_000  # PX4 begins to fuse at more than 5 Hz only
+# PX4 looks back by EKF2_DELAY_MAX (200 ms), and has no use for what is 100 ms older, or of a time to come.
+PX4_AGES_S = (-0.1, 0.3)
 START_NS = SECOND_NS  # of good samples before the estimate counts
 LOCAL_FRD, LOCAL_NED, BODY_FRD = 20, 1, 12  # MAV_FRAME
 
@@ -30,18 +33,27 @@ TAKEN = {
     "ardupilot": ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY"),
 }
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS
-GOOD, LOST, ATTITUDE_ONLY = 0x33F, 0x25, 0x1
+LOST, ATTITUDE_ONLY = 0x25, 0x1
 
 
 class Estimator:
     """Position and velocity as the vehicle believes them.
 
+    Args:
+        kind: PX4 or ArduCopter.
+        parameters: its parameters.
+        craft: what flies.
+        age_ns: how old PX4 takes a stamp to be, by the clock of who sent it; of (stamp, time) [ns].
+
     Attributes:
         origin: whether the geographic origin is known; ArduPilot without GPS waits for SET_GPS_GLOBAL_ORIGIN.
     """
 
-    def __init__(self, kind: Personality, parameters: Parameters, craft: Craft) -> None:
+    def __init__(
+        self, kind: Personality, parameters: Parameters, craft: Craft, age_ns: Callable[[int, int], int]
+    ) -> None:
         self._kind = kind
+        self._age_ns = age_ns
         self._parameters = parameters
         self._craft = craft
         self.origin = False
@@ -126,7 +138,8 @@ class Estimator:
     def flags(self) -> int:
         """EKF_STATUS_FLAGS, which are ESTIMATOR_STATUS_FLAGS."""
         if self.position_ok:
-            return GOOD if self.geographic else GOOD & ~0x210  # no absolute position without an origin
+            good = self._kind.good_flags
+            return good if self.geographic else good & ~0x210  # no absolute position without an origin
         return LOST if self.has_height or self._last_ns is not None else ATTITUDE_ONLY
 
     @property
@@ -180,8 +193,9 @@ class Estimator:
             return
         stamp_us = msg.usec if msg.get_type() == "VISION_POSITION_ESTIMATE" else msg.time_usec
         where = (msg.x, msg.y, msg.z)
-        if all(map(math.isfinite, where)) and max(map(abs, where)) < 1e6:
-            self._fuse(where, self._velocity_of(msg), self._age_s(stamp_us, at_ns), at_ns)
+        age_s = self._age_s(stamp_us, at_ns)
+        if age_s is not None and all(map(math.isfinite, where)) and max(map(abs, where)) < 1e6:
+            self._fuse(where, self._velocity_of(msg), age_s, at_ns)
 
     def _takes_frames(self, msg: Any) -> bool:
         local = (LOCAL_FRD, LOCAL_NED) if self._kind.name == "px4" else (LOCAL_FRD,)
@@ -198,13 +212,20 @@ class Estimator:
         good = all(map(math.isfinite, body)) and max(map(abs, body)) < 1e3
         return rotated(self._craft.attitude, body) if wanted and good else None
 
-    def _age_s(self, stamp_us: int, at_ns: int) -> float:
-        """Age of a sample: what it took more than the quickest one, and the configured delay."""
+    def _age_s(self, stamp_us: int, at_ns: int) -> float | None:
+        """Age of a sample with the configured delay; None if it is of no use.
+
+        To PX4 its stamp is moved by what TIMESYNC found; to ArduPilot it is what it took more than the quickest one.
+        """
+        px4 = self._kind.name == "px4"
+        delay_s = min(max(self._parameters["EKF2_EV_DELAY" if px4 else "VISO_DELAY_MS"], 0.0), 1000.0) * 1e-3
+        if px4:
+            age_s = self._age_ns(1000 * stamp_us, at_ns) * 1e-9 + delay_s
+            return age_s if PX4_AGES_S[0] <= age_s <= PX4_AGES_S[1] else None
         offset_ns = at_ns - 1000 * stamp_us
         if self._offset_ns is None or not self._offset_ns <= offset_ns <= self._offset_ns + SECOND_NS:
             self._offset_ns = offset_ns  # quicker than any before, or another clock
-        delay_ms = self._parameters["EKF2_EV_DELAY" if self._kind.name == "px4" else "VISO_DELAY_MS"]
-        return (offset_ns - self._offset_ns) * 1e-9 + min(max(delay_ms, 0.0), 1000.0) * 1e-3
+        return (offset_ns - self._offset_ns) * 1e-9 + delay_s
 
     def _fuse(self, where: Vec3, speed: Vec3 | None, age_s: float, at_ns: int) -> None:
         self._grow(at_ns)

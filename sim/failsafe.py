@@ -21,6 +21,7 @@ class Failsafes:
         self, kind: Personality, pilot: Pilot, parameters: Parameters, estimator: Estimator, battery: Supply
     ) -> None:
         self._px4 = kind.name == "px4"
+        self._mode = kind.by_role
         self._pilot = pilot
         self._parameters = parameters
         self._estimator = estimator
@@ -53,7 +54,7 @@ class Failsafes:
     def _land(self, at_ns: int, *texts: str) -> None:
         self._pilot.texts.extend((CRITICAL, text) for text in texts)
         if self._pilot.mode.role is not Role.LAND:
-            self._pilot.fail(Role.LAND, at_ns)
+            self._pilot.fail(self._mode(Role.LAND), at_ns)
 
     def _look_at_position(self, at_ns: int) -> None:
         if self._estimator.position_ok:
@@ -101,6 +102,6 @@ class Failsafes:
         if self._px4 and p[action] == 1:
             if self._pilot.mode.role not in (Role.HOLD, Role.LAND):
                 self._pilot.texts.append((CRITICAL, "Failsafe activated: no ground station"))
-                self._pilot.fail(Role.HOLD, at_ns)
+                self._pilot.fail(self._mode(Role.HOLD), at_ns)
         elif self._pilot.mode.role is not Role.LAND:
             self._land(at_ns, "Failsafe activated: no ground station" if self._px4 else "GCS Failsafe")

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
 import msgspec
 
 from sim.autopilot import Autopilot
+from sim.parameters import Parameters
 from sim.personality import PERSONALITIES
 from sim.quadrotor import Quadrotor
 from sim.spans import within
 from sim.vehicle import Vehicle
+from uavctl.config.load import find_nearest
+from uavctl.config.problem import Problem
 from uavctl.config.sim import FaultConfig
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
 
 OF_LINK = ("blackout", "held", "uplink_blackout")
 OF_CAMERA = ("occluded", "swapped", "frozen")
-LASTING = ("wind", "parameter")
+LASTING = ("wind", "battery", "parameter")
+MODE_S = 1.0  # how long a change of mode is told; afterwards the mode itself tells
 
 
 def with_spans(config: Config) -> Config:
@@ -31,8 +38,33 @@ def with_spans(config: Config) -> Config:
     return replace(config, link=link, sim=replace(config.sim, camera=camera))
 
 
+def problems(autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfig], key: str) -> Iterator[Problem]:
+    """What an autopilot of this kind cannot do of a list of faults: parameters, values and modes that it has not.
+
+    Args:
+        autopilot: the kind.
+        faults: the list.
+        key: key path of the list.
+    """
+    parameters, modes = Parameters(autopilot), tuple(mode.name for mode in PERSONALITIES[autopilot].modes)
+    for i, fault in enumerate(faults):
+        if fault.kind == "mode":
+            yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no mode", fault.name, modes)
+        elif fault.kind == "parameter" and fault.name not in parameters:
+            yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no parameter", fault.name, parameters.names)
+        elif fault.kind == "parameter" and not parameters.takes(fault.name, fault.value):
+            few = " or ".join(f"{value:g}" for value in parameters.allowed(fault.name)) or "a number up to 1e9"
+            yield Problem(f"{key}[{i}].value", f"{fault.value:g} is not simulated for {fault.name}", f"give {few}")
+
+
+def _unknown(key: str, what: str, name: str, names: Sequence[str]) -> Iterator[Problem]:
+    if name and name not in names:
+        nearest = find_nearest(name, names)
+        yield Problem(key, f'{what} "{name}"{nearest}', "rename it" if nearest else f"give one of {', '.join(names)}")
+
+
 def active(config: Config, since_ns: int) -> tuple[str, ...]:
-    """What is amiss at a time since the start [ns]: the spans that it lies in, and the lasting changes made by then.
+    """What is amiss at a time since the start [ns]: the spans that it lies in, and the changes made by then.
 
     Args:
         config: as `with_spans` gives it.
@@ -40,18 +72,26 @@ def active(config: Config, since_ns: int) -> tuple[str, ...]:
     """
     sections = ((config.link, OF_LINK), (config.sim.camera, OF_CAMERA))
     spans = [name for section, names in sections for name in names if within(getattr(section, name), since_ns)]
-    lasting = [one for one in config.sim.fault if one.kind in LASTING and one.at_s * 1e9 <= since_ns]
-    return tuple(dict.fromkeys([*spans, *(f"{one.kind} {one.name}".rstrip() for one in lasting)]))
+    made = [one for one in config.sim.fault if one.at_s * 1e9 <= since_ns]
+    changes = [
+        f"{one.kind} {one.name}".rstrip()
+        for one in made
+        if one.kind in LASTING or (one.kind == "mode" and since_ns <= (one.at_s + MODE_S) * 1e9)
+    ]
+    return tuple(dict.fromkeys([*spans, *changes]))
 
 
 class Faults:
     """The faults that are no spans, each done once at its time.
 
     Raises:
-        ConfigError: a parameter or a mode that the autopilot has not.
+        ConfigError: a parameter, a value or a mode that the autopilot has not.
     """
 
     def __init__(self, config: Config, vehicle: Vehicle | Quadrotor, autopilot: Autopilot, start_ns: int) -> None:
+        wrong = tuple(problems(config.sim.autopilot, config.sim.fault, "sim.fault"))
+        if wrong:
+            raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
         self._kind = PERSONALITIES[config.sim.autopilot]
         self._vehicle = vehicle
         self._autopilot = autopilot
@@ -60,18 +100,7 @@ class Faults:
             for i, fault in enumerate(config.sim.fault)
             if fault.kind not in OF_LINK + OF_CAMERA
         ]
-        wrong = [self._unknown(i, fault) for _, i, fault in numbered]
-        if any(wrong):
-            raise ConfigError(tuple(filter(None, wrong)))
         self._ahead = sorted(numbered, key=lambda one: one[:2])
-
-    def _unknown(self, number: int, fault: FaultConfig) -> str:
-        names = {"parameter": self._autopilot.parameters.names, "mode": tuple(one.name for one in self._kind.modes)}
-        known = names.get(fault.kind, (fault.name,))
-        if fault.name in known:
-            return ""
-        few = "" if fault.kind == "parameter" else f"; it has {', '.join(known)}"
-        return f"sim.fault[{number}].name: {self._kind.name} has no {fault.kind} {fault.name!r}{few}"
 
     @property
     def next_ns(self) -> int | None:

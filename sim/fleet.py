@@ -8,8 +8,10 @@ from urllib.parse import urlsplit
 import msgspec
 
 from sim.server import Seat
+from uavctl.config.mission_checks import outside
+from uavctl.config.sim_checks import ids
 from uavctl.config.types import Config
-from uavctl.data import Truth
+from uavctl.data import Truth, Vec3
 from uavctl.errors import ConfigError, ConnectionSpecError
 
 LARGEST_ID = 250
@@ -20,8 +22,9 @@ TCP_PORTS = 10  # from one vehicle to the next, as ArduPilot's simulator counts 
 def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]) -> tuple[Seat, ...]:
     """Seats of `count` vehicles, the first as configured.
 
-    Each of the others has the system id and the seed of the one before plus one, starts 1 m east of it, and its
-    ports lie one (UDP) or ten (TCP) higher; port 0, any free one, stays 0. What is configured to happen happens to all.
+    Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
+    (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
+    rows, each 1 m north of the one before. What is configured to happen happens to all.
 
     Args:
         config: of the first.
@@ -31,7 +34,7 @@ def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callab
         on_truth: hears the truth of all.
 
     Raises:
-        ConfigError: the system ids run out.
+        ConfigError: the system ids run out or meet the daemon's, or the limits have no room for all.
         ConnectionSpecError: two vehicles would have one port.
     """
     last = config.sim.system_id + count - 1
@@ -39,7 +42,12 @@ def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callab
         raise ConfigError(
             (f"sim.system_id: {count} vehicles would go up to {last}; set {LARGEST_ID + 1 - count} or less",)
         )
-    seats = tuple(Seat(_another(config, i), _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
+    places = _places(config, count)
+    configs = [_another(config, i, place) for i, place in enumerate(places)]
+    wrong = [problem for one in configs for problem in ids(one.sim, one.daemon)]
+    if wrong:
+        raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
+    seats = tuple(Seat(configs[i], _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
     taken: dict[str, int] = {}
     for i, seat in enumerate(seats):
         for url in _fixed(seat):
@@ -50,16 +58,28 @@ def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callab
     return seats
 
 
-def _another(config: Config, number: int) -> Config:
-    sim = config.sim
-    north, east, down = sim.start_position_m
-    replace = msgspec.structs.replace
-    other = replace(
-        sim,
-        system_id=sim.system_id + number,
-        seed=sim.seed + number,
-        start_position_m=(north, east + APART_M * number, down),
-    )
+def _places(config: Config, count: int) -> list[Vec3]:
+    """Where they start."""
+
+    def fits(place: Vec3) -> bool:
+        return not any(outside(config.plant, config.sets, place, "", ""))
+
+    north, east, down = config.sim.start_position_m
+    places = [(north, east, down)]
+    while len(places) < count:
+        at_north, at_east, _ = places[-1]
+        places.append((at_north, at_east + APART_M, down))
+        if not fits(places[-1]):
+            places[-1] = (at_north + APART_M, east, down)
+        if not fits(places[-1]):
+            reason = f"the limits of the position (sets) have room for {len(places) - 1} of {count} vehicles from here"
+            raise ConfigError((f"sim.start_position_m: {reason}; start further south and west, or serve fewer",))
+    return places
+
+
+def _another(config: Config, number: int, place: Vec3) -> Config:
+    sim, replace = config.sim, msgspec.structs.replace
+    other = replace(sim, system_id=sim.system_id + number, seed=sim.seed + number, start_position_m=place)
     return replace(config, sim=other)
 
 

@@ -18,7 +18,7 @@ from uavctl.config.peers import FrameConfig
 from uavctl.config.sim import CameraConfig
 from uavctl.data import Vec3
 from uavctl.errors import ConfigError
-from uavctl.frames import Frame
+from uavctl.frames import Frame, multiply
 
 SYSTEM_ID, COMPONENT_ID = 17, 197  # 197: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 # The cameras' clock at the start, so that a stamp is never 0 ("unknown") and never our time.
@@ -77,6 +77,11 @@ class Cameras:
         """Time of the next sample [ns]."""
         return self._start_ns + round((self._camera.phase_s + self._taken / self._camera.rate_hz) * 1e9)
 
+    @property
+    def hidden(self) -> bool:
+        """Whether a random occlusion lasted at the last sample."""
+        return self._hidden
+
     def capture(self, position_m: Vec3, velocity_mps: Vec3, attitude: Quaternion) -> tuple[int, bytes] | None:
         """Take the sample that is due at `next_ns`.
 
@@ -112,7 +117,7 @@ class Cameras:
 
     def _message(self, usec: int, pose: _Pose) -> mavlink.MAVLink_message:
         msg: mavlink.MAVLink_message
-        where, turned = self._frame.from_ned(pose.position_m), times(self._turn, pose.attitude)
+        where, turned = self._frame.from_ned(pose.position_m), multiply(self._turn, pose.attitude)
         match self._camera.message:
             case "vision":
                 angles = self._angles(turned)
@@ -129,7 +134,7 @@ class Cameras:
         return msg
 
     def _angles(self, turned: Quaternion) -> Vec3:
-        return euler(turned if self._convention == "ned" else times(turned, HALF_ROLL))
+        return euler(turned if self._convention == "ned" else multiply(turned, HALF_ROLL))
 
 
 def turn(frame: FrameConfig) -> Quaternion:
@@ -139,18 +144,6 @@ def turn(frame: FrameConfig) -> Quaternion:
         return cos, 0.0, 0.0, -sin
     half = math.sqrt(0.5)  # the same, then half a turn about (1, 1, 0): NED to ENU
     return 0.0, half * (cos - sin), half * (cos + sin), 0.0
-
-
-def times(p: Quaternion, q: Quaternion) -> Quaternion:
-    """The turn q, then p."""
-    a, b, c, d = p
-    w, x, y, z = q
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
 
 
 def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:

@@ -74,9 +74,9 @@ PX4_PARAMETERS = {
     "COM_DISARM_PRFLT": _real(10.0),
     "COM_DL_LOSS_T": _int(10),
     "COM_LOW_BAT_ACT": _int(0, 0, 2),  # warn, land when critical
-    "COM_OBL_RC_ACT": _int(5, 0, 1, 2, 4, 5),  # without a radio 0-2 do nothing; land, hold
+    "COM_OBL_RC_ACT": _int(5, 0, 1, 2, 4, 5),  # 0-2 leave it to the stick, and without one do nothing; land, hold
     "COM_OF_LOSS_T": _real(1.0),
-    "COM_RC_IN_MODE": _told(4, Kind.INT32),
+    "COM_RC_IN_MODE": _told(4, Kind.INT32),  # no stick
     "EKF2_BARO_CTRL": _int(1, 0, 1),
     "EKF2_EV_CTRL": _int(0),
     "EKF2_EV_DELAY": _real(0.0),
@@ -126,20 +126,28 @@ ARDUPILOT_PARAMETERS = {
     "WP_YAW_BEHAVIOR": _byte(2, 0, 1, 2, 3),  # 0 holds the heading, else the nose follows travel
 }
 TABLES: dict[str, Mapping[str, Parameter]] = {"px4": PX4_PARAMETERS, "ardupilot": ARDUPILOT_PARAMETERS}
+WITH_STICK = 0  # COM_RC_IN_MODE
 OWN_ID = {"px4": "MAV_SYS_ID", "ardupilot": "SYSID_THISMAV"}
 
 
 class Parameters:
     """The values of one vehicle, in order of name as they are numbered on the wire.
 
+    Args:
+        autopilot: whose they are.
+        system_id: MAVLink system id of the vehicle.
+        radio: whether there is a stick.
+
     Attributes:
         names: in order; a parameter's index is its place.
     """
 
-    def __init__(self, autopilot: Literal["px4", "ardupilot"], system_id: int = 1) -> None:
+    def __init__(self, autopilot: Literal["px4", "ardupilot"], system_id: int = 1, *, radio: bool = False) -> None:
         name = OWN_ID[autopilot]
         table = TABLES[autopilot]
         self._table = {**table, name: _told(system_id, table[name].kind)}
+        if autopilot == "px4" and radio:
+            self._table["COM_RC_IN_MODE"] = _told(WITH_STICK, Kind.INT32)
         self._bytewise = autopilot == "px4"
         self._values = {name: _stored(one.value, one.kind) for name, one in self._table.items()}
         self.names = tuple(sorted(self._table))
@@ -154,16 +162,23 @@ class Parameters:
         """Type of a parameter."""
         return self._table[name].kind
 
-    def set(self, name: str, value: float) -> bool:
-        """Change a parameter; False if it stays as it is because the value is none, or is not simulated."""
+    def allowed(self, name: str) -> tuple[float, ...]:
+        """The values of a parameter that are simulated; empty is all."""
+        return self._table[name].allowed
+
+    def takes(self, name: str, value: float) -> bool:
+        """Whether a parameter can be changed to a value; not if it is none, or is not simulated."""
         one = self._table[name]
         if not math.isfinite(value) or abs(value) > 1e9:
             return False
-        stored = _stored(value, one.kind)
-        if one.allowed and stored not in {_stored(allowed, one.kind) for allowed in one.allowed}:
-            return False
-        self._values[name] = stored
-        return True
+        return not one.allowed or _stored(value, one.kind) in {_stored(allowed, one.kind) for allowed in one.allowed}
+
+    def set(self, name: str, value: float) -> bool:
+        """Change a parameter; False if it stays as it is, since it does not take the value."""
+        takes = self.takes(name, value)
+        if takes:
+            self._values[name] = _stored(value, self._table[name].kind)
+        return takes
 
     def encoded(self, name: str) -> float:
         """A value as it travels in PARAM_VALUE: PX4 puts the bytes of an integer into the float, ArduPilot casts."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from sim.spans import within
 from sim.vehicle import Vehicle, linear_model
 from sim.wind import Wind
 from uavctl.config.types import Config
-from uavctl.data import Truth
+from uavctl.data import Outgoing, Truth
 
 VEHICLE, MOCAP = "vehicle", "mocap"
 Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
@@ -79,10 +79,15 @@ class Peers:
     @property
     def next_ns(self) -> int:
         """Time of the next event [ns]: something to send, a sample, or the vehicle's own doing."""
-        times = [self._cameras.next_ns, self._truth_ns + 1, self.autopilot.next_ns, self.channel.next_ns]
-        times.append(self._faults.next_ns)
+        times = [self._own_ns, self._truth_ns + 1, self.channel.next_ns]
         if self._wire:
             times.append(self._wire[0][0])
+        return min(at_ns for at_ns in times if at_ns is not None)
+
+    @property
+    def _own_ns(self) -> int:
+        """When cameras, autopilot or a fault do something next [ns]."""
+        times = (self._cameras.next_ns, self.autopilot.next_ns, self._faults.next_ns)
         return min(at_ns for at_ns in times if at_ns is not None)
 
     def advance(self, to_ns: int) -> list[Due]:
@@ -92,6 +97,20 @@ class Peers:
         self._wire.clear()
         due.sort(key=lambda one: one[0])  # stable: the vehicle first
         return due
+
+    def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Iterable[Outgoing]]) -> None:
+        """Move time on and have every datagram heard in order of time; its answers are taken where time then is.
+
+        Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
+        in another way.
+        """
+        while True:
+            at_ns = max(min(to_ns, self._own_ns), self.now_ns)
+            for arrival_ns, link, data in self.advance(at_ns):
+                for answer in hear(link, data, arrival_ns):
+                    self.receive(answer.link, answer.data, at_ns)
+            if at_ns >= to_ns:
+                return
 
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
@@ -110,7 +129,14 @@ class Peers:
             sent=self.channel.counters.sent,
             lost=self.channel.counters.lost,
             mode=self.autopilot.mode_name,
+            faults=self._amiss,
         )
+
+    @property
+    def _amiss(self) -> tuple[str, ...]:
+        """What is amiss now, as kinds of faults; a random occlusion is one too."""
+        found = active(self._config, self.now_ns - self._start_ns)
+        return (*found, "occluded") if self._cameras.hidden and "occluded" not in found else found
 
     def look(self) -> Look:
         """What can be seen of the vehicle now."""
@@ -129,7 +155,7 @@ class Peers:
             setpoint_age_s=None if setpoint_ns is None else (self.now_ns - setpoint_ns) * 1e-9,
             sent=counters.sent,
             lost=counters.lost,
-            faults=active(self._config, self.now_ns - self._start_ns),
+            faults=self._amiss,
             text=self.autopilot.text,
         )
 
@@ -146,8 +172,7 @@ class Peers:
     def _run(self, to_ns: int) -> None:
         while True:
             autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
-            times = [self._cameras.next_ns, to_ns, autopilot_ns, fault_ns]
-            at_ns = max(min(one for one in times if one is not None), self.now_ns)
+            at_ns = max(min(self._own_ns, to_ns), self.now_ns)
             self._move(at_ns)
             busy = False
             if fault_ns is not None and fault_ns <= at_ns:

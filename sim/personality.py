@@ -52,8 +52,13 @@ class Personality:
     armed_text: str
     disarmed_text: str
     preflight_text: str  # when it disarms itself before take-off
+    landed_text: str  # empty: it says nothing
+    good_flags: int  # ESTIMATOR_STATUS_FLAGS of a good estimate, as recorded in flight
+    vtol_state: int  # of EXTENDED_SYS_STATE
     version: int  # flight_sw_version of AUTOPILOT_VERSION
     origin_deg_m: tuple[float, float, float]  # latitude, longitude, altitude of its simulated field
+    radio: bool  # whether its simulator has a stick by itself, as SYS_STATUS of the recorded flights tells
+    greeting: tuple[bytes, ...]  # text on a TCP link, before its first packet and between that and the second
 
     def mode(self, name: str) -> Mode:
         """The mode of this name."""
@@ -95,8 +100,13 @@ PX4 = Personality(
     armed_text="Armed by external command",
     disarmed_text="Disarmed by landing",
     preflight_text="Disarmed by auto preflight disarming",
+    landed_text="Landing detected",
+    good_flags=0x37F,
+    vtol_state=0,
     version=0x01080000,
     origin_deg_m=(47.397742, 8.545594, 488.0),
+    radio=False,
+    greeting=(),
 )
 
 ARDUPILOT = Personality(
@@ -121,8 +131,13 @@ ARDUPILOT = Personality(
     armed_text="Arming motors",
     disarmed_text="Disarming motors",
     preflight_text="Disarming motors",
+    landed_text="",
+    good_flags=0x33F,
+    vtol_state=3,
     version=0x040602FF,
     origin_deg_m=(-35.363262, 149.165237, 584.0),
+    radio=True,
+    greeting=(b"\n\nInit ArduCopter V4.6.2 (simulated)\n\nFree RAM: 131072\n", b"parameters loaded\nready to fly\n"),
 )
 
 PERSONALITIES = {"px4": PX4, "ardupilot": ARDUPILOT}

@@ -18,12 +18,15 @@ from sim.setpoints import STOP, Ask, Setpoint
 from uavctl.data import Vec3
 
 SECOND_NS = 1_000_000_000
-WATCH_NS = 20_000_000  # how often a climb or a descent is looked at
-STREAM_NS = SECOND_NS // 2  # PX4: setpoints must come faster than 2 Hz before OFFBOARD
+WATCH_NS = 20_000_000  # how often height and floor are looked at
+# PX4 takes OFFBOARD while the newest setpoint is younger than COM_OF_LOSS_T; its documentation asks for 2 Hz, so here
+# never longer than that.
+FRESH_NS = SECOND_NS // 2
 DISARM_NS = 2 * SECOND_NS  # from touching the floor to disarming
 NO_DOWN_NS = 5 * SECOND_NS  # length of a take-off or landing of a plant that has no vertical axis
 TAKEOFF_HEIGHT_M = 2.5  # PX4's MIS_TAKEOFF_ALT
 TAKEOFF_DONE_M = 0.1
+LANDS = 4  # COM_OBL_RC_ACT; less leaves it to the stick
 CRASHED = "CRASHED"
 CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
 FORCED = 21196.0  # param2 of arming that skips the checks
@@ -49,6 +52,7 @@ class Pilot:
         crashed: why the autopilot's program died, None while it lives.
         failsafe: whether a failsafe chose the mode.
         helm: knows which setpoint is flown.
+        setpoint_ns: when the last setpoint that counts came [ns], None before the first.
         home_m: where it was armed last, local NED.
     """
 
@@ -61,6 +65,7 @@ class Pilot:
         boot_ns: int,
         *,
         airborne: bool,
+        radio: bool,
     ) -> None:
         self._kind = kind
         self._craft = craft
@@ -68,11 +73,12 @@ class Pilot:
         self._parameters = parameters
         self._estimator = estimator
         self._boot_ns = boot_ns
+        self._radio = radio
         self._watch_ns = craft.now_ns
         self._phase_end_ns: int | None = None  # end of a timed climb or descent, or of the wait for disarming
         self._disarm_text = kind.preflight_text
         self._takeoff_m = TAKEOFF_HEIGHT_M
-        self._setpoints_ns: tuple[int | None, int | None] = (None, None)  # the last but one, the last
+        self.setpoint_ns: int | None = None
         self._returns = False  # whether setpoints that come again end the failsafe
         self.texts: list[tuple[int, str]] = []
         self.crashed: str | None = None
@@ -87,11 +93,6 @@ class Pilot:
             craft.rest()
 
     @property
-    def setpoint_ns(self) -> int | None:
-        """When the last setpoint that counts came [ns]."""
-        return self._setpoints_ns[1]
-
-    @property
     def external(self) -> bool:
         """Whether setpoints are flown."""
         return self.mode.role is Role.EXTERNAL and self.armed and self.phase is Phase.AIR
@@ -103,7 +104,7 @@ class Pilot:
         if last_ns is None or not self.external:
             return None
         if self._kind.name == "px4":
-            if self._parameters["COM_OBL_RC_ACT"] < 4:  # needs a radio: seen to go on as if nothing were
+            if self._parameters["COM_OBL_RC_ACT"] < LANDS and not self._radio:  # seen to go on as if nothing were
                 return None
         elif self.helm.obeyed is None or self.helm.obeyed.ask is Ask.POSITION:  # a position is kept
             return None
@@ -121,7 +122,9 @@ class Pilot:
 
     @property
     def _watches(self) -> bool:
-        return self.phase in (Phase.CLIMB, Phase.DESCENT) and self._craft.has_down
+        """Whether the floor or a height is looked for; the linear plant flies through the floor where it likes."""
+        looks = (Phase.CLIMB, Phase.DESCENT) if self._steered is not None else (Phase.CLIMB, Phase.DESCENT, Phase.AIR)
+        return self.phase in looks and self._craft.has_down
 
     def run(self, at_ns: int) -> None:
         """Do what is due at `at_ns`, the vehicle being there."""
@@ -141,7 +144,7 @@ class Pilot:
             if self.external:
                 self.crash("a setpoint was not a number")
             return
-        self._setpoints_ns = (self._setpoints_ns[1], at_ns)
+        self.setpoint_ns = at_ns
         if self._returns:  # as recorded: setpoints that come again end PX4's failsafe by themselves
             self._enter(self._kind.by_role(Role.EXTERNAL), at_ns)
         if self.external:
@@ -208,21 +211,19 @@ class Pilot:
             self.texts.append((WARNING, f"Mode change failed: {what}"))
             return TEMPORARILY_REJECTED if px4 else FAILED
         if mode.role is Role.EXTERNAL and self._kind.needs_stream and not self._streaming(at_ns):
-            self.texts.append((CRITICAL, "OFFBOARD refused: no setpoints above 2 Hz"))
+            self.texts.append((CRITICAL, "OFFBOARD refused: no fresh setpoint"))
             return TEMPORARILY_REJECTED
         self._enter(mode, at_ns)
         return ACCEPTED
 
-    def fail(self, role: Role, at_ns: int, *, returns: bool = False) -> None:
+    def fail(self, mode: Mode, at_ns: int, *, returns: bool = False) -> None:
         """A failsafe changes the mode; with `returns`, setpoints that come again end it."""
-        self._enter(self._kind.by_role(role), at_ns)
+        self._enter(mode, at_ns)
         self.failsafe, self._returns = True, returns
 
     def _streaming(self, at_ns: int) -> bool:
-        before_ns, last_ns = self._setpoints_ns
-        if before_ns is None or last_ns is None:
-            return False
-        return last_ns - before_ns < STREAM_NS and at_ns - last_ns < STREAM_NS
+        limit_ns = min(FRESH_NS, round(self._parameters[self._kind.timeout] * 1e9))
+        return self.setpoint_ns is not None and at_ns - self.setpoint_ns < limit_ns
 
     # Modes and phases
 
@@ -268,15 +269,19 @@ class Pilot:
     def _touch(self, at_ns: int) -> None:
         if self._steered is not None:  # its plant would fall through the floor
             self._craft.rest()
+        else:  # whatever it was told to fly
+            self._craft.land()
         self.phase = Phase.GROUND
         self.helm.obeyed = None
         self._phase_end_ns, self._disarm_text = at_ns + DISARM_NS, self._kind.disarmed_text
-        self.texts.append((INFO, "Landing detected"))
+        if self._kind.landed_text:
+            self.texts.append((INFO, self._kind.landed_text))
 
     def _on_silence(self, at_ns: int) -> None:
         if self._kind.name == "px4":
-            lands = self._parameters["COM_OBL_RC_ACT"] == 4
-            self.fail(Role.LAND if lands else Role.HOLD, at_ns, returns=True)
+            act = self._parameters["COM_OBL_RC_ACT"]
+            name = "AUTO.LAND" if act == LANDS else "POSCTL" if act < LANDS else "AUTO.LOITER"
+            self.fail(self._kind.mode(name), at_ns, returns=True)
             self.texts.append((CRITICAL, "Failsafe activated"))
         else:
             self._fly_itself(at_ns)

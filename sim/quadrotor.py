@@ -256,9 +256,13 @@ class Quadrotor:
     def _control(self, motion: Motion) -> None:
         """Command the rotors; on the floor they idle until something that leads off it is asked."""
         self.cascade.listen()
-        if self._touched_ns is not None and not self.cascade.climbs:
+        idles = self._touched_ns is not None and not self.cascade.climbs
+        if idles or self.battery.empty:
             self.cascade.stand(motion)
+            self._loop.reset(motion.rates_rps)
             self._rotors.command(0.0, ZERO, self.battery.largest_rps)
+            if self.battery.empty:
+                self._rotors.stop()
             return
         wanted = self.cascade.step(motion, thrust_limited=self._rotors.thrust_limited)
         w, x, y, z = motion.attitude

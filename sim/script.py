@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.channel import Counters
+from sim.channel import UnderWay
 from uavctl.config.types import PlantConfig
 
 Array = NDArray[np.float64]
@@ -31,7 +30,7 @@ class Script:
     delays_ns: tuple[int | None, ...]
 
 
-class ScriptedChannel:
+class ScriptedChannel(UnderWay):
     """One direction of a radio link that loses and delays the packets that it is told to.
 
     Args:
@@ -39,10 +38,9 @@ class ScriptedChannel:
     """
 
     def __init__(self, delays_ns: tuple[int | None, ...]) -> None:
+        super().__init__()
         self._delays_ns = delays_ns
         self._number = 0  # of the next packet
-        self._pending: list[tuple[int, int, bytes]] = []
-        self.counters = Counters()
 
     def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
         """Send a packet at `at_ns`; a `certain` one is not lost, and not late if it was to be lost."""
@@ -53,22 +51,10 @@ class ScriptedChannel:
         if delay_ns is None and not certain:
             self.counters.lost += 1
             return
-        heapq.heappush(self._pending, (at_ns + (delay_ns or 0), number, data))
+        arrival_ns = at_ns + (delay_ns or 0)
+        self._let_through(arrival_ns, arrival_ns, data)
 
     def pass_over(self, at_ns: int) -> None:
         """Nothing is sent where a packet was due: the next one is told what goes for the packet after."""
         del at_ns
         self._number += 1
-
-    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
-        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
-        due = []
-        while self._pending and self._pending[0][0] <= to_ns:
-            arrival_ns, _, data = heapq.heappop(self._pending)
-            due.append((arrival_ns, data))
-        return due
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next arrival [ns], None if nothing is under way."""
-        return self._pending[0][0] if self._pending else None

@@ -15,13 +15,18 @@ from selectors import EVENT_READ, SelectSelector
 
 from sim.look import Look
 from sim.peers import MOCAP, VEHICLE, Peers
+from sim.personality import PERSONALITIES
 from sim.sockets import Port, open_port
 from uavctl.config.types import Config
 from uavctl.data import Truth
 
+Door = Callable[[str, Port], Port]
+"""Puts something around the port of a connection, which is named `vehicle` or `mocap`."""
 # Longest sleep, so that `stop` is asked often enough.
 NAP_S = 0.05
 LOOK_S = 0.25  # real time between two looks
+# What is late is made up in strides of simulated time, so that a speed beyond this computer's cannot pile up work.
+STRIDE_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,11 @@ def serve(
     on_ready: Callable[[Ready], None],
     on_truth: Callable[[Truth], None],
     stop: Callable[[], bool],
+    door: Door | None = None,
 ) -> None:
     """Run the peers of one vehicle in real time; see `serve_all`."""
     seat = Seat(config, vehicle_url, mocap_url, on_truth)
-    serve_all((seat,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop)
+    serve_all((seat,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop, door=door)
 
 
 def serve_all(
@@ -73,10 +79,12 @@ def serve_all(
     stop: Callable[[], bool],
     speed: float = 1.0,
     on_look: Callable[[tuple[Look, ...]], None] | None = None,
+    door: Door | None = None,
 ) -> None:
     """Run the peers of each seat until `stop()` or the end of the duration.
 
-    What was missed is caught up in virtual time.
+    What was missed is caught up in virtual time; at a speed that this computer does not reach, time goes as fast as it
+    can.
 
     Args:
         seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin.
@@ -86,6 +94,7 @@ def serve_all(
         stop: asked at least every 50 ms.
         speed: simulated time per real time.
         on_look: gets a look at all the vehicles four times a second of real time, and one at the end; it must not wait.
+        door: put around every port, None leaves them as they are.
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
@@ -95,9 +104,11 @@ def serve_all(
         for seat in seats:
             ports: dict[str, Port] = {}
             opened.append(ports)
-            ports[VEHICLE] = open_port(seat.vehicle)
+            ports[VEHICLE] = open_port(seat.vehicle, PERSONALITIES[seat.config.sim.autopilot].greeting)
             if seat.mocap != seat.vehicle:
                 ports[MOCAP] = open_port(seat.mocap)
+            if door is not None:
+                ports.update({name: door(name, port) for name, port in ports.items()})
         # One grid for all: a multiple of every step.
         dt_ns = math.lcm(*(round(seat.config.plant.dt_s * 1e9) for seat in seats))
         clock = _Clock(grid_start(time.monotonic_ns(), dt_ns), speed)
@@ -143,26 +154,32 @@ def _run(
     on_look: Callable[[tuple[Look, ...]], None] | None,
 ) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
+    last_ns = None if end_ns is None else end_ns - 1  # what happens at the end itself is not told any more
     look_s = time.monotonic()  # time of the next look
+
+    def goal_ns(peers: Peers) -> int:
+        now_ns = clock.now_ns() if last_ns is None else min(clock.now_ns(), last_ns)
+        return min(now_ns, peers.now_ns + STRIDE_NS)
+
     while not stop():
         if on_look is not None and time.monotonic() >= look_s:
             on_look(tuple(peers.look() for peers, _ in worlds))
             look_s = time.monotonic() + LOOK_S
-        now_ns = clock.now_ns()
-        if end_ns is not None and now_ns >= end_ns:
-            break
         for peers, ports in worlds:
-            if now_ns >= peers.now_ns:  # else the start of the grid is still to come
-                for _, link, data in peers.advance(now_ns):
+            to_ns = goal_ns(peers)
+            if to_ns >= peers.now_ns:  # else the start of the grid is still to come
+                for _, link, data in peers.advance(to_ns):
                     ports[link].write(data)
+        if last_ns is not None and all(peers.now_ns >= last_ns for peers, _ in worlds):
+            break
         until_ns = min(peers.next_ns for peers, _ in worlds)
-        if end_ns is not None:
-            until_ns = min(until_ns, end_ns)
+        if last_ns is not None:
+            until_ns = min(until_ns, last_ns)
         _wait(sockets, min(clock.left_s(until_ns), NAP_S))
         for peers, ports in worlds:
             for link, port in ports.items():
                 for data in port.read():
-                    at_ns = clock.now_ns()
+                    at_ns = goal_ns(peers)
                     if at_ns >= peers.now_ns:
                         peers.receive(link, data, at_ns)
     for peers, _ in worlds:
@@ -188,6 +205,7 @@ def serve_in_child(
     mocap_url: str,
     duration_s: float | None,
     airborne: bool,
+    door: Door | None = None,
 ) -> None:
     """`serve` as the target of a child process: `Ready` and every `Truth` go into the pipe.
 
@@ -205,6 +223,7 @@ def serve_in_child(
             on_ready=pipe.send,
             on_truth=pipe.send,
             stop=lambda: stop.is_set() or (parent is not None and not parent.is_alive()),
+            door=door,
         )
     except BrokenPipeError:
         return  # nobody listens any more

@@ -88,21 +88,44 @@ def _yaw(msg: Any, add_rad: float) -> float | None:
 
 
 def _px4(kind: Personality, msg: Any, attitude: Quaternion) -> Setpoint:
-    """PX4: a field that is ignored or not a number is unset; all three of a kind are needed to fly it."""
-    mask = msg.type_mask
-    if mask & FORCE:
-        return Setpoint(Ask.REFUSED, text="force setpoint not supported")
+    """PX4: a field that is ignored or not a number is unset; all three of a kind are needed to fly it.
+
+    A message in which nothing is set does not count for the stream. Source: PX4's handling of the message in its
+    MAVLink receiver.
+    """
     body = msg.coordinate_frame == BODY_NED
-    if msg.coordinate_frame not in kind.frames or (body and mask & IGNORE_POSITION != IGNORE_POSITION):
+    if msg.coordinate_frame not in kind.frames:
         return Setpoint(Ask.REFUSED, text=f"setpoint refused: frame {msg.coordinate_frame}")
+    position, velocity, accel = (
+        _set(vector, msg.type_mask >> 3 * i & 0x7, whole=body) for i, vector in enumerate(_fields(msg))
+    )
+    if accel and msg.type_mask & FORCE:
+        return Setpoint(Ask.REFUSED, text="force setpoint not supported")
     yaw = _yaw(msg, 0.0)
-    asks = (Ask.POSITION, IGNORE_POSITION), (Ask.VELOCITY, IGNORE_VELOCITY), (Ask.ACCELERATION, IGNORE_ACCEL)
-    for (ask, ignored), vector in zip(asks, _fields(msg), strict=True):
-        if mask & ignored != ignored:  # asked for at least in part
-            if mask & ignored or not _finite(vector):
-                return STOP
-            return Setpoint(ask, rotated(attitude, vector) if body else vector, yaw)
-    return STOP
+    if position and not body:  # there are no positions in body axes
+        return Setpoint(Ask.POSITION, position, yaw) if _finite(position) else STOP
+    if velocity:
+        turned = _turned(velocity, heading_rad(attitude) if body else 0.0)
+        return Setpoint(Ask.VELOCITY, turned, yaw) if _finite(velocity) else STOP
+    if accel:
+        turned = rotated(attitude, accel) if body else accel
+        return Setpoint(Ask.ACCELERATION, turned, yaw) if _finite(accel) else STOP
+    return Setpoint(Ask.REFUSED, text="SET_POSITION_TARGET_LOCAL_NED invalid")
+
+
+def _set(vector: Vec3, ignored: int, *, whole: bool) -> Vec3 | None:
+    """A vector whose ignored axes are no numbers, None if all are; with `whole`, one ignored axis ignores all."""
+    if whole and ignored:
+        return None
+    north, east, down = (math.nan if ignored >> i & 1 else number for i, number in enumerate(vector))
+    return (north, east, down) if any(map(math.isfinite, (north, east, down))) else None
+
+
+def _turned(vector: Vec3, heading: float) -> Vec3:
+    """A vector turned about the vertical."""
+    north, east, down = vector
+    cos, sin = math.cos(heading), math.sin(heading)
+    return (cos * north - sin * east, sin * north + cos * east, down) if heading != 0.0 else vector
 
 
 def _ardupilot(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion) -> Setpoint:
@@ -121,10 +144,7 @@ def _ardupilot(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion)
         return STOP
     if not _finite(vector):
         return Setpoint(Ask.FATAL)
-    north, east, down = vector
-    if heading != 0.0:
-        cos, sin = math.cos(heading), math.sin(heading)
-        north, east = cos * north - sin * east, sin * north + cos * east
+    north, east, down = _turned(vector, heading)
     if ask is Ask.POSITION and msg.coordinate_frame in OFFSET_FRAMES:
         north, east, down = north + place_m[0], east + place_m[1], down + place_m[2]
     return Setpoint(ask, (north, east, down), _yaw(msg, heading))

@@ -16,6 +16,7 @@ LARGEST_BACKLOG = 1 << 16  # a TCP client that leaves more unread is dropped [by
 MOST_CLIENTS = 8  # of a TCP port
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01
+Greeting = tuple[bytes, ...]
 # What a peer that is not there, or not there any more, does to a socket.
 GONE = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
 
@@ -49,18 +50,18 @@ class UdpPort:
     """UDP: `udpout` sends to an address, `udpin` to whoever spoke last."""
 
     def __init__(self, scheme: str, address: tuple[str, int]) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
         self._peer: tuple[str, int] | None = None
         self._scheme = scheme
-        if scheme == "udpout":
-            self._peer = address
+        if scheme == "udpout":  # a host that is not known is told now
+            self._peer = socket.gethostbyname(address[0]), address[1]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
         try:
             self._socket.bind(("", 0) if scheme == "udpout" else address)
         except OSError:
             self._socket.close()
             raise
-        self._address = self._peer or self._socket.getsockname()
+        self._address = address if scheme == "udpout" else self._socket.getsockname()
 
     @property
     def url(self) -> str:
@@ -86,7 +87,7 @@ class UdpPort:
     def write(self, data: bytes) -> None:
         """Send one datagram."""
         if self._peer is not None:
-            with suppress(BlockingIOError, *GONE):
+            with suppress(OSError):  # no way there, or no room: lost, as on a radio
                 self._socket.sendto(data, self._peer)
 
     def close(self) -> None:
@@ -99,6 +100,7 @@ class _Client:
     """One connection to a `TcpPort`."""
 
     socket: socket.socket
+    greeting: list[bytes]  # what of it is still to come
     stream: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
     backlog: bytearray = field(default_factory=bytearray)  # to go
 
@@ -115,6 +117,8 @@ class _Client:
 
     def write(self, data: bytes) -> bool:
         """Send in order what the socket takes now; False when the client is gone or leaves too much unread."""
+        if self.greeting:
+            self.backlog += self.greeting.pop(0)
         self.backlog += data
         try:
             del self.backlog[: self.socket.send(self.backlog)]
@@ -126,9 +130,15 @@ class _Client:
 
 
 class TcpPort:
-    """A listening TCP socket, as ArduPilot's simulator has on port 5760; every client gets everything."""
+    """A listening TCP socket, as ArduPilot's simulator has on port 5760; every client gets everything.
 
-    def __init__(self, address: tuple[str, int]) -> None:
+    Args:
+        address: where it listens.
+        greeting: text for each client, whose parts go before its first, second, ... packet.
+    """
+
+    def __init__(self, address: tuple[str, int], greeting: Greeting = ()) -> None:
+        self._greeting = greeting
         self._listener = socket.create_server(address, backlog=MOST_CLIENTS)
         self._listener.setblocking(False)
         self._clients: list[_Client] = []
@@ -163,7 +173,7 @@ class TcpPort:
             return
         one.setblocking(False)
         one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients.append(_Client(one))
+        self._clients.append(_Client(one, list(self._greeting)))
 
     def write(self, data: bytes) -> None:
         """Send to every client."""
@@ -231,8 +241,8 @@ def cut_frames(stream: bytearray) -> list[bytes]:
     return frames
 
 
-def open_port(url: str) -> Port:
-    """Open a port from its URL, or several from URLs separated by commas.
+def open_port(url: str, greeting: Greeting = ()) -> Port:
+    """Open a port from its URL, or several from URLs separated by commas; a TCP port greets each client.
 
     Raises:
         ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
@@ -240,28 +250,32 @@ def open_port(url: str) -> Port:
     opened: list[Port] = []
     try:
         for one in url.split(","):
-            opened.append(_open(one.strip()))
+            opened.append(_open(one.strip(), greeting))
     except ConnectionSpecError:
         Ports(opened).close()
         raise
     return opened[0] if len(opened) == 1 else Ports(opened)
 
 
-def _open(url: str) -> Port:
+def _open(url: str, greeting: Greeting) -> Port:
     kinds: dict[str, Callable[[tuple[str, int]], Port]] = {
         "udpout": lambda address: UdpPort("udpout", address),
         "udpin": lambda address: UdpPort("udpin", address),
-        "tcpin": TcpPort,
+        "tcpin": lambda address: TcpPort(address, greeting),
     }
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise ConnectionSpecError(f"{url}: {error}; write udpout://127.0.0.1:14540") from error
+    if port == 0 and parts.scheme == "udpout":
+        raise ConnectionSpecError(f"{url}: port 0 is no address to send to; write udpout://127.0.0.1:14540")
     if parts.scheme not in kinds or host is None or port is None:
-        raise ConnectionSpecError(f"{url}: the simulator speaks {', '.join(kinds)}; write udpout://127.0.0.1:14540")
+        raise ConnectionSpecError(f'"{url}": the simulator speaks {", ".join(kinds)}; write udpout://127.0.0.1:14540')
     try:
         return kinds[parts.scheme]((host, port))
+    except socket.gaierror as error:
+        raise ConnectionSpecError(f"{url}: no such host ({error.strerror}); check its name") from error
     except OSError as error:
         raise ConnectionSpecError(
             f"{url}: cannot be opened ({error.strerror or error}); choose another port"

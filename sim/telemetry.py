@@ -11,18 +11,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.arming import preflight
 from sim.craft import Craft, heading_rad
-from sim.estimator import GOOD, Estimator
+from sim.estimator import Estimator
 from sim.geodesy import Origin
 from sim.parameters import Parameters
 from sim.personality import Personality
 from sim.pilot import Phase, Pilot
-from sim.setpoints import IGNORE_ACCEL, IGNORE_POSITION, IGNORE_VELOCITY, Ask
+from sim.target import target
 from uavctl.data import Vec3
 
 SECOND_NS = 1_000_000_000
 SHORTEST_INTERVAL_NS = 1_000_000
 ARMED_FLAG = 128  # MAV_MODE_FLAG
-IGNORE_YAW_RATE = 0x800
 CAPACITY_MAH = 240.0
 HOME_POSITION, AUTOPILOT_VERSION, MESSAGE_INTERVAL = 242, 148, 244  # message ids
 
@@ -30,9 +29,13 @@ Message = Any  # pymavlink's classes have no types
 # MAV_SYS_STATUS_SENSOR
 GYRO, ACCEL, MAG, BARO, GPS, VISION = 1, 2, 4, 8, 32, 128
 CONTROL = 1024 | 2048 | 4096 | 8192 | 16384 | 32768  # rates, attitude, yaw, height, position, motors
-AHRS, BATTERY, PREARM = 1 << 21, 1 << 25, 1 << 28
+RADIO, AHRS, BATTERY, PREARM = 1 << 16, 1 << 21, 1 << 25, 1 << 28
 # MAV_PROTOCOL_CAPABILITY
 FLOAT, COMMAND_INT, BYTEWISE, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 128, 8192, 131072
+
+# Roll, pitch, throttle and yaw of a stick that nobody moves [µs]; telemetry has room for 18 channels.
+STICK_US = (1500, 1500, 1500, 1500)
+NO_CHANNEL, FULL_SIGNAL = 65535, 254
 
 # Usual intervals [ms]; 0: only when asked for. A message that is not here is not sent at all.
 COMMON_MS = {
@@ -48,11 +51,12 @@ COMMON_MS = {
     85: 1000,  # POSITION_TARGET_LOCAL_NED
     147: 2000,  # BATTERY_STATUS
     148: 0,  # AUTOPILOT_VERSION
+    65: 1000,  # RC_CHANNELS
     242: 0,  # HOME_POSITION
     245: 1000,  # EXTENDED_SYS_STATE
 }
 USUAL_MS = {
-    "px4": {**COMMON_MS, 31: 250, 141: 1000, 230: 1000, 242: 2000},
+    "px4": {**COMMON_MS, 31: 250, 111: 100, 141: 1000, 230: 1000, 242: 2000},
     "ardupilot": {**COMMON_MS, 193: 1000},
 }
 
@@ -68,6 +72,7 @@ class Vehicle:
     parameters: Parameters
     origin: Origin
     boot_ns: int
+    radio: bool  # whether there is a stick
 
 
 class Telemetry:
@@ -93,8 +98,10 @@ class Telemetry:
             32: self._local,
             33: self._global,
             49: self._origin,
+            65: self._radio,
             74: self._hud,
             85: self._target,
+            111: self._timesync,
             141: self._altitude,
             147: self._battery,
             148: self._version,
@@ -154,7 +161,7 @@ class Telemetry:
     def _heartbeat(self, _at_ns: int) -> Message:
         pilot = self._v.pilot
         status = mavlink.MAV_STATE_STANDBY
-        if pilot.phase is not Phase.GROUND:
+        if pilot.phase is not Phase.GROUND or (pilot.armed and self._v.kind.name == "px4"):
             status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
         base = pilot.mode.base | (ARMED_FLAG if pilot.armed else 0)
         kind = mavlink.MAV_TYPE_QUADROTOR, self._v.kind.autopilot
@@ -165,6 +172,7 @@ class Telemetry:
         estimator = v.estimator
         present = GYRO | ACCEL | MAG | BARO | CONTROL | AHRS | BATTERY | PREARM
         present |= (GPS if estimator.uses_gps else 0) | (VISION if estimator.uses_external else 0)
+        present |= RADIO if v.radio else 0
         healthy = present & ~(AHRS | VISION | PREARM)
         if estimator.position_ok:
             healthy |= present & (AHRS | VISION)
@@ -233,8 +241,15 @@ class Telemetry:
         if not v.estimator.geographic:
             return None
         place = *v.origin.degrees_e7(home), v.origin.altitude_mm(home)
-        level = [1.0, 0.0, 0.0, 0.0]
+        level = [1.0, 0.0, 0.0, 0.0] if v.kind.name == "px4" else [math.nan] * 4  # as recorded
         return mavlink.MAVLink_home_position_message(*place, *home, level, 0.0, 0.0, 0.0, self._boot_us(at_ns))
+
+    def _radio(self, at_ns: int) -> Message | None:
+        """The stick at rest: nothing while there is none."""
+        if not self._v.radio:
+            return None
+        channels = *STICK_US, *([NO_CHANNEL] * (18 - len(STICK_US)))
+        return mavlink.MAVLink_rc_channels_message(self._boot_ms(at_ns), len(STICK_US), *channels, FULL_SIGNAL)
 
     def _hud(self, _at_ns: int) -> Message:
         v = self._v
@@ -252,16 +267,12 @@ class Telemetry:
         return mavlink.MAVLink_altitude_message(self._boot_us(at_ns), *heights)
 
     def _target(self, at_ns: int) -> Message | None:
-        obeyed = self._v.pilot.helm.obeyed
-        if obeyed is None:
-            return None
-        zero: Vec3 = (0.0, 0.0, 0.0)
-        asks = (Ask.POSITION, IGNORE_POSITION), (Ask.VELOCITY, IGNORE_VELOCITY), (Ask.ACCELERATION, IGNORE_ACCEL)
-        mask = IGNORE_YAW_RATE | sum(ignored for ask, ignored in asks if ask is not obeyed.ask)
-        nine = [number for ask, _ in asks for number in (obeyed.vector if ask is obeyed.ask else zero)]
-        return mavlink.MAVLink_position_target_local_ned_message(
-            self._boot_ms(at_ns), 1, mask, *nine, obeyed.yaw_rad or 0.0, 0.0
-        )
+        v = self._v
+        return target(v.kind, v.pilot, v.estimator, v.craft.attitude, self._boot_ms(at_ns))
+
+    def _timesync(self, at_ns: int) -> Message:
+        """A request of the autopilot's own."""
+        return mavlink.MAVLink_timesync_message(0, at_ns - self._v.boot_ns)
 
     def _battery(self, _at_ns: int) -> Message:
         battery = self._v.craft.battery
@@ -280,8 +291,8 @@ class Telemetry:
         )
 
     def _ekf(self, _at_ns: int) -> Message:
-        flags = self._v.estimator.flags
-        variance = 0.05 if flags & GOOD == GOOD else 1.0
+        estimator = self._v.estimator
+        flags, variance = estimator.flags, 0.05 if estimator.position_ok else 1.0
         return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
 
     def _estimator(self, at_ns: int) -> Message:
@@ -292,7 +303,7 @@ class Telemetry:
         )
 
     def _landed(self, _at_ns: int) -> Message:
-        return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, self._v.pilot.phase.value)
+        return mavlink.MAVLink_extended_sys_state_message(self._v.kind.vtol_state, self._v.pilot.phase.value)
 
 
 def clipped_mm(metres: float) -> int:

@@ -1,8 +1,8 @@
 """Wind: steady, with gusts after Dryden's model of low altitudes.
 
 MIL-F-8785C, section 3.7.3.4 (scales and intensities below 1000 ft, in feet there) with its spectra; MIL-HDBK-1797
-has the same scales and intensities. The turbulence is frozen and carried past the vehicle by the steady wind
-(Taylor's hypothesis), so one speed turns lengths into times.
+writes the same ones with half the scales across and vertically. The turbulence is frozen and carried past the vehicle
+by the steady wind (Taylor's hypothesis), so one speed turns lengths into times.
 """
 
 from __future__ import annotations

@@ -52,6 +52,7 @@ class Case:
 
     design: Design
     spec: DesignSpec
+    solver: ConicSolver
     x: Array
     answer: Answer
 
@@ -272,7 +273,7 @@ def case_of(shape: Shape) -> Case:
         x = design.target + share * way
         answer = solver.solve(0, x, design.target)
         if kept(answer):
-            return Case(design, spec, x, answer)
+            return Case(design, spec, solver, x, answer)
     raise AssertionError(f"{shape.name}: no state from which the target is reached; last {answer}")
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
-from sim.battery import EMPTY_V, Battery
+from sim.battery import Battery
 from sim.rotors import STOPPED, Rotors
 from uavctl.data import Vec3
 
@@ -158,10 +158,22 @@ def test_a_shorted_battery_gives_what_it_can() -> None:
     assert battery.voltage_v == pytest.approx(0.5 * 4.2)
 
 
+def test_an_empty_battery_gives_nothing_until_it_has_charge_again() -> None:
+    battery = Battery(CRAZYFLIE_2, charge=1e-6)
+    while not battery.empty:
+        battery.drain(CRAZYFLIE_2.weight_n, H)
+    used_c = battery.used_c
+    battery.drain(CRAZYFLIE_2.weight_n, 1.0)
+    assert (battery.voltage_v, battery.current_a, battery.remaining, battery.used_c) == (0.0, 0.0, 0.0, used_c)
+    battery.charge(0.5)
+    battery.drain(CRAZYFLIE_2.weight_n, H)
+    assert battery.voltage_v > 3.0
+
+
 def test_charge_is_the_integral_of_the_current_and_hovering_lasts_as_long_as_its_maker_says() -> None:
     battery = Battery(CRAZYFLIE_2)
     flown_s = used_c = 0.0
-    while battery.voltage_v > EMPTY_V:
+    while battery.voltage_v > 3.0:  # where the Crazyflie's firmware counts it as empty
         battery.drain(CRAZYFLIE_2.weight_n, 0.1)
         flown_s += 0.1
         used_c += 0.1 * battery.current_a

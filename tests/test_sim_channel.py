@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sim.channel import Channel
+from uavctl.config.section import Spans
 from uavctl.config.types import LinkConfig
 
 MS = 1_000_000
@@ -147,10 +148,21 @@ def test_a_backlog_is_in_the_order_of_arrival_not_of_sending() -> None:
     assert numbers(arrivals(held, 50)) == numbers(arrivals(free, 50)) != list(range(50))
 
 
-def test_spans_of_backlog_that_touch_are_one() -> None:
-    ch = channel(held=((0.01, 0.02), (0.02, 0.03)))
+@pytest.mark.parametrize("held", [((0.01, 0.02), (0.02, 0.03)), ((0.02, 0.03), (0.01, 0.02))])
+def test_spans_of_backlog_that_touch_are_one(held: Spans) -> None:
+    ch = channel(held=held)
     ch.push(15 * MS, b"a")
     assert ch.next_ns == 30 * MS
+
+
+def test_each_step_has_its_probability_to_arrive_its_end_included() -> None:
+    link = LinkConfig(probability=(1.0, 0.0, 1.0))
+    ch = Channel(link, np.random.SeedSequence(3), 5 * MS, 10 * MS)
+    for i, at_ms in enumerate((0, 1, 10, 11, 20, 90)):  # steps 0, 1, 1, 2, 2, and beyond the last
+        ch.push((5 + at_ms) * MS, packet(i))
+    assert numbers(ch.pop_due(10**18)) == [0, 3, 4, 5]
+    with pytest.raises(ValueError, match="by steps"):
+        Channel(link, np.random.SeedSequence(3), 0)
 
 
 def test_oversized_datagrams_are_the_packet_and_padding() -> None:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import socket
+from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from sim_rig import Bench, decode
 
+from sim.faults import problems
 from sim.peers import MOCAP, VEHICLE, Peers
 from sim.quadrotor import Quadrotor
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
 from uavctl.config.fault_file import with_faults
+from uavctl.data import Truth
 from uavctl.errors import ConfigError
 
 S = 1_000_000_000
@@ -123,7 +127,7 @@ def test_a_file_of_faults_comes_after_those_of_the_configuration(tmp_path: Path)
         '[[fault]]\nat_s = 4.0\nkind = "mode"\nname = "POSCTL"\n',
         encoding="utf-8",
     )
-    given = with_faults(config('at_s=0.5, for_s=0.25, kind="frozen"'), file)
+    given = with_faults(config('at_s=0.5, for_s=0.25, kind="frozen"'), file, problems)
     assert [(one.at_s, one.kind, one.for_s, one.name) for one in given.sim.fault] == [
         (0.5, "frozen", 0.25, ""),
         (1.0, "occluded", 2.5, ""),
@@ -143,13 +147,34 @@ def test_a_file_of_faults_comes_after_those_of_the_configuration(tmp_path: Path)
         ("[[fualt]]\n", 'fualt: unknown key (nearest valid name "fault")'),
         ("fault = 3\n", "faults.toml:1: fault: "),
         ("[[fault]\n", "TOML syntax"),
+        ("", "faults.toml:1: fault: missing key; add it: list of tables, what happens"),
+        (
+            '[[fault]]\nat_s = 1\nkind = "parameter"\nname = "COM_OF_LOS_T"\n',
+            'faults.toml:4: fault[0].name: px4 has no parameter "COM_OF_LOS_T" (nearest valid name "COM_OF_LOSS_T")',
+        ),
+        (
+            '[[fault]]\nat_s = 1\nkind = "parameter"\nname = "COM_OBL_RC_ACT"\nvalue = 77\n',
+            "faults.toml:5: fault[0].value: 77 is not simulated for COM_OBL_RC_ACT; give 0 or 1 or 2 or 4 or 5",
+        ),
+        (
+            '[[fault]]\nat_s = 1\nkind = "mode"\nname = "OFBOARD"\n',
+            'faults.toml:4: fault[0].name: px4 has no mode "OFBOARD" (nearest valid name "OFFBOARD"); rename it',
+        ),
+        (
+            '[[fault]]\nat_s = 1\nkind = "mode"\nname = "POSCTL"\nvalue = 3\n',
+            'faults.toml:5: fault[0].value: has no effect with kind "mode"; remove it',
+        ),
+        (
+            '[[fault]]\nat_s = 1\nkind = "blackout"\nfor_s = 1\ncharge = 0.5\n',
+            'faults.toml:5: fault[0].charge: has no effect with kind "blackout"',
+        ),
     ],
 )
 def test_what_is_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: str, told: str) -> None:
     file = tmp_path / "faults.toml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        with_faults(config(), file)
+        with_faults(config(), file, problems)
     assert told in "\n".join(caught.value.problems)
 
 
@@ -177,16 +202,62 @@ def test_the_command_serves_a_file_of_faults_at_a_multiple_of_real_time(
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
-        with_faults(config(), tmp_path / "nowhere.toml")
+        with_faults(config(), tmp_path / "nowhere.toml", problems)
 
 
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ('at_s=1, kind="mode", name="GUIDED"', "px4 has no mode 'GUIDED'; it has OFFBOARD"),
-        ('at_s=1, kind="parameter", name="GUID_TIMEOUT"', "px4 has no parameter 'GUID_TIMEOUT'"),
+        ('at_s=1, kind="mode", name="GUIDED"', 'px4 has no mode "GUIDED"; give one of OFFBOARD'),
+        ('at_s=1, kind="parameter", name="GUID_TIMEOUT"', 'px4 has no parameter "GUID_TIMEOUT"'),
     ],
 )
 def test_names_that_the_autopilot_has_not_are_refused_at_the_start(fault: str, told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         Peers(config(fault), 0)
+
+
+def test_a_name_in_the_configuration_is_refused_with_its_line_by_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "flight.toml"
+    text = (resources.files("uavctl") / "presets" / "room.toml").read_text(encoding="utf-8")
+    text += '\n[[sim.fault]]\nat_s = 1.0\nkind = "parameter"\nname = "COM_OF_LOS_T"\n'
+    file.write_text(text, encoding="utf-8")
+    where = f"flight.toml:{len(text.splitlines())}: sim.fault[0].name:"
+    for command in (["sim", "--duration", "0.1"], ["loopback", "--out", str(tmp_path / "flight")]):
+        assert run([*command, "--config", str(file)]) == 2
+        told = capsys.readouterr().err
+        assert where in told and '(nearest valid name "COM_OF_LOSS_T")' in told
+
+
+def test_the_recording_tells_what_is_amiss() -> None:
+    told: list[Truth] = []
+    given = config(
+        'at_s=0.9, for_s=0.4, kind="blackout"',
+        'at_s=1.1, kind="wind", velocity_mps=[1.0, 0.0, 0.0]',
+        'at_s=1.5, kind="parameter", name="COM_OF_LOSS_T", value=0.5',
+        'at_s=1.7, kind="battery", charge=0.5',
+        'at_s=1.9, kind="mode", name="POSCTL"',
+        plant="quadrotor",
+    )
+    peers = Peers(given, 0, on_truth=told.append)
+    peers.advance(4 * S)
+    seen = {round(one.at_ns / S, 1): one.faults for one in told}
+    lasting = ("wind", "parameter COM_OF_LOSS_T", "battery")
+    assert (seen[0.8], seen[1.0], seen[1.2], seen[1.4]) == ((), ("blackout",), ("blackout", "wind"), ("wind",))
+    assert seen[1.6] == lasting[:2]
+    assert seen[2.0] == seen[2.8] == (*lasting, "mode POSCTL")
+    assert seen[3.0] == lasting
+
+
+def test_random_occlusions_are_told_while_they_last() -> None:
+    hides = ["sim.camera.occlusions_per_s=0.5", "sim.camera.occlusion_s=1.0"]
+    peers = Peers(load_config("room", [*HEAD, *hides]), 0)
+    told = []
+    for tenth in range(300):
+        peers.advance(tenth * S // 10)
+        told.append((peers.channel.counters.sent, peers.look().faults))
+    seen = [after[0] > before[0] for before, after in pairwise(told)]
+    assert [faults == () for _, faults in told[1:]] == seen
+    assert {faults for _, faults in told} == {(), ("occluded",)}

@@ -6,6 +6,7 @@ import threading
 import time
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import LAND, Bench, Client, bench, decode
@@ -35,11 +36,11 @@ def test_each_has_the_id_seed_place_and_ports_after_the_one_before() -> None:
         "udpout://127.0.0.1:14560",
         "sim.system_id=7",
         "sim.seed=40",
-        "sim.start_position_m=[1.0,2.0,-3.0]",
+        "sim.start_position_m=[1.0,0.5,-2.0]",
     )
     sims = [one.config.sim for one in three]
     assert [(one.system_id, one.seed) for one in sims] == [(7, 40), (8, 41), (9, 42)]
-    assert [one.start_position_m for one in sims] == [(1.0, 2.0, -3.0), (1.0, 3.0, -3.0), (1.0, 4.0, -3.0)]
+    assert [one.start_position_m for one in sims] == [(1.0, 0.5, -2.0), (1.0, 1.5, -2.0), (1.0, 2.5, -2.0)]
     assert three[2].vehicle == "udpout://127.0.0.1:14542,udpout://127.0.0.1:14552"
     assert [one.mocap for one in three] == [f"udpout://127.0.0.1:1456{i}" for i in range(3)]
     assert [one.vehicle for one in seats(3, "tcpin://127.0.0.1:5760")] == [
@@ -47,6 +48,28 @@ def test_each_has_the_id_seed_place_and_ports_after_the_one_before() -> None:
     ]
     assert {one.vehicle for one in seats(10, ANY, ANY)} == {ANY}  # any free port each
     assert len({one.vehicle for one in seats(10, "udpout://127.0.0.1:14540,udpout://127.0.0.1:14550")}) == 10
+
+
+def starts(count: int, *overrides: str) -> list[list[float]]:
+    return [list(one.config.sim.start_position_m) for one in seats(count, ANY, ANY, *overrides)]
+
+
+def test_they_start_in_rows_within_the_limits_of_the_position_or_are_refused() -> None:
+    rows = [[north, -1.9 + i, -0.7] for north in (-2.4, -1.4) for i in range(5)]
+    assert np.array(starts(10)) == pytest.approx(np.array(rows))  # limits of the room: 3 m north, 2.5 m east
+    wide = "sets.state_upper=[inf,1.5,inf,inf,1.5,inf,0.0,1.0,inf]"
+    assert starts(10, wide)[-1] == pytest.approx([-2.4, 7.1, -0.7])
+    with pytest.raises(ConfigError, match=r"sim\.start_position_m: .* have room for 2 of 3 vehicles from here"):
+        starts(3, "sim.start_position_m=[1.9,2.0,-1.0]")
+    assert len(starts(2, "sim.start_position_m=[1.9,2.0,-1.0]")) == 2
+    with pytest.raises(ConfigError, match="room for 1 of 2"):
+        starts(2, "sim.start_position_m=[0.0,0.0,-3.0]")  # the first is above the ceiling already
+
+
+def test_an_id_that_is_the_daemon_s_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"sim\.system_id: 245 is that of the daemon too"):
+        seats(3, ANY, ANY, "sim.system_id=243")
+    assert seats(2, ANY, ANY, "sim.system_id=243")[1].config.sim.system_id == 244
 
 
 def test_ids_that_run_out_and_ports_that_meet_are_refused() -> None:

@@ -51,15 +51,18 @@ def test_preset_room_flies_it_with_gusts_bursts_and_delay_bit_for_bit(autopilot:
     assert summarise(flight(memory), wall_s=1.0).input_violations == 0
 
 
-def test_over_udp_preset_room_flies_it_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = [QUADROTOR, *GUSTS, *ROUGH, "sim.autopilot=ardupilot"]
+@pytest.mark.parametrize(("autopilot", "mode"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
+def test_over_udp_preset_room_flies_it_in_real_time(
+    autopilot: str, mode: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = [QUADROTOR, *GUSTS, *ROUGH, f"sim.autopilot={autopilot}"]
     more = [word for setting in settings for word in ("--set", setting)]
     assert run(["loopback", "--udp", "--duration", "5", "--out", str(tmp_path / "f"), "--json", *more]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["steps"] >= 20
     assert summary["failed_solves"] == summary["input_violations"] == summary["recorder_dropped"] == 0
     truths = list(records(tmp_path / "f" / "flight.mcap", Truth))
-    assert {one.mode for one in truths} == {"GUIDED"}
+    assert {one.mode for one in truths} == {mode}
     assert truths[-1].position_m[0] > truths[0].position_m[0] + 1.0  # on its way to the target
 
 

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from sim_rig import Client, decode
 
-from sim.server import Ready, Seat, grid_start, serve, serve_all, serve_in_child
+from sim.peers import Peers
+from sim.server import STRIDE_NS, Ready, Seat, grid_start, serve, serve_all, serve_in_child
 from sim.sockets import cut_frames, open_port
 from uavctl.config import Config, load_config
 from uavctl.data import Truth
@@ -108,7 +109,7 @@ def test_udp_vehicle_and_cameras_send_to_the_client_and_obey_it() -> None:
         # the cameras' clock counts from the start of the grid
         assert [msg.usec % 20_000 for msg in samples] == [0] * 5
         vehicle.sendto(client.timesync(77), beat.sender)
-        assert listen(vehicle, is_a("TIMESYNC"))[-1].ts1 == 77
+        assert listen(vehicle, lambda msg: msg.get_type() == "TIMESYNC" and msg.tc1)[-1].ts1 == 77
         moving = len(served.truths)
         while not served.truths or served.truths[-1].input != (1.0, 0.0, 0.0):
             vehicle.sendto(client.setpoint(1.0, 0.0, 0.0), beat.sender)
@@ -302,6 +303,23 @@ def test_a_child_process_tells_through_a_pipe_and_stops_when_told() -> None:
         child.close()
 
 
+def test_a_speed_beyond_this_computer_s_piles_up_no_work_and_tells_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    strides: list[int] = []
+    advance = Peers.advance
+
+    def spied(peers: Peers, to_ns: int) -> Any:
+        strides.append(to_ns - peers.now_ns)
+        return advance(peers, to_ns)
+
+    monkeypatch.setattr(Peers, "advance", spied)
+    told: list[Truth] = []
+    seat = Seat(config("sim.plant=quadrotor"), "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", told.append)
+    readies: list[Ready] = []
+    serve_all((seat,), duration_s=10.0, airborne=True, on_ready=readies.append, stop=lambda: False, speed=1000.0)
+    assert max(strides) <= STRIDE_NS
+    assert [one.at_ns - readies[0].start_ns for one in told] == [k * S // 5 for k in range(50)]
+
+
 def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_once() -> None:
     clients = [udp() for _ in range(4)]
     told: tuple[list[Truth], list[Truth]] = ([], [])
@@ -317,7 +335,7 @@ def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_
     assert [(one.vehicle, one.mocap) for one in readies] == [(one.vehicle, one.mocap) for one in seats]
     assert readies[0].start_ns == readies[1].start_ns
     for truths in told:
-        assert [one.at_ns - readies[0].start_ns for one in truths[:30]] == [k * S // 5 for k in range(30)]
+        assert [one.at_ns - readies[0].start_ns for one in truths] == [k * S // 5 for k in range(30)]
     for i, number in ((0, 12), (2, 3)):  # each client hears its own vehicle
         beat = listen(clients[i][0], is_a("HEARTBEAT"))[-1]
         assert beat.autopilot == number

@@ -25,9 +25,11 @@ class Scripted:
     client: Client = field(default_factory=Client)
     got: list[tuple[int | None, int, str, bytes]] = field(default_factory=list)  # (ticks so far, arrival, link, data)
     ticks: list[tuple[int, int]] = field(default_factory=list)
+    answer: Callable[[str, bytes], tuple[Outgoing, ...]] = lambda link, data: ()
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
         self.got.append((len(self.ticks), at_ns, link, data))
+        return self.answer(link, data)
 
     def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
         self.ticks.append((tick, at_ns))
@@ -146,7 +148,7 @@ def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> No
 
     flyer = Asking()
     World(load_config("room", ["link.loss=0"]), flyer).run(1.0)
-    answers = [(n, at_ns, msg) for n, at_ns, msg in flyer.messages(VEHICLE) if msg.get_type() == "TIMESYNC"]
+    answers = [(n, at_ns, msg) for n, at_ns, msg in flyer.messages(VEHICLE) if msg.get_type() == "TIMESYNC" and msg.tc1]
     assert [(n, at_ns, msg.ts1, msg.tc1) for n, at_ns, msg in answers] == [
         (n + 1, n * 50 * MS, n * 50 * MS + 1, n * 50 * MS + 20 * S) for n in range(19)
     ]

@@ -78,7 +78,6 @@ def fly(url: str) -> dict[str, Any]:
     wait("the end of the climb", lambda: telemetry.flight_mode().name in ("HOLD", "OFFBOARD"))
 
     offboard.set_position_ned(PositionNedYaw(1.0, 0.5, -2.0, 0.0))
-    time.sleep(0.3)  # OFFBOARD wants a stream of setpoints before, not only the first
     try:
         offboard.start()
     except OffboardError as error:

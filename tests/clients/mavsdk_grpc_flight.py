@@ -65,7 +65,6 @@ async def fly(url: str, port: int) -> dict[str, Any]:
     await first("landed state", tell.landed_state(), lambda state: state == LandedState.IN_AIR)
 
     await drone.offboard.set_position_ned(PositionNedYaw(1.0, 0.5, -2.0, 0.0))
-    await asyncio.sleep(0.3)
     await drone.offboard.start()
     await first("offboard", tell.flight_mode(), lambda mode: mode == FlightMode.OFFBOARD)
     at = await first("the position", tell.position_velocity_ned(), lambda one: distance(one, (1.0, 0.5, -2.0)) < 0.25)

@@ -120,5 +120,5 @@ def test_mavproxy_lists_parameters_changes_mode_arms_and_takes_off(tmp_path: Pat
 
         console.say("mode LAND")
         console.wait("Mode LAND")
-        console.wait("AP: Landing detected")
+        console.wait("AP: Disarming motors")
         console.wait("DISARMED")
