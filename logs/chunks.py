@@ -26,9 +26,11 @@ from uavctl.errors import RecordingError
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
 _CHUNK_FIELDS = _CHUNK.size - _RECORD.size
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
+_IS_MESSAGE, _IS_INDEX = int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)  # plain numbers: compared for every record
 
 
 class Message(NamedTuple):
@@ -58,9 +60,10 @@ class Damage:
 
 @dataclass(frozen=True)
 class End:
-    """The file is read; `finished` if it has its index and footer."""
+    """The file is read."""
 
-    finished: bool
+    finished: bool  # it has its index and footer
+    complete: bool  # the end of the data was there: no chunk is missing after the last one
 
 
 class _BadRecordError(Exception):
@@ -83,10 +86,26 @@ def scan(path: Path) -> Iterator[Message | Damage | End]:
     try:
         with path.open("rb") as file:
             if path.stat().st_size == 0:  # ended between creating and first writing
-                yield End(finished=False)
+                yield End(finished=False, complete=False)
                 return
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 yield from _scan(path, data)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a file ends with an index and footer that are whole; its chunks are not looked at.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                return False
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                return _data_end(data) is not None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
 
@@ -98,11 +117,11 @@ def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
     if data[:at] != MAGIC:
         if MAGIC.startswith(data[:at]):
             yield Damage(path, 0, size, "torn in the first bytes", torn=True)
-            yield End(finished=False)
+            yield End(finished=False, complete=False)
             return
         first = _next_chunk(data, 0)
         if first is None:
-            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk)")
+            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){_hint(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
     contents = _Contents()
@@ -116,18 +135,25 @@ def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
                 stored = _DATA_END.unpack_from(data, at)[2]
                 if not damaged and stored != _crc(data, at):
                     yield Damage(path, at, 0, "every chunk is whole, but something between them is damaged")
-                yield End(finished=_summary_ok(data, at + length))
+                finished = _summary_ok(data, at + length)
+                if not finished:
+                    yield Damage(path, at + length, 0, "no record is lost, but the index is damaged", _is_torn(data))
+                yield End(finished=finished, complete=True)
                 return
             at += length
         except _BadRecordError as error:
             later = _next_chunk(data, at + 1)
             if later is None:
                 later = _data_end(data)
+            if later == at:
+                yield Damage(path, at, 0, "no record is lost, but the end of the data is damaged")
+                yield End(finished=False, complete=True)
+                return
             torn = later is None and isinstance(error, _TornRecordError)
             later = size if later is None else later
             yield Damage(path, at, later - at, f"chunk or index {error}", torn=torn)
             at, damaged = later, True
-    yield End(finished=False)
+    yield End(finished=False, complete=False)
 
 
 class _Contents:
@@ -141,13 +167,16 @@ class _Contents:
         """Messages of one chunk, whose checksum is right."""
         channels: dict[int, Definition] = {}
         at = 0
-        while at < len(content):
+        size = len(content)
+        while at < size:
+            if content[at] == _IS_MESSAGE:
+                _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
+                begin, at = at + _MESSAGE.size, at + _RECORD.size + length
+                yield Message(channels[channel], sequence, at_ns, content[begin:at], offset)
+                continue
             opcode, length = _RECORD.unpack_from(content, at)
             at += _RECORD.size
-            if opcode == Opcode.MESSAGE:
-                channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-                yield Message(channels[channel], sequence, at_ns, content[at + _MESSAGE.size : at + length], offset)
-            elif opcode == Opcode.CHANNEL:
+            if opcode == Opcode.CHANNEL:
                 channel, channels[channel] = self._channel(content[at : at + length])
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
@@ -160,6 +189,10 @@ class _Contents:
             schema = self._schemas.get(channel.schema_id)
             self._known[record] = (channel.id, _definition(channel, schema))
         return self._known[record]
+
+
+def _hint(path: Path) -> str:
+    return "; `uavctl log replay` and `uavctl identify` read a .tlog" if path.suffix == ".tlog" else ""
 
 
 def _definition(channel: Channel, schema: Schema | None) -> Definition:
@@ -179,10 +212,10 @@ def _whole(data: Buffer, at: int) -> int:
     if at + _RECORD.size + length > len(data):
         raise _TornRecordError("is torn")
     inner = at + _RECORD.size
-    if opcode == Opcode.CHUNK:
+    if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
+        good = length >= 6 and _INDEX.unpack_from(data, at)[3] == length - 6
+    elif opcode == Opcode.CHUNK:
         good = length >= _CHUNK_FIELDS
-    elif opcode == Opcode.MESSAGE_INDEX:
-        good = length >= 6 and struct.unpack_from("<I", data, inner + 2)[0] == length - 6
     elif opcode == Opcode.DATA_END:
         good = length == _DATA_END.size - _RECORD.size
     elif opcode == Opcode.HEADER:
@@ -254,3 +287,9 @@ def _summary_ok(data: Buffer, start: int) -> bool:
     opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
     covered = data[start : at + _FOOTER.size - 4]
     return bool(opcode == Opcode.FOOTER and length == 20 and summary_start == start and crc == zlib.crc32(covered))
+
+
+def _is_torn(data: Buffer) -> bool:
+    """Whether a file without a good summary just ends too early: neither footer nor magic is where it should be."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    return data[at + _FOOTER.size :] != MAGIC and _RECORD.unpack_from(data, at) != (Opcode.FOOTER, 20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -96,6 +97,17 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return Box.of(self.c_x, self.b_x, len(self.target))
 
     @cached_property
+    def position_rows(self) -> tuple[tuple[int, int, float], ...]:
+        """Rows that limit a position: state, row, size of the row's coefficient."""
+        box = self.state_box
+        return tuple(
+            (state, row, abs(self.c_x[row][state]))
+            for state in self.position_index
+            for row in (int(box.row_lower[state]), int(box.row_upper[state]))
+            if row >= 0
+        )
+
+    @cached_property
     def input_box(self) -> Box:
         """Axis-parallel limits of the inputs."""
         return Box.of(self.c_u, self.b_u, len(self.q_u))
@@ -135,6 +147,18 @@ def design_view(header: Header) -> DesignView:
         RecordingError: a key is missing or does not fit the others.
     """
     try:
-        return msgspec.convert(header.design, DesignView)
+        view = msgspec.convert(header.design, DesignView)
     except msgspec.ValidationError as error:
         raise RecordingError(f"the header's design cannot be used: {error}") from error
+    free = _free_input(header)
+    sides = tuple(b + free * sum(map(abs, row)) for row, b in zip(view.c_u, view.b_u, strict=True))
+    return msgspec.structs.replace(view, b_u=sides)
+
+
+def _free_input(header: Header) -> float:
+    """What plans leave of each input to be flown against a bias: flown inputs may use it [input units]."""
+    try:
+        estimator = tomllib.loads(header.config_toml).get("estimator", {})
+    except tomllib.TOMLDecodeError:
+        return 0.0  # the page shows the damaged text, and limits that are cautious
+    return float(estimator.get("bias_max", 0.0))

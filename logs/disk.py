@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -58,7 +59,9 @@ class DiskFile:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._fd)
+        # The number may soon be another file's: whatever is asked of this one from now on fails.
+        fd, self._fd = self._fd, -1
+        os.close(fd)
 
 
 def segment_path(path: Path, segment: int) -> Path:
@@ -71,6 +74,46 @@ def later_segments(path: Path) -> tuple[Path, ...]:
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
     found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
     return tuple(found[number] for number in sorted(found))
+
+
+def free_bytes(folder: Path) -> int | None:
+    """Free space where a folder is [bytes]; None if it cannot be told."""
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return None
+
+
+class RoomWatch:
+    """Tells when the disk under a recording gets low, when recording should rest, and when it may go on.
+
+    Attributes:
+        low: less than `low_bytes` are free.
+        resting: there was less than `stop_bytes`, and has not been `low_bytes` since.
+        text: what is known, in words.
+
+    Args:
+        folder: of the recording.
+        free: gives its free space [bytes]; None, which changes nothing, if that cannot be told.
+        low_bytes: see above.
+        stop_bytes: see above.
+    """
+
+    def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:
+        self._folder, self._free, self._low_bytes, self._stop_bytes = folder, free, low_bytes, stop_bytes
+        self.low = self.resting = False
+        self.text = ""
+
+    def look(self) -> None:
+        """Ask for the free space."""
+        free = self._free(self._folder)
+        if free is None:
+            return
+        self.low = free < self._low_bytes
+        self.resting = free < self._stop_bytes or (self.resting and self.low)
+        self.text = f"{free} bytes free in {self._folder}" + (
+            f"; recording rests until there are {self._low_bytes}" if self.resting else ""
+        )
 
 
 def check_room(path: Path, free_bytes: int) -> int:

@@ -9,6 +9,7 @@ it has any value at all (`Header.design`) they stay strings.
 from __future__ import annotations
 
 import math
+import re
 import types
 import typing
 from functools import cache
@@ -17,9 +18,10 @@ import msgspec
 import numpy as np
 
 from logs.topics import raw_link, record_type
-from uavctl.data import Datagram, Record
+from uavctl.data import Datagram, Record, raw_topic
 from uavctl.errors import RecordingError
 
+_MAX_TIME_NS = 2**64 - 1
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -35,6 +37,10 @@ def _plain(value: object) -> object:
 
 
 _ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+# MessagePack keeps the eight bytes of each float behind 0xcb: where the exponent has all bits set, it is not finite.
+# Other values may have such bytes too, which costs time only.
+_BINARY = msgspec.msgpack.Encoder(enc_hook=_plain)
+_NON_FINITE_BYTES = re.compile(rb"\xcb[\x7f\xff][\xf0-\xff]", re.DOTALL)
 
 
 def encode(record: Record) -> bytes:
@@ -48,11 +54,36 @@ def encode(record: Record) -> bytes:
     try:
         data = _ENCODER.encode(record)
         # msgspec writes every non-finite float as null: without one, all is said.
-        if b"null" not in data or not _has_non_finite(record):
+        if b"null" not in data or not _may_be_non_finite(record):
             return data
         return _ENCODER.encode(_spell(msgspec.to_builtins(record, enc_hook=_plain)))
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
+
+
+def alike(one: Record, other: Record) -> bool:
+    """Whether two records of a type are surely the same in every bit; cheaper than to look where they differ."""
+    binary = _exact(one)
+    return binary is not None and binary == _exact(other)
+
+
+def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
+    """Bytes of a record that a reader will get back from under this topic and log time [ns].
+
+    Raises:
+        RecordingError: it would not, and why.
+    """
+    try:
+        expected = record_type(topic)
+    except KeyError:
+        raise RecordingError(f"there is no topic {topic}") from None
+    if type(record) is not expected:
+        raise RecordingError(f"topic {topic} takes {expected.__name__}, not {type(record).__name__}")
+    if isinstance(record, Datagram) and topic != raw_topic(record.link, outgoing=record.outgoing):
+        raise RecordingError(f"topic {topic} is not that of connection {record.link}")
+    if not 0 <= at_ns <= _MAX_TIME_NS:
+        raise RecordingError(f"topic {topic}: time {at_ns} ns does not fit a recording")
+    return encode(record)
 
 
 def decode(topic: str, data: bytes, at_ns: int) -> Record:
@@ -85,16 +116,17 @@ def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
     return msgspec.json.Decoder(kind)
 
 
-def _has_non_finite(value: object) -> bool:
-    if isinstance(value, float | np.floating):
-        return not math.isfinite(value)
-    if isinstance(value, msgspec.Struct):
-        return any(_has_non_finite(getattr(value, name)) for name in value.__struct_fields__)
-    if isinstance(value, dict):
-        return any(map(_has_non_finite, value.values()))
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind == "f" and not bool(np.isfinite(value).all())
-    return isinstance(value, tuple | list) and any(map(_has_non_finite, value))
+def _exact(record: Record) -> bytes | None:
+    """A record's bytes with those of its floats; None if an integer is too large for that."""
+    try:
+        return _BINARY.encode(record)
+    except OverflowError:
+        return None
+
+
+def _may_be_non_finite(record: Record) -> bool:
+    binary = _exact(record)
+    return binary is None or _NON_FINITE_BYTES.search(binary) is not None
 
 
 def _spell(value: object) -> object:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Self, TypeVar
 
 import numpy as np
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 
 from logs.design_view import DesignView, Floats, design_view
 from uavctl.data import (
+    Checked,
     ControlMode,
     Decision,
     Estimate,
     Event,
     Header,
+    LinkEstimate,
     LinkStats,
     Plan,
     PositionSample,
@@ -54,10 +57,16 @@ class FlightData:
     timings: tuple[Timing, ...]
     links: tuple[LinkStats, ...]
     truths: tuple[Truth, ...]
+    link_estimates: tuple[LinkEstimate, ...] = ()
+    checks: tuple[Checked, ...] = ()  # before arming
 
     @classmethod
-    def from_records(cls, records: Iterable[tuple[str, int, Record]]) -> Self:
+    def from_records(cls, records: Iterable[tuple[str, int, Record]], path: Path | None = None) -> Self:
         """Sort (topic, log_time_ns, record) by record type; types that nobody reads here are left out.
+
+        Args:
+            records: In the order of recording.
+            path: The file that they are from, which errors name.
 
         Raises:
             RecordingError: no header, no decision, or a design without the keys of `DesignView`.
@@ -70,10 +79,13 @@ class FlightData:
             return tuple(record for record in found[kind] if isinstance(record, kind))
 
         headers, decisions = take(Header), take(Decision)
+        where = "" if path is None else f"{path}: "
         if not headers:
-            raise RecordingError("the recording has no header; it is empty, or not one of uavctl")
+            raise RecordingError(f"{where}the recording has no header; it is empty, or not one of uavctl")
         if not decisions:
-            raise RecordingError("the recording has no decision: nothing was flown, so there is nothing to report")
+            raise RecordingError(
+                f"{where}the recording has no decision: nothing was flown, so there is nothing to report"
+            )
         return cls(
             header=headers[0],
             design=design_view(headers[0]),
@@ -87,6 +99,8 @@ class FlightData:
             timings=take(Timing),
             links=take(LinkStats),
             truths=take(Truth),
+            link_estimates=take(LinkEstimate),
+            checks=take(Checked),
         )
 
     @property

@@ -36,16 +36,17 @@ font-size:.875rem;color:var(--muted)}
 .legend li{display:flex;align-items:center;gap:.45rem}
 .legend svg{width:26px;height:14px;flex:none}
 table{border-collapse:collapse;width:100%%;font-size:.95rem;font-variant-numeric:tabular-nums}
-.many td:first-child{min-width:6.5rem}
+.many td:first-child:not(.number){min-width:5rem}
 th,td{text-align:left;padding:.4rem .9rem .4rem 0;vertical-align:top;border-top:1px solid var(--line)}
 tr:first-child>*{border-top:0}
 th{font-weight:600}
 tbody th{white-space:nowrap;width:13rem}
 td{overflow-wrap:anywhere}
-.many td:last-child{min-width:11rem}
+.many td:last-child:not(.number){min-width:11rem}
 .number{text-align:right;white-space:nowrap;width:1%%}
 .error{color:var(--limit);font-weight:600}
 details{padding:.6rem 1rem;margin:.75rem 0}
+details .card{border:0;padding:0;margin-top:.4rem}
 summary{cursor:pointer;font-weight:600}
 pre{overflow-x:auto;font:.8125rem/1.5 ui-monospace,Menlo,Consolas,monospace}
 .narrow{display:none}
@@ -56,9 +57,17 @@ figure:last-child:nth-child(odd):not(.wide){width:100%%}
 .broad{display:none}.narrow{display:block}
 .facts th,.facts td{display:block;width:auto;padding-right:0}
 .facts td{border-top:0;padding-top:0}
+.many thead{display:none}
+.many tr{display:block;padding:.4rem 0;border-top:1px solid var(--line)}
+.many tr:first-child{border-top:0}
+.many td,.many .number{display:flex;justify-content:space-between;gap:1rem;width:auto;padding:.1rem 0;border:0;
+text-align:right;white-space:normal}
+.many td::before{content:attr(data-name);color:var(--muted);text-align:left;white-space:nowrap}
 }
 @media print{body{font-size:10.5pt}main{max-width:none;padding:0}
-h2,.note,.legend{break-after:avoid}.note{break-inside:avoid}figure,.card,details{border-color:#ccc}}
+h2,.note,.legend{break-after:avoid}.note,.legend,tr{break-inside:avoid}.grid{break-before:avoid}
+details::details-content{content-visibility:visible;block-size:auto}
+figure,.card,details{border-color:#ccc}}
 """
 
 
@@ -131,7 +140,11 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozen
 
     def cells(tag: str, row: Sequence[str]) -> str:
         kinds = [' class="number"' if place in numbers else "" for place in range(len(row))]
-        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
+        # Phones show a row as lines of their own, each with its column's name.
+        names = [f' data-name="{escape(name, quote=True)}"' if tag == "td" else "" for name in columns]
+        return "".join(
+            f"<{tag}{kind}{name}>{escape(text)}</{tag}>" for kind, name, text in zip(kinds, names, row, strict=True)
+        )
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     head = f"<thead><tr>{cells('th', columns)}</tr></thead>"
@@ -141,6 +154,16 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozen
 def paragraph(text: str) -> str:
     """A paragraph of plain text."""
     return f"<p>{escape(text)}</p>"
+
+
+def note(text: str) -> str:
+    """A remark below a table or a figure."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def table_folded(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int]) -> str:
+    """A long table behind a line that opens it."""
+    return f"<details><summary>{escape(title)}</summary>{table(columns, rows, numbers)}</details>"
 
 
 def folded(title: str, text: str) -> str:

@@ -14,7 +14,7 @@ from logs.summary import position_error_m, state_outside
 from logs.svg import Drawing, canvas, colour, dots
 from uavctl.data import Plan
 
-POINTS = 1200
+POINTS = 800
 LIMIT_POINTS = 200
 PLANS_SHOWN = 6
 ARRIVED_SHARE = 0.1
@@ -163,7 +163,7 @@ def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
 
 def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
     """A handful of plans over what was then flown, axis by axis."""
-    chosen = _choose_plans(flight)
+    chosen = choose_plans(flight)
     if not chosen:
         return
     end_s = max(_plan_times(flight, plan)[-1] for plan in chosen)
@@ -232,7 +232,7 @@ def _plan_times(flight: FlightData, plan: Plan) -> Floats:
     return np.asarray(flight.seconds([plan.base_ns])[0] + flight.design.dt_s * np.arange(len(plan.states)))
 
 
-def _choose_plans(flight: FlightData) -> list[Plan]:
+def choose_plans(flight: FlightData) -> list[Plan]:
     """Within the way to the target: of each sixth, the plan that was played out the longest."""
     steps, plans = flight.steps, flight.flown_plans
     error_m = position_error_m(flight)

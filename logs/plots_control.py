@@ -15,10 +15,13 @@ from logs.design_view import Floats
 from logs.flight_data import FALLBACK, FlightData
 from logs.plots import DASHED, draw_path, shade_fallback, span, thin
 from logs.summary import decision_times_us, duration, input_outside
-from logs.svg import WIDTH_IN, Drawing, canvas, colour, dots, ramp, standalone, strokes
+from logs.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, ramp, standalone, strokes
 
 WIDE_IN = 8.6
 MARKS = 1500
+_DURATIONS_IN = 0.86  # for ticks like "100 ms"
+# Keeps a text readable on what it lies on.
+_BEHIND = {"facecolor": PALETTE["card"][0], "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
 # Inputs as people see them: down is drawn upwards, like the height.
 INPUT = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("up", -1.0)}
 PICTURE_LABEL = "A flight from above within its limits, and the age of its position information"
@@ -120,14 +123,15 @@ def timing(flight: FlightData) -> Iterator[Drawing]:
 
 def _times(flight: FlightData, key: str, title: str, t_s: Floats, values_us: Floats) -> Drawing:
     with canvas(key, 2.3) as one:
-        ax = one.axes(title, "time [s]", f"{title.lower()} (log scale)")
+        ax = one.axes(title, "time [s]", "duration (log scale)", _DURATIONS_IN)
         ax.set_yscale("log")
-        shown_s, shown_us = _largest(t_s, np.maximum(values_us, 1.0))
+        shown_s, shown_us = largest(t_s, np.maximum(values_us, 1.0))
         dots(ax, shown_s, shown_us, "estimate", 2.0)
         p50, p99 = np.percentile(values_us, [50, 99])
         for value, name, side in ((p50, "median", "top"), (p99, "99 %", "bottom")):
             ax.axhline(max(value, 1.0), color=colour("muted"), lw=0.9, ls=DASHED)
-            ax.annotate(name, (1.0, max(value, 1.0)), (3, 0), ("axes fraction", "data"), "offset points", va=side)
+            at, off = (1.0, max(value, 1.0)), (-2, -1 if side == "top" else 1)
+            ax.annotate(name, at, off, ("axes fraction", "data"), "offset points", va=side, ha="right", bbox=_BEHIND)
         low, high = float(shown_us.min()), float(shown_us.max())
         ax.set_ylim(low / 2, high * 2)
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
@@ -137,7 +141,7 @@ def _times(flight: FlightData, key: str, title: str, t_s: Floats, values_us: Flo
     return Drawing(key, one.svg, f"{title} over time; median {duration(p50)}, 99 percent below {duration(p99)}")
 
 
-def _largest(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+def largest(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     """The MARKS largest values evenly thinned below: outliers are never hidden."""
     if len(values) <= MARKS:
         return t_s, values

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from logs.chunks import Damage, End, Message, scan
+from logs.chunks import Damage, End, Message, is_finished, scan
 from logs.disk import later_segments
 from logs.encoding import decode
-from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, record_type
+from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, is_view, record_type
 from uavctl.data import Header, Record
 from uavctl.errors import RecordingError
 
@@ -23,8 +23,13 @@ def segment_files(path: Path) -> tuple[Path, ...]:
     """Files of a recording in order: the named one, and those that go on after a failed write.
 
     Raises:
-        RecordingError: there is none.
+        RecordingError: there is none, or the path is that of a folder.
     """
+    if path.is_dir():
+        held = set(path.glob("*.mcap"))
+        inside = sorted(held.difference(*map(later_segments, held)))[:3]
+        hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
+        raise RecordingError(f"{path}: is a folder{hint}")
     files = tuple(one for one in later_segments(path) if _continues(one))
     if path.exists():
         files = (path, *files)
@@ -50,14 +55,23 @@ def walk(path: Path) -> Iterator[Message | Damage | End]:
 
 
 def read(path: Path) -> Iterator[tuple[str, int, Record]]:
-    """Topic, log time [ns] and record of each message, in file order.
+    """Topic, log time [ns] and record of each message, in file order; what was made for viewers is left out.
 
     Raises:
         RecordingError: no recording, or damaged; names file and offset. What came before is good.
     """
-    for message in _good(path):
+    for message in good_messages(path):
         topic = message.definition.topic
         yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
+
+
+def finished(path: Path) -> bool:
+    """Whether every file of a recording was closed in order.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    return all(map(is_finished, segment_files(path)))
 
 
 def records(path: Path, kind: type[R]) -> Iterator[R]:
@@ -66,7 +80,7 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
     Raises:
         RecordingError: as `read`.
     """
-    for message in _good(path):
+    for message in good_messages(path):
         topic = message.definition.topic
         if _is(topic, kind):
             record = decode(topic, message.data, message.at_ns)
@@ -85,11 +99,14 @@ def header(path: Path) -> Header:
     raise RecordingError(f"{path}: no header: it was ended before its first chunk was written, or that chunk was lost")
 
 
-def _good(path: Path) -> Iterator[Message]:
+def good_messages(path: Path) -> Iterator[Message]:
+    """The messages themselves, also of topics that this version does not know; no repetitions, nothing for viewers.
+
+    Raises:
+        RecordingError: as `read`.
+    """
     expected: int | None = None
     for item in walk(path):
-        if isinstance(item, Damage) and not item.torn:
-            raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
         if isinstance(item, Message):
             if expected is not None and item.sequence != expected:
                 raise RecordingError(
@@ -97,8 +114,10 @@ def _good(path: Path) -> Iterator[Message]:
                     f"`uavctl log recover {path} OUT` restores the rest"
                 )
             expected = item.sequence + 1
-            if not item.repeated:
+            if not item.repeated and not is_view(item.definition.topic):
                 yield item
+        elif isinstance(item, Damage) and not item.torn:
+            raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
 
 
 def _is(topic: str, kind: type[Record]) -> bool:

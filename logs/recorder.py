@@ -9,15 +9,19 @@ from pathlib import Path
 
 import msgspec
 
-from logs.disk import DiskFile, OutputFile
+from logs.disk import DiskFile, OutputFile, free_bytes
 from logs.journal import Journal, RecorderStatus
+from logs.onlookers import Onlookers
+from uavctl.config.log import LogConfig
 from uavctl.data import Record
 
 POLL_S = 0.02
-# A thread that writes 64 records holds the interpreter for about a millisecond: a tick can be late
-# by no more. Every POLL_S that makes 3200 records a second, five times what a flight has; a
-# backlog, left by a slow disk, goes faster.
-BATCH = 64
+# A thread that writes 32 records, and what viewers want beside them, needs the interpreter for one or two
+# milliseconds: a tick can be late by no more. Every POLL_S that makes 1600 records a second, several times
+# what a flight has. A backlog goes faster: half of a small one, which a busy computer has left and which would be lost
+# if the process were killed; a share of a large one, left by a slow disk.
+BATCH = 32
+SMALL_BACKLOG = 256
 BACKLOG_SHARE = 8
 
 
@@ -27,14 +31,15 @@ class _Base:
     def __init__(
         self,
         path: Path,
-        chunk_bytes: int = 16384,
-        queue: int = 8192,
+        log: LogConfig | None = None,
         *,
         open_file: Callable[[Path], OutputFile] = DiskFile,
+        free: Callable[[Path], int | None] = free_bytes,
         clock: Callable[[], float] = time.monotonic,
+        onlookers: Onlookers | None = None,
     ) -> None:
-        self._journal = Journal(path, chunk_bytes, queue, open_file, clock)
-        self._queue = queue
+        self._log = log or LogConfig()
+        self._journal = Journal(path, self._log, open_file, free, clock, onlookers or Onlookers())
         self._begin()
 
     def _begin(self) -> None:
@@ -48,7 +53,7 @@ class SyncRecorder(_Base):
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Record one value under a topic; whatever goes wrong is in `status()`."""
         self._journal.append(topic, at_ns, record)
-        self._journal.drain(self._queue)
+        self._journal.drain(self._log.queue)
 
     def close(self) -> RecorderStatus:
         """Write the rest, the index and the footer; later records are dropped."""
@@ -87,5 +92,10 @@ class Recorder(_Base):
 
     def _run(self) -> None:
         while not self._stop.wait(POLL_S):
-            self._journal.drain(max(BATCH, self._journal.queued // BACKLOG_SHARE))
+            self._journal.drain(portion(self._journal.queued))
         self._journal.finish()
+
+
+def portion(queued: int) -> int:
+    """Records that the thread writes at once, of those that wait."""
+    return max(BATCH, min(queued, SMALL_BACKLOG) // 2, queued // BACKLOG_SHARE)

@@ -63,7 +63,7 @@ class _Tally:
 
     def file_ended(self, item: End) -> None:
         self.finished &= item.finished
-        self.open_ended = not item.finished  # of the last file: a later one's numbers tell what an earlier one lost
+        self.open_ended = not item.complete  # of the last file: a later one's numbers tell what an earlier one lost
 
     def end(self) -> None:
         self.open_ended |= self._doubtful_bytes > 0

@@ -2,20 +2,39 @@
 
 The raw bytes go through parser, clock offset and frames again; the ticks through the same
 `step()`. Each record that comes out (step inputs, estimates, plans, decisions, setpoints, bytes
-to send) must be the recorded one, bit for bit.
+to send) must be the recorded one, bit for bit. Where one is not, the replay goes on, so that it can be
+told what becomes of the difference: what is recorded stays the input.
 """
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import msgspec
 
+from logs.difference import (
+    DECISION,
+    Context,
+    Course,
+    Difference,
+    Leaf,
+    Places,
+    brief,
+    change,
+    close,
+    context,
+    leaves,
+    plain,
+    stage,
+)
+from logs.encoding import alike
 from logs.reader import records
-from uavctl.data import Datagram, PolicyLibrary, Record, Sink, StepInput
+from logs.topics import RecorderNote
+from uavctl.data import Datagram, PolicyLibrary, Record, Refused, Sink, StepInput
 from uavctl.errors import RecordingError
 from uavctl.loop import ControlLoop
 
@@ -23,33 +42,33 @@ COMPARED = frozenset(
     {
         "/uavctl/step_input",
         "/uavctl/estimate",
+        "/uavctl/link_estimate",
         "/uavctl/plan",
         "/uavctl/decision",
         "/uavctl/setpoint",
         "/uavctl/vehicle",
         "/uavctl/event",
+        "/uavctl/link",
     }
 )
 Key = tuple[str, int]
-
-
-class Difference(msgspec.Struct, frozen=True, kw_only=True):
-    """The first place where recording and replay part."""
-
-    topic: str
-    at_ns: int
-    field: str
-    recorded: str
-    replayed: str
+Labels = frozenset[tuple[str, str]]
+# What a plan says of who made it, which a changed controller need not repeat to decide alike.
+MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a replay found."""
+    """What a replay found; the four before the last are there if there is a difference."""
 
     decisions: int
     compared: int
     identical: bool
     first_difference: Difference | None
+    first_decision: Difference | None = None  # the first decision that differs; None if all are alike
+    context: Context | None = None  # of the first difference; None before the first tick
+    decisions_differing: int = 0
+    course: tuple[Course, ...] = ()  # field by field, in the order in which they began to differ
+    dropped: int = 0  # records that the recorder had to drop: what came after the first of them cannot be compared
 
 
 def recorded_library(path: Path) -> PolicyLibrary:
@@ -84,11 +103,137 @@ class _Produced:
             del self.waiting[topic, at_ns]
         return found
 
-    def unsaid(self) -> Difference | None:
-        """What the loop has said and the recording has not."""
-        for topic, at_ns in self.waiting:
-            return Difference(topic=topic, at_ns=at_ns, field="", recorded="nothing", replayed="a record")
-        return None
+    def unsaid(self) -> list[tuple[str, int, Record]]:
+        """What the loop has said and the recording has not; it is forgotten."""
+        found = [(topic, at_ns, one) for (topic, at_ns), queue in self.waiting.items() for one in queue]
+        self.waiting.clear()
+        return found
+
+
+@dataclass
+class _Field:
+    """How one field's difference goes on."""
+
+    first_s: float
+    before: int  # records of its topic before it differed
+    differing: int = 0
+    largest: float | None = None
+    largest_s: float | None = None
+    path: str = ""  # of the entry that differs most
+
+    def add(self, parts: Iterable[Leaf], at_s: float) -> None:
+        self.differing += 1
+        for path, recorded, replayed in parts:
+            size = change(recorded, replayed)
+            if size is not None and (self.largest is None or abs(size) > self.largest):
+                self.largest, self.largest_s, self.path = abs(size), at_s, path
+
+
+@dataclass
+class _Findings:
+    """What has been compared, and where it parts."""
+
+    places: Places
+    tolerance: float
+    ignored: Labels
+    compared: int = 0
+    decisions: int = 0
+    decisions_differing: int = 0
+    first: Difference | None = None
+    first_decision: Difference | None = None
+    context: Context | None = None
+    dropped: int = 0
+    _before: tuple[int, int] = (0, 0)  # decisions and records before the first difference
+    _tick: StepInput | None = None
+    _begun_ns: int | None = None
+    _fields: dict[tuple[str, str], _Field] = field(default_factory=dict)
+    _records: dict[str, int] = field(default_factory=lambda: defaultdict(int))  # by topic, since the first difference
+
+    def begin(self, inp: StepInput) -> None:
+        """A tick begins."""
+        self._tick = inp
+        self._begun_ns = inp.at_ns if self._begun_ns is None else self._begun_ns
+
+    def compare(self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None) -> None:
+        """Take one record of the recording and what the loop says in its place; either may be missing."""
+        parts: list[Leaf] = []
+        if recorded is not None and replayed is not None and not alike(recorded, replayed):
+            parts = [
+                one
+                for one in leaves(recorded, replayed)
+                if (topic, plain(one[0])) not in self.ignored and not close(one[1], one[2], self.tolerance)
+            ]
+        differs = bool(parts) or recorded is None or replayed is None
+        if differs:
+            self._differs(topic, at_ns, recorded, replayed, parts)
+        if recorded is not None:
+            self.compared += 1
+            self.decisions += topic == DECISION
+        if self.first is None:
+            return
+        self._records[topic] += 1
+        self.decisions_differing += differs and topic == DECISION
+        of_tick = topic == DECISION and self._tick is not None and at_ns == self._tick.at_ns
+        if of_tick and self.context is None and self._tick is not None:
+            self.context = context(self._tick, *self._before, recorded, replayed)
+
+    def _differs(
+        self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None, parts: list[Leaf]
+    ) -> None:
+        at_s = 0.0 if self._begun_ns is None else (at_ns - self._begun_ns) * 1e-9
+        path, left, right = parts[0] if parts else ("", None, None)
+        meaning, unit = self.places.meaning(topic, path)
+        found = Difference(
+            topic=topic,
+            at_ns=at_ns,
+            flight_s=at_s,
+            tick=None if self._tick is None else self._tick.tick,
+            field=path,
+            meaning=meaning,
+            unit=unit,
+            recorded=repr(left) if parts else brief(recorded),
+            replayed=repr(right) if parts else brief(replayed),
+            change=change(left, right),
+            fields=len(parts),
+            stage=stage(topic),
+        )
+        if self.first is None:
+            self.first, self._before = found, (self.decisions, self.compared)
+        if topic == DECISION:
+            self.first_decision = self.first_decision or found
+        fields: dict[str, list[Leaf]] = defaultdict(list)
+        for one in parts or [("", None, None)]:
+            fields[plain(one[0])].append(one)
+        for name, those in fields.items():
+            known = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
+            known.add(those, at_s)
+
+    def result(self) -> ReplayResult:
+        """All of it."""
+        return ReplayResult(
+            decisions=self.decisions,
+            compared=self.compared,
+            identical=self.first is None and self.decisions > 0,
+            first_difference=self.first,
+            first_decision=self.first_decision,
+            context=self.context,
+            decisions_differing=self.decisions_differing,
+            course=tuple(
+                Course(
+                    topic=topic,
+                    field=name,
+                    entry=self.places.meaning(topic, one.path)[0],
+                    unit=self.places.meaning(topic, one.path or name)[1],
+                    differing=one.differing,
+                    records=self._records[topic] - one.before,
+                    first_s=one.first_s,
+                    largest=one.largest,
+                    largest_s=one.largest_s,
+                )
+                for (topic, name), one in self._fields.items()
+            ),
+            dropped=self.dropped,
+        )
 
 
 def replay(
@@ -97,6 +242,7 @@ def replay(
     tolerance: float = 0.0,
     *,
     finished: bool = True,
+    ignored: Labels = frozenset(),
 ) -> ReplayResult:
     """Drive a loop with the recorded inputs and compare all that it says, and that it says no more.
 
@@ -106,62 +252,37 @@ def replay(
         tolerance: largest difference of two numbers that counts as none, relative to the larger
             of 1 and their size; 0 compares bit for bit. For a recording of another CPU type.
         finished: the recording was closed in order; a torn one's last tick may lack records.
+        ignored: (topic, field) that may differ; of a vector all entries.
     """
     produced = _Produced()
     loop = make_loop(produced)
-    decisions = compared = 0
-    first: Difference | None = None
+    found = _Findings(Places(loop.plant), tolerance, ignored)
     for topic, at_ns, record in messages:
         if isinstance(record, StepInput):
             # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
-            first = first or produced.unsaid()
+            _unsaid(found, produced)
+            found.begin(record)
+            for command in record.commands:
+                loop.order(command)
             deque(loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop), maxlen=0)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
+        elif isinstance(record, Refused):
+            loop.refused(record.link, record.counts, record.at_ns)
+        elif isinstance(record, RecorderNote):
+            found.dropped = record.dropped
         if _is_compared(topic):
-            compared += 1
-            decisions += topic == "/uavctl/decision"
-            first = first or _difference(topic, at_ns, record, produced.take(topic, at_ns), tolerance)
+            found.compare(topic, at_ns, record, produced.take(topic, at_ns))
     if finished:
-        first = first or produced.unsaid()
-    identical = first is None and decisions > 0
-    return ReplayResult(decisions=decisions, compared=compared, identical=identical, first_difference=first)
+        _unsaid(found, produced)
+    return found.result()
 
 
+def _unsaid(found: _Findings, produced: _Produced) -> None:
+    for topic, at_ns, record in produced.unsaid():
+        found.compare(topic, at_ns, None, record)
+
+
+@cache
 def _is_compared(topic: str) -> bool:
     return topic in COMPARED or (topic.startswith("/raw/") and topic.endswith("/out"))
-
-
-def _difference(
-    topic: str, at_ns: int, recorded: Record, replayed: Record | None, tolerance: float
-) -> Difference | None:
-    if replayed is None:
-        return Difference(topic=topic, at_ns=at_ns, field="", recorded="a record", replayed="nothing")
-    for field, left, right in _unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed), ""):
-        if not _close(left, right, tolerance):
-            return Difference(topic=topic, at_ns=at_ns, field=field, recorded=repr(left), replayed=repr(right))
-    return None
-
-
-def _unequal(left: object, right: object, path: str) -> Iterator[tuple[str, object, object]]:
-    """Leaves where two trees of plain values differ in any bit."""
-    if isinstance(left, dict) and isinstance(right, dict):
-        for key in dict.fromkeys([*left, *right]):
-            yield from _unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
-    elif isinstance(left, list | tuple) and isinstance(right, list | tuple) and len(left) == len(right):
-        for index, (one, other) in enumerate(zip(left, right, strict=True)):
-            yield from _unequal(one, other, f"{path}[{index}]")
-    elif not _same_bits(left, right):
-        yield path, left, right
-
-
-def _same_bits(left: object, right: object) -> bool:
-    if isinstance(left, float) and isinstance(right, float):
-        return left.hex() == right.hex()
-    return type(left) is type(right) and left == right
-
-
-def _close(left: object, right: object, tolerance: float) -> bool:
-    if not isinstance(left, int | float) or not isinstance(right, int | float) or tolerance == 0.0:
-        return False
-    return math.isclose(left, right, rel_tol=tolerance, abs_tol=tolerance)

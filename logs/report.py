@@ -6,11 +6,17 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-from logs import page, plots, plots_control
+from logs import page, plots, plots_control, plots_link, plots_solver
 from logs.flight_data import FALLBACK, FlightData
 from logs.page import Mark, Section
+from logs.path3d import path_3d
 from logs.plots_control import picture
+from logs.report_origin import origin_sections
+from logs.report_verdicts import verdict_rows, verdict_sections
 from logs.summary import FlightSummary, rows
+from logs.timeline import timeline
+from logs.verdict_link import LinkVerdict
+from logs.verdicts import Judged, judge
 from logs.words import story
 from uavctl.data import Event
 from uavctl.errors import RecordingError
@@ -26,48 +32,60 @@ _LATENESS = "lateness is from a tick's deadline to its start"
 _NO_TIMING = "No times were measured in this flight."
 
 
-def write_report(flight: FlightData, summary: FlightSummary, path: Path) -> None:
-    """Write the page.
+def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged: Judged | None = None) -> None:
+    """Write the page; `judged` are the flight's verdicts, if they are there already.
 
     Raises:
         RecordingError: the file cannot be written.
     """
-    text = report_html(flight, summary)
+    text = report_html(flight, summary, judged)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
 
 
-def report_html(flight: FlightData, summary: FlightSummary) -> str:
+def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | None = None) -> str:
     """The page as text."""
+    judged = judge(flight) if judged is None else judged
     header = flight.header
     name = _config_name(header.config_toml)
     title = f"Flight “{name}”" if name else "Flight"
     subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
-    return page.page(title, subtitle, story(flight, summary), _sections(flight, summary))
+    return page.page(title, subtitle, story(flight, summary), _sections(flight, summary, judged))
 
 
-def _sections(flight: FlightData, summary: FlightSummary) -> Iterator[Section]:
-    yield Section("Summary", "", page.facts(rows(summary)))
+def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Iterator[Section]:
+    yield Section("Summary", "", page.facts([*rows(summary), *verdict_rows(judged.verdicts)]))
+    yield _timeline_section(flight)
     yield _path_section(flight)
-    yield _age_section(flight)
     yield _axes_section(flight)
+    yield _age_section(flight)
+    yield _link_section(flight, judged.verdicts.link)
     yield _inputs_section(flight)
     yield _plans_section(flight)
+    yield _certificates_section(flight)
     yield _timing_section(flight)
     yield _events_section(flight)
-    yield _origin_section(flight)
+    yield from verdict_sections(flight, judged)
+    yield from origin_sections(flight)
+
+
+def _timeline_section(flight: FlightData) -> Section:
+    wide, narrow, marks = timeline(flight)
+    return Section("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
 
 
 def _path_section(flight: FlightData) -> Section:
+    deep = path_3d(flight)
     return Section(
         "Path",
         "",
-        page.grid(list(plots.path(flight))),
+        ("" if deep is None else page.wide_or_narrow(*deep)) + page.grid(list(plots.path(flight))),
         (
             *_truth_mark(flight),
             _ESTIMATE,
+            *((Mark("planned", "plan", "plan, with its back-offs as ellipsoids"),) if deep is not None else ()),
             Mark("dot", "sample", "position used"),
             Mark("ring", "truth", "start"),
             _TARGET if flight.moving_target else Mark("star", "target", "target"),
@@ -105,6 +123,40 @@ def _age_section(flight: FlightData) -> Section:
             *lost,
             *_fallback_mark(flight),
         ),
+    )
+
+
+def _link_section(flight: FlightData, verdict: LinkVerdict) -> Section:
+    drawings = list(plots_link.link(flight, verdict))
+    note = "The dashed line is what the design counts on, by the link of the configuration."
+    if verdict.delay is not None and verdict.delay.from_quickest:
+        note += " Delays are short of the quickest one, as the sender's clock is only known by it."
+    return Section(
+        "The link, estimated against promised",
+        note,
+        page.paragraph(verdict.text) + (page.grid(drawings) if drawings else ""),
+        (
+            Mark("line", "estimate", "measured"),
+            Mark("dashed", "limit", "promised"),
+            Mark("band", "limit", "configured"),
+        ),
+    )
+
+
+def _certificates_section(flight: FlightData) -> Section:
+    drawings = list(plots_solver.certificates(flight))
+    marks = [Mark("dot", role, name) for name, role in plots_solver.methods(flight)]
+    gave = any(drawing.key == "plan-slack" for drawing in drawings)
+    told = (
+        "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
+        if gave
+        else "No plan that was flown gave way anywhere."
+    )
+    return Section(
+        "Certificates and slack",
+        f"Each plan comes with a bound of the least cost there is: the gap between them is certified. {told}",
+        page.grid(drawings) if drawings else page.paragraph(_NO_PLAN),
+        tuple(marks) if drawings else (),
     )
 
 
@@ -150,13 +202,6 @@ def _events_section(flight: FlightData) -> Section:
     columns = ("first at [s]", "severity", "event", "times", "as first told")
     body = page.table(columns, found, frozenset({0, 3})) if found else page.paragraph("There were none.")
     return Section("Events", "", body)
-
-
-def _origin_section(flight: FlightData) -> Section:
-    header = flight.header
-    made = [("Design", header.design_id), ("Processor", header.cpu), *sorted(header.versions.items())]
-    body = page.folded("Configuration", header.config_toml) + page.facts(made)
-    return Section("Made with", "", body)
 
 
 def _truth_mark(flight: FlightData) -> tuple[Mark, ...]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
+from functools import cache
 from importlib.metadata import version
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from logs.topics import Definition
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
+_OPCODE = int(Opcode.MESSAGE)
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
 
@@ -42,6 +44,13 @@ class Entry(NamedTuple):
     data: bytes
 
 
+class _Channel(NamedTuple):
+    """A topic's channel."""
+
+    number: int
+    record: bytes
+
+
 class Segment:
     """Writer of one MCAP file.
 
@@ -53,9 +62,12 @@ class Segment:
     def __init__(self, file: OutputFile, chunk_bytes: int) -> None:
         self._file = file
         self._chunk_bytes = chunk_bytes
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, _Channel] = {}
         self._schemas: dict[str, Schema] = {}
-        self._chunk_indexes: list[ChunkIndex] = []
+        # Of a long recording there are many chunks: what the footer says of them is kept as its bytes.
+        self._chunk_indexes = bytearray()
+        self._chunks = 0
+        self._times_ns: tuple[int, int] | None = None  # first and last
         self._counts: Counter[int] = Counter()
         self._crc = 0
         self._begin_chunk()
@@ -69,15 +81,19 @@ class Segment:
         Raises:
             OSError: the chunk could not be written; its messages and this one are in `open_entries`.
         """
-        head = self._channel_records(entry.definition)
+        channel = self._channels.get(entry.definition.topic)
+        if channel is None:
+            channel, head = self._new_channel(entry.definition)
+        else:
+            head = b"" if channel.number in self._indexes else channel.record
         size = len(head) + _MESSAGE.size + len(entry.data)
         full = bool(self.open_entries) and self._size + size > self._chunk_bytes
         self.open_entries.append(entry)
         if full:
             self._commit(self.open_entries[:-1])
             self.open_entries = [entry]
-            head = head or self._channel_records(entry.definition)
-        self._put(entry, head)
+            head = head or channel.record
+        self._put(entry, channel.number, head)
 
     def commit(self) -> None:
         """Write the open chunk, if there is anything in it.
@@ -95,9 +111,14 @@ class Segment:
         self._file.sync()
 
     def finish(self) -> None:
-        """Write the open chunk, the index and the footer, and close the file."""
+        """Write the open chunk, the index and the footer, wait for the disk, and close the file.
+
+        Raises:
+            OSError: not all of it could be done; `abandon` does what is left.
+        """
         self.commit()
         self._file.write(self._tail())
+        self._file.sync()
         self._file.close()
 
     def abandon(self) -> None:
@@ -121,14 +142,11 @@ class Segment:
         self._size = 0
         self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
 
-    def _channel_records(self, definition: Definition) -> bytes:
-        """What the open chunk must hold before a message of this topic."""
-        channel = self._channels.get(definition.topic)
-        if channel is not None and channel.id in self._indexes:
-            return b""
+    def _new_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
+        """Channel of a new topic, and what must be before its first message."""
         schema = self._schemas.get(definition.schema_name)
-        new_schema = schema is None and definition.schema_encoding != ""
-        if new_schema:
+        head = b""
+        if schema is None and definition.schema_encoding != "":
             schema = Schema(
                 id=len(self._schemas) + 1,
                 name=definition.schema_name,
@@ -136,29 +154,32 @@ class Segment:
                 data=definition.schema,
             )
             self._schemas[definition.schema_name] = schema
-        if channel is None:
-            channel = Channel(
-                id=len(self._channels) + 1,
-                topic=definition.topic,
-                message_encoding=definition.encoding,
-                schema_id=0 if schema is None else schema.id,
-                metadata={},
-            )
-            self._channels[definition.topic] = channel
-        return _bytes(schema, channel) if schema is not None and new_schema else _bytes(channel)
+            head = _bytes(schema)
+        record = Channel(
+            id=len(self._channels) + 1,
+            topic=definition.topic,
+            message_encoding=definition.encoding,
+            schema_id=0 if schema is None else schema.id,
+            metadata={},
+        )
+        channel = self._channels[definition.topic] = _Channel(record.id, _bytes(record))
+        return channel, head + channel.record
 
-    def _put(self, entry: Entry, head: bytes) -> None:
-        channel_id = self._channels[entry.definition.topic].id
-        index = self._indexes.setdefault(channel_id, [])
-        index += (entry.at_ns, self._size + len(head))
-        length = _MESSAGE_FIELDS + len(entry.data)
-        fields = _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, entry.sequence, entry.at_ns, entry.at_ns)
-        self._parts += (head, fields, entry.data)
-        self._size += len(head) + len(fields) + len(entry.data)
+    def _put(self, entry: Entry, channel: int, head: bytes) -> None:
+        data, at_ns, place = entry.data, entry.at_ns, self._size + len(head)
+        index = self._indexes.get(channel)
+        if index is None:
+            self._indexes[channel] = [at_ns, place]
+        else:
+            index += (at_ns, place)
+        fields = _MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel, entry.sequence, at_ns, at_ns)
+        self._parts += (head, fields, data)
+        self._size = place + _MESSAGE.size + len(data)
 
     def _commit(self, entries: list[Entry]) -> None:
         content = b"".join(self._parts)
-        first, last = min(one.at_ns for one in entries), max(one.at_ns for one in entries)
+        times_ns = [one.at_ns for one in entries]
+        first, last = min(times_ns), max(times_ns)
         chunk = _bytes(
             Chunk(
                 compression="",
@@ -184,7 +205,7 @@ class Segment:
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
         self.bytes += len(block)
-        self._chunk_indexes.append(
+        self._chunk_indexes += _bytes(
             ChunkIndex(
                 chunk_start_offset=start,
                 chunk_length=len(chunk),
@@ -197,6 +218,9 @@ class Segment:
                 message_index_length=at - start - len(chunk),
             )
         )
+        self._chunks += 1
+        before = self._times_ns or (first, last)
+        self._times_ns = min(before[0], first), max(before[1], last)
         self.messages += len(entries)
         self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
         self._begin_chunk()
@@ -206,15 +230,14 @@ class Segment:
         prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
         data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
         start = self.bytes + len(data_end)
-        groups: tuple[tuple[Opcode, list[McapRecord]], ...] = (
-            (Opcode.SCHEMA, [*self._schemas.values()]),
-            (Opcode.CHANNEL, [*self._channels.values()]),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, [*self._chunk_indexes]),
+        groups = (
+            (Opcode.SCHEMA, _bytes(*self._schemas.values())),
+            (Opcode.CHANNEL, b"".join(channel.record for channel in self._channels.values())),
+            (Opcode.STATISTICS, _bytes(self._statistics())),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
         )
         summary, offsets = b"", b""
-        for opcode, records in groups:
-            data = _bytes(*records)
+        for opcode, data in groups:
             if data:
                 offsets += _bytes(Group(group_opcode=opcode, group_start=start + len(summary), group_length=len(data)))
             summary += data
@@ -224,14 +247,15 @@ class Segment:
         return data_end + summary + offsets + footer + MAGIC
 
     def _statistics(self) -> Statistics:
+        first, last = self._times_ns or (0, 0)
         return Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self._chunks,
             message_count=self.messages,
-            message_start_time=min((one.message_start_time for one in self._chunk_indexes), default=0),
-            message_end_time=max((one.message_end_time for one in self._chunk_indexes), default=0),
+            message_start_time=first,
+            message_end_time=last,
             metadata_count=0,
             schema_count=len(self._schemas),
         )
@@ -245,5 +269,6 @@ def _bytes(*records: McapRecord) -> bytes:
     return data
 
 
+@cache
 def _library() -> str:
     return f"uavctl mcap-records-{version('mcap')}"

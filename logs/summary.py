@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from enum import StrEnum
 from itertools import pairwise
 
@@ -180,12 +181,12 @@ def spread(values_us: Floats) -> Spread:
     return Spread(p50=float(p50), p99=float(p99), max=float(values_us.max()))
 
 
-def render(summary: FlightSummary) -> Table:
-    """The summary as a table for a terminal."""
+def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
+    """The summary as a table for a terminal, followed by other (name, value)."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    for name, value in rows(summary):
+    for name, value in (*rows(summary), *more):
         table.add_row(name, Text(value))  # paths and names may look like markup
     return table
 
@@ -248,7 +249,9 @@ def _times(times: Spread) -> str:
 
 def duration(value_us: float) -> str:
     """A duration [µs] with a unit that suits it."""
-    return f"{value_us:.3g} µs" if value_us < 1000 else f"{value_us / 1000:.3g} ms"
+    if value_us < 999.5:
+        return f"{value_us:.3g} µs"
+    return f"{value_us / 1e3:.3g} ms" if value_us < 999.5e3 else f"{value_us / 1e6:.3g} s"
 
 
 def number(value: float, decimals: int = 3) -> str:

@@ -11,7 +11,7 @@ from uavctl.errors import RecordingError
 
 GROUND_SYSTEMS = frozenset({245, 255})  # our own system id, and that of ground stations
 _STAMP = struct.Struct(">Q")
-_STX_V1, _STX_V2 = 0xFE, 0xFD
+_STX_V1, _STX_V2 = MARKERS = 0xFE, 0xFD  # first byte of a frame
 _SIGNED = 0x01
 _LONGEST_SILENCE_US = 3600 * 1_000_000  # a stamp further on than this after the last is taken for garbage
 
@@ -50,12 +50,12 @@ def read_tlog(path: Path) -> Tlog:
     packets: list[TlogPacket] = []
     at = skipped = 0
     while at + _STAMP.size + 3 <= len(data):
-        length = _packet_length(data, at) if _plausible(data, at, packets) else 0
+        length = frame_length(data, at + _STAMP.size) if _plausible(data, at, packets) else 0
         end = at + _STAMP.size + length
         if end > len(data):
             break
         if length:
-            packets.append(_packet(data, at, end))
+            packets.append(packet_of(_STAMP.unpack_from(data, at)[0] * 1000, data[at + _STAMP.size : end]))
             at = end
         else:
             at += 1
@@ -65,13 +65,14 @@ def read_tlog(path: Path) -> Tlog:
     return Tlog(tuple(packets), torn_bytes=len(data) - at, skipped_bytes=skipped)
 
 
-def _packet_length(data: bytes, at: int) -> int:
-    """Bytes of the packet after the stamp at `at`, by its head; 0 if there is none."""
-    head = at + _STAMP.size
-    if data[head] == _STX_V2:
-        return 12 + data[head + 1] + (13 if data[head + 2] & _SIGNED else 0)
-    if data[head] == _STX_V1:
-        return 8 + data[head + 1]
+def frame_length(data: bytes, at: int) -> int:
+    """Bytes of the frame that begins at `at`, by its head; 0 if none does."""
+    if at + 3 > len(data):
+        return 0
+    if data[at] == _STX_V2:
+        return 12 + data[at + 1] + (13 if data[at + 2] & _SIGNED else 0)
+    if data[at] == _STX_V1:
+        return 8 + data[at + 1]
     return 0
 
 
@@ -83,7 +84,7 @@ def _plausible(data: bytes, at: int, packets: list[TlogPacket]) -> bool:
     return bool(abs(stamp_us - packets[-1].at_ns // 1000) <= _LONGEST_SILENCE_US)
 
 
-def _packet(data: bytes, at: int, end: int) -> TlogPacket:
-    packet = data[at + _STAMP.size : end]
-    system = packet[5] if packet[0] == _STX_V2 else packet[3]
-    return TlogPacket(at_ns=_STAMP.unpack_from(data, at)[0] * 1000, data=packet, outgoing=system in GROUND_SYSTEMS)
+def packet_of(at_ns: int, data: bytes) -> TlogPacket:
+    """A packet with its direction guessed; one that is too short to name a system is taken for incoming."""
+    place = 5 if data[0] == _STX_V2 else 3
+    return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > place and data[place] in GROUND_SYSTEMS)

@@ -1,7 +1,8 @@
 """The topics of a recording: one row each.
 
 Raw MAVLink bytes have one topic a connection and direction; everything else is one record type,
-written as JSON with its JSON Schema.
+written as JSON with its JSON Schema. Beside these stand the topics made for viewers, as protobuf
+(`logs.view_topics`); nothing is decided, replayed or reported from them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import cast
 
 import msgspec
 
+from logs.view_topics import VIEWS, View
 from uavctl.data import (
+    Checked,
     Datagram,
     Decision,
     Estimate,
@@ -24,6 +27,7 @@ from uavctl.data import (
     Plan,
     PolicyLibrary,
     Record,
+    Refused,
     Setpoint,
     StepInput,
     Timing,
@@ -90,12 +94,15 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/vehicle", VehicleStatus, "the vehicle's mode and state, as it tells"),
     Topic("/uavctl/event", Event, "something worth telling a person"),
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
+    Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
+    Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
     Topic("/uavctl/link_estimate", LinkEstimate, "what is believed of the link that carries the positions"),
     Topic("/sim/truth", Truth, "the simulator's own state, in simulated flights"),
     Topic(RECORDER, RecorderNote, "the recorder's own account: segments, drops, failed writes"),
 )
 _BY_NAME = {topic.name: topic for topic in TOPICS}
+_VIEW_BY_NAME = {view.name: view for view in VIEWS}
 _RAW = re.compile(r"/raw/([^/]+)/(in|out)")
 _RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
 
@@ -105,6 +112,11 @@ def raw_link(topic: str) -> tuple[str, bool] | None:
     """Connection name and whether outgoing, of a raw topic; None for any other topic."""
     match = _RAW.fullmatch(topic)
     return None if match is None else (match[1], match[2] == "out")
+
+
+def is_view(topic: str) -> bool:
+    """Whether a topic was made for viewers: it holds nothing that the records do not."""
+    return topic in _VIEW_BY_NAME
 
 
 def record_type(topic: str) -> type[Record]:
@@ -125,6 +137,9 @@ def definition(topic: str) -> Definition:
     """
     if raw_link(topic) is not None:
         return Definition(topic=topic, encoding="mavlink")
+    if topic in _VIEW_BY_NAME:
+        view = _VIEW_BY_NAME[topic]
+        return Definition(topic, "protobuf", view.schema_name, "protobuf", view.schema)
     return _BY_NAME[topic].definition
 
 
@@ -148,7 +163,41 @@ def topics_page() -> str:
         properties = cast("dict[str, dict[str, object]]", _schema(topic.record)["properties"])
         lines += [f"| `{name}` | {_type_text(schema)} |" for name, schema in properties.items()]
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_views_section()])
+
+
+def _views_section() -> list[str]:
+    lines = [
+        "# Topics for viewers",
+        "",
+        "Made from the records above while they are written, for programs that show recordings",
+        "([viewers.md](viewers.md) says how to open one); protobuf, with the schemas inside the file. A replay and a",
+        "report never read them. Places are local NED, in the frame `ned`; the frame `room` (axes: east, north, up)",
+        "is the one to look from. Log times are those of the records. NaN: there is no number.",
+        "",
+        "| topic | schema | what it is |",
+        "|---|---|---|",
+        *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
+        "",
+    ]
+    for view in VIEWS:
+        if issubclass(view.kind, Record):
+            lines += _message_section(view, view.kind)
+    return lines
+
+
+def _message_section(view: View, kind: type[Record]) -> list[str]:
+    fields = msgspec.structs.fields(kind)
+    return [
+        f"## `{view.name}`",
+        "",
+        (kind.__doc__ or "").strip(),
+        "",
+        "| field | type |",
+        "|---|---|",
+        *(f"| `{field.name}` | `{field.type.__name__}` |" for field in fields),
+        "",
+    ]
 
 
 def _schema(record: type[Record]) -> dict[str, object]:

@@ -1,15 +1,21 @@
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
+import msgspec
 import pytest
-from recording_fakes import record_flight, write_two_segments
+from recording_fakes import HEADER, Clock, record_flight, write_two_segments
+from rich.console import Console
 
 from logs.disk import check_room
 from logs.info import info
-from logs.reader import header
+from logs.reader import header, read
+from logs.recorder import SyncRecorder
 from logs.recover import recover
 from logs.segment import MAGIC
+from uavctl.cli.info_table import info_table
+from uavctl.data import LinkEstimate, LinkStats, Refused, Truth
 from uavctl.errors import RecordingError
 
 
@@ -101,3 +107,65 @@ def test_room_is_refused_where_a_recording_is_or_no_folder_can_be(tmp_path: Path
     assert str(told.value) == (
         f"{path}: the folder cannot be made (File exists); choose another folder for the recording"
     )
+
+
+def test_links_losses_and_what_the_recorder_said(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    recorder = SyncRecorder(path, clock=Clock())
+    second = 1_000_000_000
+    estimate = LinkEstimate(
+        at_ns=2 * second, arrived=7.0, lost=3.0, arrival_mean=0.7, arrival_lower=0.5, credible=0.99,
+        burst_statistic=0.1, bursts=True, promised=0.8, below_promise=False,
+    )  # fmt: skip
+    truth = Truth(
+        at_ns=2 * second, position_m=(0.0, 0.0, 0.0), velocity_mps=(0.0, 0.0, 0.0), state=(), input=(), sent=50, lost=9,
+        mode="OFFBOARD",
+    )  # fmt: skip
+    recorder.put("/uavctl/header", second, HEADER)
+    for count in (1, 2):
+        stats = LinkStats(
+            at_ns=count * second, link="vehicle", datagrams=10 * count, messages=9 * count, samples=count,
+            bad={"checksum": count}, clock_offset_ns=None, clock_source="none",
+        )  # fmt: skip
+        recorder.put("/uavctl/link", count * second, stats)
+        told = Refused(at_ns=count * second, link="mocap", counts={"address": 2, "rate": count})
+        recorder.put("/uavctl/refused", count * second, told)
+    recorder.put("/uavctl/link_estimate", 2 * second, msgspec.structs.replace(estimate, arrival_mean=0.1))
+    recorder.put("/uavctl/link_estimate", 2 * second, estimate)
+    recorder.put("/sim/truth", 2 * second, truth)
+    recorder.close()
+    found = info(path)
+    mocap, vehicle = found.connections
+    assert (mocap.link, mocap.datagrams, mocap.refused) == ("mocap", 0, {"address": 4, "rate": 3})
+    assert (vehicle.datagrams, vehicle.messages, vehicle.samples, vehicle.bad) == (20, 18, 2, {"checksum": 2})
+    loss = found.position_loss
+    assert loss.believed == pytest.approx(0.3)
+    assert (loss.bursts, loss.below_promise, loss.simulated_sent, loss.simulated_lost) == (True, False, 50, 9)
+    assert found.segments[0].messages == found.messages and found.segments[0].bytes == found.bytes
+    console = Console(width=160, record=True, file=io.StringIO())
+    console.print(info_table(found))
+    shown = console.export_text()
+    for text in (
+        "20 datagrams, 18 messages, 2 positions; bad: 2 checksum",
+        "refused: 4 address, 3 rate",
+        "30 % of the steps without news, as last estimated, in bursts",
+        "9 of 50 positions lost",
+    ):
+        assert text in shown
+
+
+def test_a_damaged_index_is_told_and_a_torn_one_is_not_called_damaged(tmp_path: Path) -> None:
+    path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    record_flight(path, 30)
+    whole = path.read_bytes()
+    data = bytearray(whole)
+    data[data.rindex(b"/uavctl/event")] ^= 1  # a channel's name, in the summary
+    path.write_bytes(data)
+    assert "the index is damaged" in info(path).damage[0]
+    with pytest.raises(RecordingError, match="log recover"):
+        list(read(path))
+    result = recover(path, out)
+    assert result.lossless and len(result.damage) == 1
+    path.write_bytes(whole[:-100])  # killed while it was closed
+    assert list(read(path)) == list(read(out))
+    assert not info(path).finished

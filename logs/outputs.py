@@ -1,0 +1,70 @@
+"""Files that are there whole, and all of them, or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from logs.segment import MAGIC
+from uavctl.errors import RecordingError, UsageError
+
+_UNFINISHED = ".part"
+
+
+def spare_recording(target: Path) -> None:
+    """Refuse to put anything else where a recording is: a slip of the command line would cost the flight.
+
+    Raises:
+        UsageError: A recording of ours is there, or the name is that of one (which may be damaged).
+    """
+    begin = b""
+    if target.is_file():
+        with contextlib.suppress(OSError), target.open("rb") as file:
+            begin = file.read(len(MAGIC))
+    if begin == MAGIC or target.suffix == ".mcap":
+        raise UsageError(f"{target}: is a recording, or called like one, and would be lost; choose another name")
+
+
+def check_free(targets: Sequence[Path], *, force: bool) -> None:
+    """Refuse to overwrite.
+
+    Raises:
+        UsageError: One of the files exists, and `force` is not given, or is a recording.
+    """
+    for target in targets:
+        spare_recording(target)
+    there = [target for target in targets if target.exists()]
+    if there and not force:
+        more = f" (and {len(there) - 1} more of these files)" if len(there) > 1 else ""
+        raise UsageError(f"{there[0]} exists{more}; --force writes anew, --out chooses another place")
+
+
+@contextmanager
+def unfinished(targets: Sequence[Path]) -> Iterator[Mapping[Path, Path]]:
+    """Where to write each file; in the end all get their names, but after an error they are removed.
+
+    Raises:
+        UsageError: Their folder cannot be made.
+        RecordingError: Something could not be written.
+    """
+    parts = {target: target.with_name(target.name + _UNFINISHED) for target in targets}
+    for folder in {target.parent for target in targets}:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{folder}: no folder can be made there ({error.strerror}); take another --out") from error
+    try:
+        yield parts
+        for target, part in parts.items():
+            part.replace(target)
+    except OSError as error:
+        where = error.filename or targets[0].parent
+        reason = os.strerror(error.errno) if error.errno else error
+        raise RecordingError(f"{where}: cannot be written ({reason}); make room or choose another place") from error
+    finally:
+        for part in parts.values():
+            with contextlib.suppress(OSError):
+                part.unlink()

@@ -1,0 +1,66 @@
+"""How plans were found: how far from the optimum they are certified to be, and what they gave way by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.ticker import LogLocator, NullLocator
+
+from logs.flight_data import FlightData
+from logs.plots import span
+from logs.plots_control import largest
+from logs.svg import Drawing, canvas, colour, dots, power_of_ten
+from uavctl.data import Plan
+
+# Roles of the ways to a plan, in the order of their names.
+_ROLES = ("estimate", "sample", "target", "plan", "limit")
+_LEAST_GAP = 1e-12
+
+
+def methods(flight: FlightData) -> list[tuple[str, str]]:
+    """Ways in which plans were found, each with its colour's role."""
+    names = sorted({plan.method for plan in flight.plans})
+    return [(name, _ROLES[place % len(_ROLES)]) for place, name in enumerate(names)]
+
+
+def certificates(flight: FlightData) -> Iterator[Drawing]:
+    """Certified gap of each plan, and the slack of those that gave way."""
+    if any(np.isfinite(plan.gap) for plan in flight.plans):
+        yield _gaps(flight)
+    gave = [plan for plan in flight.flown_plans.values() if plan.slack > 0.0 or plan.terminal_miss > 0.0]
+    if gave:
+        yield _slack(flight, gave)
+
+
+def _gaps(flight: FlightData) -> Drawing:
+    with canvas("plan-gap", 2.5) as one:
+        ax = one.axes("Certified gap", "time [s]", "share of the cost (log scale)")
+        ax.set_yscale("log")
+        for name, role in methods(flight):
+            plans = [plan for plan in flight.plans if plan.method == name and np.isfinite(plan.gap)]
+            gaps = np.maximum(np.array([plan.gap for plan in plans], dtype=np.float64), _LEAST_GAP)
+            shown_s, shown = largest(flight.seconds([plan.base_ns for plan in plans]), gaps)
+            dots(ax, shown_s, shown, role, 2.4)
+        ax.yaxis.set_major_locator(LogLocator(numticks=7))
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.yaxis.set_major_formatter(power_of_ten)
+        ax.margins(y=0.08)
+        ax.autoscale_view()
+        span(ax, flight)
+    label = "Certified gap of each plan between its cost and the least possible, as a share of the cost, over time"
+    return Drawing("plan-gap", one.svg, label)
+
+
+def _slack(flight: FlightData, plans: list[Plan]) -> Drawing:
+    t_s = flight.seconds([plan.base_ns for plan in plans])
+    with canvas("plan-slack", 2.5) as one:
+        ax = one.axes("What gave way in plans flown", "time [s]", "sum over rows, their units")
+        for role, values in (
+            ("sample", np.array([plan.slack for plan in plans])),
+            ("limit", np.array([plan.terminal_miss for plan in plans])),
+        ):
+            dots(ax, *largest(t_s, values), role, 3.0)
+        ax.axhline(0.0, color=colour("muted"), lw=0.6)
+        span(ax, flight)
+    return Drawing("plan-slack", one.svg, "Slack of the state limits and of the rest at the end of plans, over time")

@@ -1,0 +1,240 @@
+"""3D scenes of a flight in Foxglove's messages. All of it is local NED; viewers turn it (topic /view/frames).
+
+The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import product
+from typing import Any, TypeVar
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+
+from logs.design_view import AXIS_NUMBER, DesignView, Floats
+from logs.plot_records import tightened
+from uavctl.data import ControlMode, Decision, Estimate, Event, Plan, Severity, Vec3
+from uavctl.frames import axes_turn, from_axes
+
+Fields = dict[str, Any]  # of a message within another
+M = TypeVar("M", bound=Message)
+
+ROOM, NED, VEHICLE = "room", "ned", "vehicle"  # east-north-up; local NED; at the vehicle's estimated place
+OPEN_M = 5.0  # an open side of the room is drawn so far from the target
+# Square root of the 0.95 quantile of chi squared with three degrees of freedom: what an estimate's ellipsoid holds.
+STD_95 = 2.7955
+
+
+def _colour(red: float, green: float, blue: float, alpha: float) -> Fields:
+    return {"r": red, "g": green, "b": blue, "a": alpha}
+
+
+_LIMITS, _TIGHT = _colour(0.9, 0.9, 0.9, 0.9), _colour(1.0, 0.65, 0.1, 0.8)
+_PLANNED, _SPREAD = _colour(0.25, 0.6, 1.0, 1.0), _colour(0.25, 0.6, 1.0, 0.15)
+_FLOWN, _MEASURED = _colour(0.2, 0.85, 0.4, 1.0), _colour(0.85, 0.3, 0.85, 0.8)
+_NEWS, _SILENCE, _FALLBACK = _colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _colour(0.95, 0.2, 0.2, 0.9)
+_LEVEL: Fields = {"w": 1.0}
+_LABEL_M = (0.0, 0.0, -0.35)  # above the vehicle: down is positive
+_IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
+_LEVELS = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
+_EDGES = [  # corners whose numbers differ in one bit
+    corner for first, second in product(range(8), repeat=2) if first < second and (first ^ second) in (1, 2, 4)
+    for corner in (first, second)
+]  # fmt: skip
+
+
+def _made(kind: Callable[..., M], **fields: Any) -> M:
+    """A message of its fields; the types of constructors know only of messages in messages."""
+    return kind(**fields)
+
+
+def stamp(at_ns: int) -> Fields:
+    """A time of our clock."""
+    return {"seconds": at_ns // 1_000_000_000, "nanos": at_ns % 1_000_000_000}
+
+
+def vector(at_m: Sequence[float]) -> Fields:
+    """Three numbers, as a vector or a point."""
+    return {"x": at_m[0], "y": at_m[1], "z": at_m[2]}
+
+
+def pose(at_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
+    """A place [m] and a turn."""
+    return {"position": vector(at_m), "orientation": turn}
+
+
+def quaternion(turn: Sequence[float]) -> Fields:
+    """A turn (w, x, y, z)."""
+    w, x, y, z = turn
+    return {"x": x, "y": y, "z": z, "w": w}
+
+
+def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
+    """A place in local NED [m]."""
+    return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
+
+
+def poses_in_frame(at_ns: int, places_m: Iterable[Vec3]) -> PosesInFrame:
+    """Places in local NED [m], in order."""
+    return _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED, poses=[pose(one) for one in places_m])
+
+
+def frames(at_ns: int) -> FrameTransforms:
+    """How local NED lies in the room's frame, whose z axis points up as viewers want it."""
+    turned: Fields = {
+        "timestamp": stamp(at_ns),
+        "parent_frame_id": ROOM,
+        "child_frame_id": NED,
+        "translation": {},
+        "rotation": quaternion(axes_turn("enu")),
+    }
+    return _made(FrameTransforms, transforms=[turned])
+
+
+def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
+    """Where the vehicle is estimated to be; its attitude is not known, so the axes stay those of local NED."""
+    return _made(
+        FrameTransform,
+        timestamp=stamp(at_ns),
+        parent_frame_id=NED,
+        child_frame_id=VEHICLE,
+        translation=vector(at_m),
+        rotation=_LEVEL,
+    )
+
+
+def log_line(event: Event) -> Log:
+    """An event."""
+    times = "" if event.count == 1 else f" ({event.count} times)"
+    return _made(
+        Log, timestamp=stamp(event.at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
+    )
+
+
+def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
+    """Limits of the position, as a box."""
+    lower, upper = _sides(design, design.state_box.lower, design.state_box.upper)
+    return _update(_entity(at_ns, "limits", lines=[_box(lower, upper, _LIMITS)]))
+
+
+def plan_scene(at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None) -> SceneUpdate:
+    """A plan's predicted path, its confidence ellipsoids, and what its back-offs leave of the limits.
+
+    A stage's ellipsoid has the back-offs of the position limits as semi-axes: what the plan keeps
+    from them so that they hold with the promised probability. The estimate's is from its covariance.
+    """
+    places = [design.position_of(state) for state in plan.states]
+    lower, upper = _sides(design, *tightened(design, design.state_box, plan.backoff_x, -1))
+    stages = [_sphere(pose(at_m), _reach(design, row)) for at_m, row in zip(places, plan.backoff_x, strict=True)]
+    entities = [
+        _entity(at_ns, "predicted path", lines=[_line(places, _PLANNED, 3.0)]),
+        _entity(at_ns, "predicted spread", spheres=stages),
+        _entity(at_ns, "limits less back-offs", lines=[_box(lower, upper, _TIGHT)]),
+    ]
+    if estimate is not None:
+        entities.append(_entity(at_ns, "estimate, 95 %", spheres=[_estimate_sphere(design, estimate)]))
+    return _update(*entities)
+
+
+def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
+    """What was flown and measured lately."""
+    return _update(
+        _entity(at_ns, "flown path", lines=[_line(flown_m, _FLOWN, 3.0)]),
+        _entity(at_ns, "measured path", lines=[_line(measured_m, _MEASURED, 1.5)]),
+    )
+
+
+def link_scene(design: DesignView, decision: Decision) -> SceneUpdate:
+    """The link's state at the vehicle: green with news, amber in silence, red in the fallback; and in words."""
+    colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
+    age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
+    label: Fields = {
+        "pose": pose(_LABEL_M),
+        "billboard": True,
+        "font_size": 14.0,
+        "scale_invariant": True,
+        "color": colour,
+        "text": f"{decision.mode.value}, {age}",
+    }
+    ball: Fields = {"pose": pose((0.0, 0.0, 0.0)), "size": vector((0.2, 0.2, 0.2)), "color": colour}
+    return _update(_entity(decision.at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
+
+
+def _update(*entities: Fields) -> SceneUpdate:
+    return _made(SceneUpdate, entities=entities)
+
+
+def _entity(
+    at_ns: int,
+    name: str,
+    frame: str = NED,
+    *,
+    lines: Sequence[Fields] = (),
+    spheres: Sequence[Fields] = (),
+    texts: Sequence[Fields] = (),
+) -> Fields:
+    return {
+        "timestamp": stamp(at_ns),
+        "frame_id": frame,
+        "id": name,
+        "frame_locked": True,
+        "lines": lines,
+        "spheres": spheres,
+        "texts": texts,
+    }
+
+
+def _line(places_m: Iterable[Sequence[float]], colour: Fields, pixels: float) -> Fields:
+    return {
+        "type": LinePrimitive.LINE_STRIP,
+        "pose": pose((0.0, 0.0, 0.0)),
+        "thickness": pixels,
+        "scale_invariant": True,
+        "points": [vector(at_m) for at_m in places_m],
+        "color": colour,
+    }
+
+
+def _box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
+    line = _line(product(*zip(lower, upper, strict=True)), colour, 1.5)
+    return {**line, "type": LinePrimitive.LINE_LIST, "indices": _EDGES}
+
+
+def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3]:
+    """Sides of the room in local NED; open ones near the target, and flat in axes that the plant has not."""
+    centre = np.array(design.target)
+    return (
+        design.position_of(np.where(np.isfinite(lower), lower, centre - OPEN_M).tolist()),
+        design.position_of(np.where(np.isfinite(upper), upper, centre + OPEN_M).tolist()),
+    )
+
+
+def _reach(design: DesignView, backoff: Sequence[float]) -> Vec3:
+    """Semi-axes of a stage's ellipsoid (3,) [m]; 0 in an axis without limits."""
+    reach = [0.0] * len(design.target)
+    for state, row, size in design.position_rows:
+        reach[state] = max(reach[state], backoff[row] / size)
+    return design.position_of(reach)
+
+
+def _sphere(at: Fields, semi_axes_m: Sequence[float]) -> Fields:
+    return {"pose": at, "size": vector([2 * one for one in semi_axes_m]), "color": _SPREAD}
+
+
+def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
+    """Ellipsoid that holds the position with 95 %, from the covariance."""
+    cov = np.zeros((3, 3))
+    place = [AXIS_NUMBER[axis] for axis in design.axes]
+    cov[np.ix_(place, place)] = np.array(estimate.cov)[np.ix_(design.position_index, design.position_index)]
+    variances, directions = np.linalg.eigh(cov)
+    semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
+    turn = quaternion(from_axes(directions.T.tolist()))
+    return _sphere(pose(design.position_of(estimate.mean), turn), semi_axes_m.tolist())

@@ -1,0 +1,133 @@
+"""A recording process that is killed at a random moment, and what is left of its recording."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from recording_fakes import Item, flight, own
+
+from logs.disk import segment_path
+from logs.encoding import encode
+from logs.onlookers import Onlookers
+from logs.reader import read, segment_files
+from logs.recorder import Recorder, SyncRecorder
+from logs.recover import recover
+from logs.topics import Definition
+from uavctl.config.log import LogConfig
+
+KINDS = ("sync", "thread")
+LOG = LogConfig(segment_bytes=60_000)  # so that kills hit the change of files, too
+RECORDS = 30_000
+MOST_S = 0.25  # from the start to the kill
+THREAD_PAUSE_S = 0.006  # after 8 records: about 1200 a second, several times what a flight has
+MESSAGE_HEAD = 31  # bytes that a message has in a chunk besides its own
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What one kill left.
+
+    Attributes:
+        kind: Which recorder.
+        put: Records that were put.
+        taken: Of these, records that had left the queue before the file.
+        kept: Records that were recovered.
+        lost_bytes: Chunk bytes of the records that were taken and are lost.
+        files: Segments that were begun.
+        wrong: What must not be; empty if all is well.
+    """
+
+    kind: str
+    put: int
+    taken: int
+    kept: int
+    lost_bytes: int
+    files: int
+    wrong: str
+
+    @property
+    def queued(self) -> int:
+        """Records that were still in the queue."""
+        return self.put - self.taken
+
+
+def kill_once(folder: Path, kind: str, seed: int, items: list[Item]) -> Killed:
+    """Record in a process of its own, kill it at a moment that `seed` draws, and look at what it left.
+
+    The caller has no other threads, since it is forked.
+    """
+    path = folder / "flight.mcap"
+    shared = mmap.mmap(-1, 16)
+    with memoryview(shared) as raw, raw.cast("Q") as counts:
+        child = os.fork()
+        if child == 0:
+            try:
+                _record(path, kind, items, counts)
+            finally:
+                os._exit(1)  # it is killed before it comes here
+        time.sleep(random.Random(seed).uniform(0.0, MOST_S))
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        put, taken = counts[0], counts[1]
+    shared.close()
+    assert os.WIFSIGNALED(status), "the recording ended before the kill"
+    return _look(folder, kind, put, taken, items)
+
+
+def _record(path: Path, kind: str, items: list[Item], counts: memoryview) -> None:
+    def watch(definition: Definition, at_ns: int, data: bytes) -> None:
+        counts[1] += 1
+
+    make: Callable[..., SyncRecorder | Recorder] = SyncRecorder if kind == "sync" else Recorder
+    recorder = make(path, LOG, onlookers=Onlookers(watch=watch))
+    for number, item in enumerate(items, 1):
+        recorder.put(*item)
+        counts[0] = number
+        if kind == "thread" and number % 8 == 0:
+            time.sleep(THREAD_PAUSE_S)
+    while True:
+        time.sleep(1.0)
+
+
+def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> Killed:
+    path, out = folder / "flight.mcap", folder / "out.mcap"
+    files, kept, wrong = 0, 0, ""
+    if path.exists() and path.stat().st_size:
+        files = len(segment_files(path))
+        direct = own(list(read(path)))
+        kept = len(direct)
+        recover(path, out)
+        restored = own(list(read(out)))
+        if direct != items[:kept] or restored != direct:
+            wrong = "a record differs"
+        elif _independent(out) != len(list(read(out))):
+            wrong = "the format's own reader finds something else"
+        for number in range(1, files):
+            with segment_path(path, number).open("rb") as file:
+                if make_reader(file, validate_crcs=True).get_summary() is None:
+                    wrong = f"file {number} is not closed"
+    lost = [len(encode(record)) + MESSAGE_HEAD for _, _, record in items[kept:taken]]
+    # Beside the open chunk the record in hand, which may be the one that fills it.
+    if sum(lost) > LOG.chunk_bytes + (lost[-1] if lost else 0):
+        wrong = f"{len(lost)} records, {sum(lost)} bytes lost"
+    return Killed(kind, put, taken, kept, sum(lost), files, wrong)
+
+
+def _independent(out: Path) -> int:
+    """Messages of a recovered file by the format's own reader, each chunk's checksum looked at."""
+    with out.open("rb") as file:
+        return sum(type(one).__name__ == "Message" for one in StreamReader(file, validate_crcs=True).records)
+
+
+def truth() -> list[Item]:
+    """What a recording process puts."""
+    return flight(RECORDS)

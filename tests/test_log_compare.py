@@ -1,0 +1,200 @@
+"""Flights beside each other: what is alike, what differs, and by how much."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from loopback_rig import Memory, lockstep
+from rich.console import Console
+
+from logs.compare import Comparison, compare
+from logs.compare_figures import Figure
+from logs.compare_side import load_all
+from logs.flight_data import FlightData
+from logs.recorder import SyncRecorder
+from logs.summary import summarise
+from uavctl.cli.app import run
+from uavctl.cli.log_compare_cmd import comparison_picture
+from uavctl.data import Decision, Header, Record, Timing
+
+SECONDS = 6.0
+EXACT = "solver.method=exact"
+
+
+@pytest.fixture(scope="module")
+def base() -> Memory:
+    return lockstep("room", SECONDS, EXACT)
+
+
+@pytest.fixture(scope="module")
+def other() -> Memory:
+    return lockstep("room", SECONDS, EXACT, "sim.seed=3", "link.loss=0.25")
+
+
+def record(path: Path, entries: Sequence[tuple[str, int, Record]]) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    recorder = SyncRecorder(path)
+    for entry in entries:
+        recorder.put(*entry)
+    assert recorder.close().ok
+    return path
+
+
+def figures(found: Comparison) -> dict[str, Figure]:
+    return {one.key: one for one in found.figures}
+
+
+def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
+    # another day: another start, other computing times
+    again = []
+    for topic, at_ns, one in base.entries:
+        if isinstance(one, Header):
+            one = msgspec.structs.replace(one, started_utc="2026-02-02T00:00:00", command="uavctl loopback --out b")
+        again.append((topic, at_ns, one))
+    again.append(("/uavctl/timing", 1, Timing(tick=0, at_ns=1, lateness_ns=0, step_ns=7, send_ns=7)))
+    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", again)]))
+    (likeness,) = found.likenesses
+    assert likeness.identical and likeness.parting is None
+    assert likeness.records == len(base.entries) - 1  # all but the header
+    assert found.parameters == () and found.notes[1:] == ()
+    assert all(one.differences == (0,) for one in found.figures if one.group not in ("time", "recording"))
+
+
+def test_parameters_that_differ_have_dotted_names(base: Memory, other: Memory, tmp_path: Path) -> None:
+    a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
+    found = compare(load_all([a, b]))
+    differing = {one.key: one.values for one in found.parameters}
+    assert differing["sim.seed"] == (0, 3)
+    assert differing["link.loss"] == (0.3, 0.25)
+    assert differing.keys() == {"sim.seed", "link.loss", "design_id"}
+
+
+def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -> None:
+    changed = [
+        (
+            topic,
+            at_ns,
+            msgspec.structs.replace(one, cpu="another", versions={"numpy": "3"}) if isinstance(one, Header) else one,
+        )
+        for topic, at_ns, one in base.entries
+    ]
+    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)]))
+    assert {one.key: one.values for one in found.parameters} == {"cpu": ("", "another"), "versions.numpy": (None, "3")}
+    assert found.likenesses[0].identical
+    assert "times were measured on different processors" in found.notes
+
+
+def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) -> None:
+    def with_waypoints(count: int) -> list[tuple[str, int, Record]]:
+        text = "".join(f"\n[[mission.waypoint]]\nat = [{number}.0]\n" for number in range(count)) + "\n[a]\nb = inf\n"
+        return [
+            (topic, at_ns, msgspec.structs.replace(one, config_toml=text) if isinstance(one, Header) else one)
+            for topic, at_ns, one in base.entries
+        ]
+
+    paths = [record(tmp_path / f"{count}.mcap", with_waypoints(count)) for count in (1, 2)]
+    found = compare(load_all(paths))
+    assert [(one.key, one.values) for one in found.parameters] == [("mission.waypoint[1].at", (None, [1.0]))]
+
+
+def test_figures_are_the_summaries(base: Memory, other: Memory, tmp_path: Path) -> None:
+    a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
+    found = figures(compare(load_all([a, b])))
+    first, second = (summarise(FlightData.from_records(one.entries), wall_s=None) for one in (base, other))
+    for key in ("steps", "received", "lost", "max_age", "fallbacks", "cost", "settled_error_m", "solves", "rejected"):
+        values = (getattr(first, key), getattr(second, key))
+        assert found[key].values == values
+        assert found[key].differences == (values[1] - values[0],)
+        assert found[key].ratios == ((values[1] / values[0],) if values[0] else (None,))
+    ages = [d.age_steps for d in base.of(Decision) if d.boundary and d.age_steps is not None and d.mode != "wait"]
+    assert found["mean_age"].values[0] == pytest.approx(np.mean(ages))
+    assert found["loss"].values[0] == pytest.approx(first.lost / (first.received + first.lost))  # type: ignore[operator]
+
+
+def test_where_they_part(base: Memory, tmp_path: Path) -> None:
+    at = next(i for i, (_, _, r) in enumerate(base.entries) if isinstance(r, Decision) and r.tick == 57)
+    topic, at_ns, one = base.entries[at]
+    assert isinstance(one, Decision) and one.input is not None
+    changed = [*base.entries]
+    changed[at] = (topic, at_ns, msgspec.structs.replace(one, input=(one.input[0] + 2.0**-50, *one.input[1:])))
+    a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)
+    (likeness,) = compare(load_all([a, b])).likenesses
+    assert not likeness.identical and likeness.records == at - 1
+    parting = likeness.parting
+    assert parting is not None and (parting.topic, parting.field) == (topic, "input[0]")
+    assert parting.flight_s == pytest.approx(57 * 0.05)
+    assert parting.first == repr(one.input[0]) and parting.other != parting.first
+
+
+def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> None:
+    a = record(tmp_path / "a.mcap", base.entries)
+    torn = tmp_path / "b.mcap"
+    torn.write_bytes(a.read_bytes()[: a.stat().st_size // 2])
+    found = compare(load_all([a, torn]))
+    (likeness,) = found.likenesses
+    assert likeness.parting is not None and likeness.parting.other == "its end"
+    assert "B is torn: compared up to its end" in found.notes
+    assert any("different length" in note for note in found.notes)
+    assert [one.finished for one in found.recordings] == [True, False]
+
+
+def shown(found: Comparison, width: int) -> str:
+    out = io.StringIO()
+    Console(file=out, width=width).print(comparison_picture(found))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, tmp_path: Path) -> None:
+    paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
+    found = compare(load_all([*paths, *paths]))
+    text = shown(found, width)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in text
+    assert "C is the same flight as A" in text and "B is the same as A for" in text
+    for one in found.figures:
+        assert text.count(f"│ {one.text}") >= 1
+    for heading in ("B − A", "B / A", "C − A", "D / A"):
+        assert heading in text
+
+
+def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
+    page = tmp_path / "c.html"
+    assert run(["log", "compare", str(a), str(b), "--out", str(page), "--json"]) == 0
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in document["recordings"]] == ["A", "B"]
+    assert msgspec.convert(document, Comparison).figures
+    text = page.read_text(encoding="utf-8")
+    for part in ('id="path-above"', 'id="position-north"', 'id="age"', "sim.seed", "distance from target"):
+        assert part in text
+    assert "<script" not in text and "http" not in text
+    assert run(["log", "compare", str(a), str(b)]) == 0
+    assert "Parameters that differ" in capsys.readouterr().out
+
+
+def test_refusals(base: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a = record(tmp_path / "a.mcap", base.entries)
+    assert run(["log", "compare", str(a)]) == 2
+    capsys.readouterr()
+    assert run(["log", "compare", str(a), str(tmp_path / "none.mcap")]) == 1
+    assert "none.mcap: no such recording" in capsys.readouterr().err.replace("\n", "")
+    data = bytearray(a.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    assert run(["log", "compare", str(a), str(tmp_path / "damaged.mcap")]) == 1
+    assert "uavctl log recover" in capsys.readouterr().err.replace("\n", " ")
+    headless = record(tmp_path / "b.mcap", [entry for entry in base.entries if not isinstance(entry[2], Header)])
+    assert run(["log", "compare", str(a), str(headless)]) == 1
+    assert f"{headless}: the recording has no header" in capsys.readouterr().err.replace("\n", "")
+    assert run(["log", "compare", str(a), str(a), "--out", str(tmp_path / "no" / "c.html")]) == 1
+    assert "cannot be written" in capsys.readouterr().err
+    assert run(["log", "compare", *[str(a)] * 6, "--out", str(tmp_path / "c.html")]) == 2
+    assert "5 flights at most" in capsys.readouterr().err

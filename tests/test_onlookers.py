@@ -1,0 +1,113 @@
+"""Messages for viewers beside the records: they cost the records nothing, whatever happens to them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from recording_fakes import Clock, Disk, flight, own
+from view_rig import flown, record
+
+from logs.chunks import Message, scan
+from logs.info import info
+from logs.onlookers import Onlookers
+from logs.reader import read, records, segment_files
+from logs.recorder import Recorder, SyncRecorder
+from logs.recover import recover
+from logs.topics import Definition, RecorderNote, is_view
+from logs.view_topics import VIEWS
+from logs.views import Views
+from uavctl.config.log import LogConfig
+from uavctl.data import Estimate, Record
+
+
+def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None:
+    path = record(tmp_path / "flight.mcap")
+    assert own(list(read(path))) == flown().entries
+    found = info(path)
+    assert found.finished and not found.missing and not found.refused
+    assert sum(is_view(one.topic) for one in found.topics) == len(VIEWS)
+
+
+def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
+    items = flown().entries[:120]
+    whole = tmp_path / "whole.mcap"
+    recorder = SyncRecorder(whole, onlookers=Onlookers(Views()))
+    for item in items:
+        recorder.put(*item)
+    recorder.close()
+    want = [m.data for m in scan(whole) if isinstance(m, Message) and is_view(m.definition.topic)]
+    number = 0
+    while True:
+        path = tmp_path / f"at{number}" / "flight.mcap"
+        clock, disk = Clock(), Disk({number}.__contains__)
+        recorder = SyncRecorder(
+            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=Onlookers(Views())
+        )
+        for item in items:
+            clock.now_s += 0.1
+            recorder.put(*item)
+        status = recorder.close()
+        if disk.operations <= number:
+            break
+        assert status.ok and own(list(read(path))) == items, number
+        messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, Message)]
+        assert [m.data for m in messages if is_view(m.definition.topic)] == want
+        number += 1
+    assert number > 20
+
+
+def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
+    path = record(tmp_path / "flight.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    recover(cut, tmp_path / "again.mcap")
+    views = {one.topic for one in info(tmp_path / "again.mcap").topics if is_view(one.topic)}
+    assert len(views) > len(VIEWS) - 3
+    kept = own(list(read(tmp_path / "again.mcap")))
+    assert kept == flown().entries[: len(kept)] and len(kept) > 100
+
+
+def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
+    # This header's design lacks what a view needs.
+    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=Onlookers(Views()))
+    for item in flight(30):
+        recorder.put(*item)
+    status = recorder.close()
+    assert (status.ok, status.unseen, status.refused) == (True, 1, 0)
+    assert own(list(read(tmp_path / "flight.mcap"))) == flight(30)
+    last = [*records(tmp_path / "flight.mcap", RecorderNote)][-1]
+    assert last.text.startswith("end; 1 without views: Header: the header's design cannot be used")
+
+
+@pytest.mark.parametrize("error", [ValueError, TypeError, IndexError, ZeroDivisionError])
+def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Path, error: type[Exception]) -> None:
+    class Failing(Views):
+        def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+            if isinstance(record, Estimate) and record.at_ns == flown().of(Estimate)[5].at_ns:
+                raise error("no")
+            return super().made(at_ns, record)
+
+    recorder = Recorder(tmp_path / "flight.mcap", onlookers=Onlookers(Failing()))
+    for item in flown().entries:
+        recorder.put(*item)
+    status = recorder.close()
+    assert (status.ok, status.unseen) == (True, 1)
+    counts = {one.topic: one.messages for one in info(tmp_path / "flight.mcap").topics}
+    assert counts["/view/estimate"] == counts["/uavctl/estimate"] - 1
+
+
+def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
+    seen: list[tuple[str, int, bytes]] = []
+
+    def watch(definition: Definition, at_ns: int, data: bytes) -> None:
+        seen.append((definition.topic, at_ns, data))
+
+    path = tmp_path / "flight.mcap"
+    recorder = SyncRecorder(path, onlookers=Onlookers(Views(), watch))
+    for item in flown().entries:
+        recorder.put(*item)
+    recorder.close()
+    written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, Message)]
+    unnoted = [one for one in written if one[0] != "/uavctl/recorder"]
+    assert seen == unnoted

@@ -1,0 +1,65 @@
+"""A small part of what `tools/soak.py --scenario replay` flies: recordings with everything amiss decide alike again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from draw_flight import drawn
+from soak_replay import replayed, tally
+
+from logs.reader import segment_files
+
+SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for below
+
+
+def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
+    found = [replayed(seed, tmp_path) for seed in SEEDS]
+    assert {one.seed: one.result.first_difference for one in found if not one.good} == {}
+    had = {word for one in found for word in one.words}
+    assert {
+        "px4",
+        "ardupilot",
+        "preset paper",
+        "preset room",
+        "simulated quadrotor",
+        "solver library",
+        "solver exact",
+        "orders",
+        "missed ticks",
+        "late ticks",
+        "strangers",
+        "signed",
+        "reboot",
+        "one connection",
+    } <= had
+    seen = Counter[str]()
+    for one in found:
+        seen.update(one.seen)
+    assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= seen.keys()
+    assert max(len(segment_files(one.path)) for one in found) > 1
+    report = tally(found)
+    assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
+
+
+def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = 0
+
+    def forgetful(*given: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+        # What a cache that is not part of the recording would do.
+        nonlocal memory
+        memory += 1
+        return (1e-9 * memory, 0.0, 0.0), ()
+
+    monkeypatch.setattr("uavctl.flight.step.gate", forgetful)
+    found = replayed(SEEDS[0], tmp_path)
+    assert not found.good
+    report = tally([found])
+    assert report["identical"] == 0
+    wrong = report["wrong"]
+    assert isinstance(wrong, dict) and wrong[str(SEEDS[0])]["topic"] == "/uavctl/decision"
+
+
+def test_a_seed_draws_the_same_flight_each_time() -> None:
+    assert drawn(15) == drawn(15) != drawn(0)

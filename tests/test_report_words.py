@@ -1,0 +1,76 @@
+"""The page's words on how a flight ended: by the operator, by the fallback, or cut off."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from report_rig import words_of
+from synthetic_flight import fly
+from synthetic_scene import room
+
+from logs.flight_data import FlightData
+from uavctl.data import ControlMode, Decision, Record, StepInput
+
+TICK_S = room().tick_s
+
+
+def ended_in(modes: dict[int, ControlMode], stop_tick: int | None = None) -> str:
+    """Text of the page of a 4 s flight (ticks of 50 ms) whose modes change at the given ticks."""
+
+    def change(record: Record) -> Record:
+        if isinstance(record, StepInput) and stop_tick is not None:
+            return msgspec.structs.replace(record, stop=record.tick >= stop_tick)
+        if isinstance(record, Decision) and record.tick >= min(modes):
+            mode = modes[max(tick for tick in modes if tick <= record.tick)]
+            return msgspec.structs.replace(record, mode=mode, reason="why not")
+        return record
+
+    items = [(t, at, change(r)) for t, at, r in fly(room(), 4.0)]
+    return " ".join(words_of(FlightData.from_records(items)).text)
+
+
+HAND_OVER = {40: ControlMode.BRAKE, 50: ControlMode.HOLD, 51: ControlMode.LAND, 52: ControlMode.STOPPED}
+
+
+def test_the_operators_stop_is_no_fallback() -> None:
+    text = ended_in(HAND_OVER, stop_tick=40)
+    assert f"The operator ended the flight after {40 * TICK_S:g} s" in text
+    assert "the vehicle was handed over to its own landing" in text
+    assert "The fallback was never needed." in text
+    assert "handed over by the operator" in text
+
+
+def test_a_fallback_before_the_operators_stop_is_told() -> None:
+    text = ended_in({20: ControlMode.BRAKE, 24: ControlMode.TRACK, **HAND_OVER}, stop_tick=40)
+    assert f"took over once, for {4 * TICK_S:g} s in all; at {20 * TICK_S:g} s: why not" in text
+    assert "The operator ended the flight" in text
+
+
+def test_a_hand_over_that_was_cut_off_is_told() -> None:
+    assert "the recording ends before the vehicle was handed over" in ended_in({40: ControlMode.BRAKE}, stop_tick=40)
+    assert "; the vehicle was handed over." in ended_in({40: ControlMode.STOPPED}, stop_tick=40)
+
+
+def test_a_landing_is_told() -> None:
+    text = ended_in(HAND_OVER)
+    assert f"The fallback had the vehicle land after {51 * TICK_S:g} s." in text
+    assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s in all" in text
+    assert "landed by the fallback" in text
+    assert "operator" not in text
+
+
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        (ControlMode.WAIT, "At the end the controller was waiting: why not."),
+        (ControlMode.TRACK, "At the end a plan was being flown."),
+        (ControlMode.HOLD, "The recording ends while the fallback held zero acceleration."),
+    ],
+)
+def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
+    assert told in ended_in({40: mode})
+
+
+def test_a_simulated_flight_that_never_began_has_a_page() -> None:
+    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.WAIT})
+    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.STOPPED}, stop_tick=0)

@@ -1,0 +1,303 @@
+"""Long recordings: files by size, memory that stays flat, and the watch over the disk's room."""
+
+from __future__ import annotations
+
+import re
+import tracemalloc
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from loopback_rig import header as made_header
+from mcap.reader import make_reader
+from recording_fakes import HEADER, Clock, Disk, Item, flight, own
+
+from logs.disk import DiskFile, RoomWatch
+from logs.info import info
+from logs.onlookers import Onlookers
+from logs.reader import header, read, records, segment_files
+from logs.recorder import SyncRecorder
+from logs.recover import recover
+from logs.segment import Entry, Segment
+from logs.topics import RecorderNote, definition
+from logs.view_topics import LOG
+from logs.views import Views
+from uavctl.build import build_design
+from uavctl.config import load_config
+from uavctl.config.log import LogConfig
+from uavctl.data import PolicyLibrary
+from uavctl.errors import ConfigError, RecordingError
+
+SMALL = LogConfig(chunk_bytes=1024, segment_bytes=6000)
+LOW, STOP = 3000, 1000
+
+
+def fly(recorder: SyncRecorder, clock: Clock, items: list[Item]) -> None:
+    for item in items:
+        clock.now_s += 0.1
+        recorder.put(*item)
+
+
+def texts(path: Path) -> list[str]:
+    return [note.text for note in records(path, RecorderNote)]
+
+
+def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    items = flight(300)
+    clock = Clock()
+    recorder = SyncRecorder(path, SMALL, clock=clock)
+    fly(recorder, clock, items)
+    status = recorder.close()
+    files = segment_files(path)
+    assert status.ok and (status.failures, status.reason) == (0, "")
+    assert status.segments == tuple(map(str, files)) and len(files) > 4
+    assert own(list(read(path))) == items
+    for file in files:
+        with file.open("rb") as stream:  # closed in order: the format's own reader has its index
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            count = sum(1 for _ in reader.iter_messages())
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == count
+        assert header(file) == HEADER
+    for file in files[:-1]:
+        assert 6000 < file.stat().st_size < 6000 + 1024 + 6000  # a chunk over its size, and the index
+    assert texts(path) == [
+        "begin",
+        *(
+            "goes on in the next file" if end else f"goes on after {files[i].name}"
+            for i in range(len(files) - 1)
+            for end in (True, False)
+        ),
+        "end",
+    ]
+    assert recover(path, out).lossless
+    assert own(list(read(out))) == items
+    found = info(path)
+    assert [one.file for one in found.segments] == list(found.files)
+    assert sum(one.messages for one in found.segments) == status.written
+    assert all(one.finished for one in found.segments)
+
+
+def test_each_file_is_on_the_disk_before_the_next_is_begun(tmp_path: Path) -> None:
+    class Watched(DiskFile):
+        def __init__(self, path: Path) -> None:
+            super().__init__(path)
+            done.append(f"open {path.name}")
+            self._name = path.name
+
+        def sync(self) -> None:
+            super().sync()
+            done.append(f"sync {self._name}")
+
+        def close(self) -> None:
+            super().close()
+            done.append(f"close {self._name}")
+
+    done: list[str] = []
+    recorder = SyncRecorder(tmp_path / "a.mcap", SMALL, open_file=Watched, clock=Clock())
+    for item in flight(100):
+        recorder.put(*item)
+    recorder.close()
+    names = [f"a{end}.mcap" for end in ("", "-2", "-3")]
+    assert done[: 3 * len(names)] == [f"{word} {name}" for name in names for word in ("open", "sync", "close")]
+
+
+@pytest.mark.fault(29)
+def test_29_disk_full_at_every_operation_loses_nothing_when_files_change(tmp_path: Path) -> None:
+    items = flight(120)
+    number = 0
+    while True:
+        path = tmp_path / f"at{number}" / "flight.mcap"
+        clock, disk = Clock(), Disk({number}.__contains__)
+        recorder = SyncRecorder(path, SMALL, open_file=disk.open, clock=clock)
+        fly(recorder, clock, items)
+        status = recorder.close()
+        if disk.operations <= number:
+            break
+        assert own(list(read(path))) == items, number
+        assert status.ok and status.failures == 1
+        number += 1
+    assert number > 30
+
+
+def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> None:
+    # Else a policy library larger than a file would make each record a file of its own.
+    path = tmp_path / "flight.mcap"
+    library = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) * 100)
+    items = flight(100)
+    items.insert(1, ("/uavctl/library", 6, library))
+    recorder = SyncRecorder(path, SMALL, clock=Clock())
+    for item in items:
+        recorder.put(*item)
+    recorder.close()
+    assert own(list(read(path))) == items
+    assert 2 <= len(segment_files(path)) < 8
+
+
+def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = SyncRecorder(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024, segment_bytes=50_000), clock=clock)
+    record = flight(2)[2]
+
+    def put(count: int) -> None:
+        for _ in range(count):
+            recorder.put(*record)
+
+    put(3000)  # several files
+    tracemalloc.start()
+    try:
+        put(300)
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        put(9000)
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    files = len(recorder.close().segments)
+    assert files > 20
+    assert after - before < 40_000  # a file's name and what its index takes, not its chunks
+    assert peak - before < 200_000
+
+
+def test_an_index_takes_few_bytes_of_memory(tmp_path: Path) -> None:
+    segment = Segment(DiskFile(tmp_path / "a.mcap"), 1024)
+    kinds = [definition(f"/raw/{name}/in") for name in ("a", "b", "c", "d")]
+    tracemalloc.start()
+    try:
+        for number in range(4000):
+            segment.add(Entry(kinds[number % 4], number + 1, number, bytes(400)))
+        grown, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    segment.finish()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert grown / len(summary.chunk_indexes) < 250  # and not a kilobyte of objects
+
+
+@dataclass
+class Room:
+    """A disk whose free space is told."""
+
+    free: int | None = 10_000
+
+    def __call__(self, folder: Path) -> int | None:
+        return self.free
+
+
+def test_the_watch_warns_rests_and_goes_on_with_a_margin() -> None:
+    room = Room()
+    watch = RoomWatch(Path("flights"), room, LOW, STOP)
+    seen = []
+    for room.free in (3000, 2999, 1000, 999, 1500, 2999, None, 3000, 1500):
+        watch.look()
+        seen.append((watch.low, watch.resting))
+    low, rest, well = (True, False), (True, True), (False, False)
+    assert seen == [well, low, low, rest, rest, rest, rest, well, low]
+
+
+@pytest.mark.fault(29)
+def test_29_recording_rests_before_the_disk_is_full_and_goes_on_when_there_is_room(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    items = flight(400)
+    room, clock, disk = Room(), Clock(), Disk()
+    log = LogConfig(chunk_bytes=1024, queue=50, low_bytes=LOW, stop_bytes=STOP)
+    recorder = SyncRecorder(path, log, open_file=disk.open, free=room, clock=clock)
+    fly(recorder, clock, items[:100])
+    assert recorder.status().warning == ""
+    room.free = 2000
+    fly(recorder, clock, items[100:120])
+    status = recorder.status()
+    assert status.ok and "2000 bytes free" in status.warning
+    room.free = 900
+    fly(recorder, clock, items[120:140])
+    status = recorder.status()
+    assert not status.ok and "rests until there are 3000" in status.reason
+    with path.open("rb") as file:  # closed in order
+        summary = make_reader(file, validate_crcs=True).get_summary()
+    assert summary is not None
+    before = disk.operations
+    fly(recorder, clock, items[140:300])
+    assert disk.operations == before  # the disk is left alone, the flight goes on
+    assert recorder.status().waiting == 50
+    room.free = 5000
+    clock.now_s += 1.0
+    fly(recorder, clock, items[300:])
+    final = recorder.close()
+    got = own(list(read(path)))
+    assert got == [item for item in items if item in got]
+    assert got[-90:] == items[-90:]
+    assert len(items) - len(got) == final.dropped == info(path).dropped > 0
+    said = " | ".join(one.text for one in info(path).notes)
+    for text in ("disk gets low: 2000 bytes", "900 bytes free", "after a rest", "disk has room again"):
+        assert text in said
+    assert [one.finished for one in info(path).segments] == [True, True]
+
+
+@pytest.mark.fault(29)
+def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    items = flight(60)
+    room, clock = Room(), Clock()
+    log = LogConfig(chunk_bytes=1024, low_bytes=LOW, stop_bytes=STOP)
+    recorder = SyncRecorder(path, log, free=room, clock=clock)
+    fly(recorder, clock, items[:20])
+    room.free = 0
+    fly(recorder, clock, items[20:])
+    assert len(own(list(read(path)))) < 35
+    status = recorder.close()
+    assert status.ok
+    assert own(list(read(path))) == items
+
+
+@pytest.mark.fault(29)
+def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
+    seen: list[tuple[str, bytes]] = []
+    room, clock = Room(), Clock()
+    looking = Onlookers(Views(), lambda definition, _, data: seen.append((definition.topic, data)))
+    log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
+    recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, onlookers=looking)
+    loaded = load_config("room")
+    recorder.put("/uavctl/header", 0, made_header(loaded, build_design(loaded)))
+    fly(recorder, clock, flight(20)[1:])
+    room.free = 2000
+    fly(recorder, clock, flight(20)[1:])
+    assert recorder.close().ok
+    lines = [Log.FromString(data) for topic, data in seen if topic == LOG]
+    assert [line.level for line in lines if "disk gets low: 2000 bytes free" in line.message] == [Log.WARNING]
+
+
+@pytest.mark.fault(32)
+def test_32_a_flipped_byte_in_a_later_file_is_refused_or_restored(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    items = flight(120)
+    recorder = SyncRecorder(path, SMALL, clock=Clock())
+    for item in items:
+        recorder.put(*item)
+    recorder.close()
+    files = segment_files(path)
+    assert len(files) > 2
+    for file in (files[1], files[-1]):  # each with the header again, an index and a footer
+        data = file.read_bytes()
+        for position in range(0, len(data), 101):
+            file.write_bytes(data[:position] + bytes([data[position] ^ 1 << position % 8]) + data[position + 1 :])
+            with pytest.raises(RecordingError, match=re.escape(file.name)):
+                list(read(path))
+            restored = tmp_path / "restored.mcap"
+            result = recover(path, restored)
+            left = own(list(read(restored)))
+            restored.unlink()
+            assert left == [item for item in items if item in left], position
+            # The chunk with the repeated header has a note of the recorder too, which may be all that is lost.
+            assert result.damage and (left == items or not result.lossless), position
+        file.write_bytes(data)
+    assert own(list(read(path))) == items
+
+
+def test_a_warning_that_cannot_come_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"log\.stop_bytes.*more than log\.low_bytes"):
+        load_config("room", ["log.stop_bytes=40000000"])

@@ -1,0 +1,70 @@
+"""Baselines in the flight core do what they do in a campaign."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from loopback_rig import Memory
+from whatif_rig import PAPER, config_of, far, flown, history
+
+from sim.vehicle import linear_model
+from uavctl.build import build_controller
+from uavctl.campaign.controllers import build, recipe_for
+from uavctl.campaign.setting import problem_of
+from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
+from uavctl.data import Plan, Truth
+from uavctl.smpc.batch import News
+from uavctl.whatif.baseline import BaselineSolver
+from uavctl.whatif.fly import fly
+
+
+@pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
+def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: Kind) -> None:
+    config = config_of(PAPER)
+    spec = ControllerSpec(name=kind, kind=kind)
+    campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
+    recipe = recipe_for(spec, config, campaign, lambda *_: None)
+    solver = BaselineSolver(kind, lambda target: (problem_of(config), build(recipe)))
+    alone, problem = build(recipe), problem_of(config)
+    alone.begin(1)
+    low, high = problem.input_set.bounds
+    acted = np.zeros((1, 0, 2))
+    newest, states = 0, {0: np.array([35.0, -2.0, -20.0, -4.0])}
+    plan = np.zeros((0, 2))
+    for step in range(9):
+        if step in (0, 1, 4):  # news; else silence
+            newest = step
+            states.setdefault(step, states[0] * (1.0 - 0.1 * step))
+            answer = solver.solve(step, states[step], problem.target)
+            assert answer.method == kind and answer.inputs.shape == (config.smpc.horizon, 2)
+            np.testing.assert_allclose(
+                answer.states[1],
+                problem.plant.a @ answer.states[0] + problem.plant.b @ np.clip(answer.inputs[0], low, high),
+            )
+            plan = answer.inputs
+        asked = alone.act(News(step, np.array([newest]), states[newest][np.newaxis], acted))
+        np.testing.assert_allclose(plan[step - newest], asked[0], atol=1e-9)
+        acted = np.concatenate([acted, np.clip(asked, low, high)[:, np.newaxis]], axis=1)
+
+
+def test_a_baseline_flies_and_its_plans_say_so() -> None:
+    config = config_of(PAPER)
+    spec = ControllerSpec(name="lqg", kind="lqg")
+    recipe = recipe_for(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)), lambda *_: None)
+    controller = build_controller(config)
+    solver = BaselineSolver("lqg", lambda target: (problem_of(config), build(recipe)))
+    memory = Memory()
+    fly(
+        history(PAPER),
+        config,
+        dataclasses.replace(controller, solver=solver),
+        linear_model(config.plant),
+        memory,
+        lambda: 0,
+    )
+    assert {plan.method for plan in memory.of(Plan)} == {"lqg"}
+    assert far(memory, flown(PAPER)) > 0.5
+    last = memory.of(Truth)[-1]
+    assert np.abs(last.position_m).max() < 5.0  # it has come to the target all the same

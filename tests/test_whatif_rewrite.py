@@ -1,0 +1,83 @@
+"""A moved position message says what cameras would have said that saw the vehicle there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.mocap import Cameras
+from uavctl.config import load_config
+from uavctl.config.peers import FrameConfig
+from uavctl.config.sim import CameraConfig
+from uavctl.data import Vec3
+from uavctl.frames import Quaternion
+from uavctl.whatif.rewrite import Axes
+
+FRAMES = [
+    FrameConfig(),
+    FrameConfig(convention="enu", origin_m=(1.0, -2.0, 0.5), yaw_deg=0.0),
+    FrameConfig(convention="enu", origin_m=(1.0, -2.0, 0.5), yaw_deg=37.0),
+    FrameConfig(convention="ned", origin_m=(0.0, 3.0, 0.0), yaw_deg=-120.0),
+]
+HERE: tuple[Vec3, Vec3] = (1.25, -0.5, -1.0), (0.5, -0.25, 0.125)
+BY: tuple[Vec3, Vec3] = (0.7, 1.1, -0.3), (-0.4, 0.2, 0.9)
+THERE: tuple[Vec3, Vec3] = tuple(tuple(np.add(a, b).tolist()) for a, b in zip(HERE, BY, strict=True))  # type: ignore[assignment]
+TURNED: Quaternion = (math.cos(0.4), 0.0, math.sin(0.4) * 0.6, math.sin(0.4) * 0.8)
+
+
+def said(camera: CameraConfig, frame: FrameConfig, where: tuple[Vec3, Vec3]) -> bytes:
+    found = Cameras(camera, frame, np.random.SeedSequence(1), 0).capture(*where, TURNED)
+    assert found is not None
+    return found[1]
+
+
+def camera_of(message: str) -> CameraConfig:
+    camera = load_config("room").sim.camera
+    return CameraConfig(rate_hz=camera.rate_hz, message=message)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=["ned", "enu", "enu-turned", "ned-turned"])
+@pytest.mark.parametrize("message", ["vision", "vicon", "mocap", "odometry"])
+def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
+    camera, axes = camera_of(message), Axes(frame)
+    (seen,) = axes.seen(said(camera, frame, HERE))
+    np.testing.assert_allclose(seen.position_m, HERE[0], atol=1e-6)
+    moved = axes.moved(seen, *BY)
+    expected = said(camera, frame, THERE)
+    mav = mavlink.MAVLink(None)
+    mine, theirs = (mav.decode(bytearray(one)) for one in (moved, expected))
+    assert mine.get_type() == theirs.get_type() and moved[:10] == expected[:10]  # length, number, sender
+    for name in mine.fieldnames:
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), atol=2e-6, err_msg=name)
+    (again,) = axes.seen(moved)
+    np.testing.assert_allclose(again.position_m, THERE[0], atol=2e-6)
+
+
+@pytest.mark.parametrize("message", ["vision", "odometry"])
+def test_a_stamp_is_replaced(message: str) -> None:
+    axes = Axes(FrameConfig())
+    (seen,) = axes.seen(said(camera_of(message), FrameConfig(), HERE))
+    moved = axes.moved(seen, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
+    (again,) = axes.seen(moved)
+    assert again.position.stamp_us == 123_456_789 and again.position_m == seen.position_m
+
+
+def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version() -> None:
+    mav = mavlink.MAVLink(None, 1, 1)
+    mav.seq = 77
+    frame = FRAMES[2]
+    message = mavlink.MAVLink_local_position_ned_message(5000, 1.0, 2.0, -3.0, 0.5, 0.0, 0.0)
+    axes = Axes(frame)
+    (seen,) = axes.seen(bytes(message.pack(mav, force_mavlink1=True)))
+    moved = axes.moved(seen, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
+    assert moved[0] == 0xFE and moved[2] == 77
+    found = mavlink.MAVLink(None).decode(bytearray(moved))
+    assert (found.x, found.y, found.z, found.vx, found.vy, found.time_boot_ms) == (1.5, 2.0, -2.75, 0.5, 1.0, 7000)
+
+
+def test_what_is_no_position_is_not_seen() -> None:
+    beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
+    assert list(Axes(FrameConfig()).seen(bytes(beat) + b"\xfd\x00garbage")) == []

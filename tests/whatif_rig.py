@@ -1,0 +1,60 @@
+"""Flights in memory, and what might have been in their place."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from loopback_rig import Memory, header, lockstep
+
+from sim.vehicle import linear_model
+from uavctl.build import build_controller, build_design
+from uavctl.config import Config, load_config
+from uavctl.data import Record, Truth
+from uavctl.whatif.fly import Course, OtherLink, fly
+from uavctl.whatif.history import Entry, History, history_of
+
+EXACT = ("solver.method=exact",)
+PAPER = ("paper", 20.0, EXACT)
+ROOM = ("room", 8.0, EXACT)
+QUADROTOR = ("room", 8.0, (*EXACT, "sim.plant=quadrotor"))
+Case = tuple[str, float, tuple[str, ...]]
+# Positions and setpoints cross MAVLink as float32, in one order of rounding here and in another there.
+WIRE = 1e-5
+
+
+def config_of(case: Case, *changes: str) -> Config:
+    name, duration_s, overrides = case
+    return load_config(name, [f"duration_s={duration_s}", *overrides, *changes])
+
+
+@cache
+def flown(case: Case, *changes: str) -> Memory:
+    name, duration_s, overrides = case
+    return lockstep(name, duration_s, *overrides, *changes)
+
+
+@cache
+def history(case: Case) -> History:
+    return history_of(flown(case).entries, config_of(case), "recording")
+
+
+def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, Course]:
+    config, memory = config_of(case, *changes), Memory()
+    memory.put("/uavctl/header", 0, header(config, build_design(config)))
+    model = linear_model(config_of(case).plant)
+    course = fly(history(case), config, build_controller(config), model, memory, lambda: 0, other)
+    return memory, course
+
+
+def far(some: Memory, others: Memory) -> float:
+    """Largest difference of the true states, and of the inputs that acted."""
+    left, right = some.of(Truth), others.of(Truth)
+    assert [one.at_ns for one in left] == [one.at_ns for one in right]
+    states = np.array([one.state for one in left]) - np.array([one.state for one in right])
+    inputs = np.array([one.input for one in left]) - np.array([one.input for one in right])
+    return float(max(np.abs(states).max(), np.abs(inputs).max()))
+
+
+def stripped(case: Case, kind: type[Record]) -> list[Entry]:
+    return [entry for entry in flown(case).entries if not isinstance(entry[2], kind)]

@@ -1,0 +1,98 @@
+"""What may happen to a recording, done to it many times.
+
+`python tools/storage.py --scenario kill --runs 1000`: recording processes, fed faster than real time, are killed
+(SIGKILL) at random moments; what they left is recovered, and compared record by record with what was put. Nothing but
+the open chunk may be lost, beside what the writing thread had not yet taken from its queue.
+`python tools/storage.py --scenario flip`: each byte of a small recording, finished and torn, is flipped. It must be
+refused, or recovered, and never give a wrong value, nor a recovered file whose index or statistics are wrong.
+
+Exit code 1 where something was wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the process is forked, so it may have no threads
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
+from flip_rig import Flips  # the tests' own
+from kill_rig import KINDS, LOG, Killed, kill_once, truth
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do it, and say whether all was well."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", choices=("kill", "flip"), default="kill")
+    parser.add_argument("--runs", type=int, default=1000, help="kills")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first kill")
+    parser.add_argument("--json", action="store_true", help="figures as JSON, one document")
+    given = parser.parse_args(arguments)
+    if given.runs < 1 or given.first < 0:
+        parser.error("give at least one run, and a first seed of 0 or more")
+    begun = time.monotonic()
+    wrong, report = _flips() if given.scenario == "flip" else _kills(given.first, given.runs)
+    document = {**report, "wrong": wrong, "wall_s": round(time.monotonic() - begun, 1)}
+    sys.stdout.write(json.dumps(document, indent=None if given.json else 2) + "\n")
+    return 1 if wrong else 0
+
+
+def _kills(first: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
+    items = truth()
+    found: list[Killed] = []
+    for seed in range(first, first + runs):
+        with tempfile.TemporaryDirectory(prefix="uavctl-kill-") as folder:
+            found.append(kill_once(Path(folder), KINDS[seed % len(KINDS)], seed, items))
+        _tell(f"{len(found)} of {runs}")
+    report = {kind: _figures([one for one in found if one.kind == kind]) for kind in KINDS}
+    wrong = {str(first + number): one.wrong for number, one in enumerate(found) if one.wrong}
+    return wrong, {"runs": runs, "chunk_bytes": LOG.chunk_bytes, **report}
+
+
+def _figures(found: Sequence[Killed]) -> dict[str, int]:
+    """Sums and extremes of the runs of one kind."""
+    return {
+        "runs": len(found),
+        "before_the_first_chunk": sum(not one.kept for one in found),
+        "records_put": sum(one.put for one in found),
+        "records_kept": sum(one.kept for one in found),
+        "most_lost_bytes": max((one.lost_bytes for one in found), default=0),
+        "most_queued_records": max((one.queued for one in found), default=0),
+        "most_files": max((one.files for one in found), default=0),
+    }
+
+
+def _flips() -> tuple[dict[str, str], dict[str, object]]:
+    wrong: dict[str, str] = {}
+    report: dict[str, object] = {}
+    for state in ("finished", "torn"):
+        with tempfile.TemporaryDirectory(prefix="uavctl-flip-") as folder:
+            flips = Flips(Path(folder), finished=state == "finished")
+            refused = 0
+            for position in range(len(flips.data)):
+                _tell(f"{state}: {position} of {len(flips.data)}")
+                flips.flip(position, 1 << position % 8)
+                try:
+                    refused += flips.read()
+                    flips.look()
+                    flips.recover()
+                except AssertionError as error:
+                    wrong[f"{state}, byte {position}"] = repr(error)
+            report[state] = {"bytes": len(flips.data), "refused": refused}
+    return wrong, report
+
+
+def _tell(text: str) -> None:
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r{text} ")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

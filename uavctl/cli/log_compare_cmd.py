@@ -1,0 +1,87 @@
+"""`uavctl log compare`: recordings beside each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from logs.compare import Comparison, compare
+from logs.compare_page import write_page
+from logs.compare_side import Side, load_all
+from logs.compare_words import difference, label, likeness, measured, parameter
+from uavctl.cli.common import Common, messages
+from uavctl.cli.wide_table import Column, WideTable
+
+
+def compare_command(
+    first: Annotated[Path, Parameter(help="the recording that the others are compared with")],
+    second: Annotated[Path, Parameter(help="another one")],
+    /,
+    *more: Annotated[Path, Parameter(help="and more")],
+    out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
+    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+) -> int:
+    """Put flights beside each other: parameters that differ, figures, and where they part."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        paths = (first, second, *more)
+        task = progress.add_task("reading", total=len(paths))
+        loaded = load_all(paths, lambda: progress.advance(task))
+        progress.update(task, description="comparing")
+        found = compare(loaded)
+    if out is not None:
+        write_page(found, loaded, out)
+    Common(json=json).show(found, lambda: comparison_picture(found))
+    return 0
+
+
+def comparison_picture(found: Comparison) -> RenderableType:
+    """What is compared, how far it is the same, parameters, figures, and what to mind."""
+    parts: list[RenderableType] = [_sides(found.recordings)]
+    parts += [Text(text) for text in map(likeness, found.likenesses)]
+    parts.append(_parameters(found) if found.parameters else Text("No parameter differs."))
+    parts.append(_figures(found))
+    parts += [Text(f"Mind: {text}.", style="yellow") for text in found.notes]
+    return Group(*parts)
+
+
+def _sides(sides: tuple[Side, ...]) -> RenderableType:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for one in sides:
+        state = "" if one.finished else ", torn"
+        made = f"config {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
+        table.add_row(one.name, Text(f"{one.recording}\n{made}"))
+    return table
+
+
+def _parameters(found: Comparison) -> Table:
+    table = Table(title="Parameters that differ", title_justify="left")
+    for name in ("", *(one.name for one in found.recordings)):
+        table.add_column(name, overflow="fold")
+    for one in found.parameters:
+        table.add_row(Text(one.key), *(Text(parameter(value)) for value in one.values))
+    return table
+
+
+def _figures(found: Comparison) -> WideTable:
+    rows = found.figures
+    first, *others = (one.name for one in found.recordings)
+    groups = [[Column(first, [measured(row.values[0]) for row in rows])]]
+    for place, name in enumerate(others):
+        groups.append(
+            [
+                Column(name, [measured(row.values[place + 1]) for row in rows]),
+                Column(f"{name} − {first}", [difference(row.differences[place]) for row in rows]),
+                Column(f"{name} / {first}", [measured(row.ratios[place]) for row in rows]),
+            ]
+        )
+    ends = frozenset(place for place in range(len(rows) - 1) if rows[place].group != rows[place + 1].group)
+    return WideTable(Column("figure", list(map(label, rows)), "left"), groups, ends)

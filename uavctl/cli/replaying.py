@@ -1,0 +1,117 @@
+"""The replay of a recording of ours from its file alone, as recorded or with another configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from logs.reader import finished, header, read, records
+from logs.replay import MAKERS, ReplayResult
+from logs.replay import replay as replay_recording
+from logs.topics import RecorderNote
+from uavctl.cli.flying import cpu, versions
+from uavctl.cli.recorded import changed_flyer, recorded_flyer
+from uavctl.config.load import parse
+from uavctl.data import Header
+from uavctl.errors import RecordingError, UsageError
+from uavctl.loop import ControlLoop, make_links
+
+
+class Changed(msgspec.Struct, frozen=True, kw_only=True):
+    """A key of the configuration that is another one in the replay."""
+
+    key: str
+    recorded: str
+    replayed: str
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A replay and what has to be known of its recording.
+
+    Attributes:
+        result: What it found.
+        finished: Whether the recording was closed in order.
+        changed: What was asked to be different.
+        other_versions: What decides the last bits, and is not here what the recording was made with.
+    """
+
+    result: ReplayResult
+    finished: bool
+    changed: tuple[Changed, ...]
+    other_versions: tuple[str, ...]
+
+
+def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str] = ()) -> Replayed:
+    """Drive the recorded inputs through a new control loop of the recorded configuration.
+
+    Args:
+        flight: The recording, its first file if there are several.
+        tolerance: See `logs.replay.replay`.
+        overrides: `key=value`, as for a flight: what is to be another value than in the recording.
+
+    Raises:
+        RecordingError: It cannot be read, is only a later file of one, or carries not what it was flown with.
+        ConfigError: An override does not fit, or leaves no design.
+        UsageError: An override changes over which connections the bytes came.
+    """
+    check_first(flight)
+    recorded = header(flight)
+    name = f"{flight} (configuration)"
+    config = parse(recorded.config_toml, name).config
+    if overrides:
+        loaded = parse(recorded.config_toml, name, overrides)
+        if make_links(loaded.config).keys() != make_links(config).keys():
+            raise UsageError(
+                "daemon.vehicle and daemon.mocap say over which connections the recorded bytes came; leave them as "
+                "they are"
+            )
+        controller = changed_flyer(flight, config, loaded).controller
+        changed = tuple(_changes(msgspec.to_builtins(config), msgspec.to_builtins(loaded.config), ""))
+        config = loaded.config
+    else:
+        controller, changed = recorded_flyer(flight, config).controller, ()
+    whole = finished(flight)
+    result = replay_recording(
+        read(flight),
+        lambda sink: ControlLoop(config, controller, sink, lambda: 0),
+        tolerance,
+        finished=whole,
+        ignored=MAKERS if overrides else frozenset(),
+    )
+    return Replayed(result, whole, changed, tuple(other_versions(recorded)))
+
+
+def check_first(flight: Path) -> None:
+    """A later file alone has neither the first ticks nor what they left behind."""
+    note = next(records(flight, RecorderNote), None)
+    if note is None or note.segment == 1:
+        return
+    if not flight.exists():
+        raise RecordingError(f"{flight}: is missing, and a recording can be replayed from its beginning only")
+    first = flight.with_name(f"{flight.stem.removesuffix(f'-{note.segment}')}{flight.suffix}")
+    raise RecordingError(
+        f"{flight}: is file {note.segment} of a recording, which can be replayed from its beginning only; "
+        f"give the first one, {first}, with the others beside it"
+    )
+
+
+def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
+    """Keys of two configurations that differ."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in dict.fromkeys([*before, *now]):
+            yield from _changes(before.get(name), now.get(name), f"{key}.{name}" if key else str(name))
+    elif before != now:
+        yield Changed(key=key, recorded=str(before), replayed=str(now))
+
+
+def other_versions(recorded: Header) -> Iterator[str]:
+    """What decides a flight's last bits and is not what the recording was made with: code, libraries, CPU type."""
+    here = {**versions(), "cpu": cpu()}
+    there = {**recorded.versions, "cpu": recorded.cpu}
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
+            yield f"recorded with {name} {there.get(name, 'unknown')}, here is {here.get(name, 'none')}"

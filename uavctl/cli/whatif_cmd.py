@@ -1,0 +1,222 @@
+"""`uavctl log whatif`: a recorded flight flown by another controller, schedule or link."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from cyclopts import Parameter
+from numpy.typing import NDArray
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from logs.disk import check_room
+from logs.flight_data import FlightData
+from logs.foreign import is_foreign
+from logs.info import info as recording_info
+from logs.journal import RecorderStatus
+from logs.onlookers import Onlookers
+from logs.reader import header, read
+from logs.recorder import SyncRecorder
+from logs.summary import summarise
+from logs.topics import HEADER
+from logs.views import Views
+from sim.vehicle import LinearModel
+from uavctl.campaign.spec import Kind
+from uavctl.cli.common import Common, messages
+from uavctl.cli.flying import conclude, put_header, recording_path
+from uavctl.cli.prepare import Prepared
+from uavctl.cli.recorded import changed_flyer, recorded_flyer
+from uavctl.cli.replaying import check_first, other_versions
+from uavctl.cli.whatif_config import baseline_flyer, changed, model_of
+from uavctl.config.link import LinkConfig
+from uavctl.config.load import parse
+from uavctl.data import Header, Record
+from uavctl.errors import UsageError
+from uavctl.whatif.compare import WhatIf, departure_m, model_fit, reproduction, until
+from uavctl.whatif.fly import Course, OtherLink, fly
+from uavctl.whatif.history import Entry, History, history_of
+from uavctl.whatif.other_link import Relinked
+from uavctl.whatif.page import HEADINGS, side_by_side, story, write_page
+
+RECORDED, CONFIGURED = "recorded", "configured"
+
+
+def whatif(
+    flight: Annotated[Path, Parameter(help="the recording")],
+    /,
+    *,
+    config: Annotated[str | None, Parameter(help="preset or TOML file in place of the recorded configuration")] = None,
+    overrides: Annotated[
+        tuple[str, ...],
+        Parameter(name="--set", negative=(), metavar="KEY=VALUE", help="change one key; may be repeated"),
+    ] = (),
+    controller: Annotated[Kind, Parameter(help="who flies: the SMPC, or one of a campaign's baselines")] = "smpc",
+    link: Annotated[
+        tuple[str, ...],
+        Parameter(
+            negative=(),
+            metavar="recorded|configured|KEY=VALUE",
+            help="how positions come: as recorded; over a simulated link as [link] says; or over that with a key of it "
+            "changed, as in loss=0.5, which the design does not know; may be repeated. Else as recorded, unless --set "
+            "changes a key of link",
+        ),
+    ] = (),
+    seed: Annotated[int | None, Parameter(help="seed of a simulated link; else the recorded sim.seed")] = None,
+    model: Annotated[
+        Path | None, Parameter(help="TOML file whose [plant] answers to other setpoints, as of `uavctl identify`")
+    ] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+) -> int:
+    """Fly a recorded flight again with something changed, in the same disturbance, and compare.
+
+    The recorded inputs of the control loop come again at their times; positions are moved by as much as the vehicle,
+    by its model, would have been elsewhere. docs/what-if.md says what that can tell, and what not.
+    """
+    if flight.suffix == ".tlog" or is_foreign(flight):
+        raise UsageError(
+            f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
+            "`uavctl identify` read it"
+        )
+    over = _link(link, overrides)
+    if seed is not None and over == RECORDED:
+        raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
+    check_first(flight)
+    recorded = header(flight)
+    before = parse(recorded.config_toml, f"{flight} (configuration)").config
+    loaded = changed(before, recorded.config_toml, flight, config, overrides)
+    keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
+    on = changed(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link
+    answers, source = model_of(model, before)
+    _warn(flight, recorded)
+    history = history_of(read(flight), before, str(flight))
+    was = recorded_flyer(flight, before)
+    if controller == "smpc":
+        now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
+    else:
+        now = baseline_flyer(loaded, controller, _start(history))
+    path = recording_path(out, loaded.config.name)
+    check_room(path, before.log.free_bytes)
+    other = None if over == RECORDED else _relinked(history, on, seed)
+    begun = time.perf_counter()
+    with messages().status("flying the recording again"):
+        again = _reproduced(history, was, answers)
+        course, status = _recorded(history, now, answers, other, path, recorded)
+    conclude(path, time.perf_counter() - begun, status)
+    given = (
+        *((f"--config {config}",) if config else ()),
+        *overrides,
+        *((f"--seed {seed}",) if seed is not None else ()),
+    )
+    sides = [
+        FlightData.from_records(until(entries, course.end_ns))
+        for entries in (history.entries, again, tuple(read(path)))
+    ]
+    result = WhatIf(
+        flight=str(flight),
+        reproduction=reproduction(sides[0], sides[1]),
+        model=model_fit(history, answers, source),
+        controller=controller,
+        link=over,
+        changed=given,
+        compared_s=(course.end_ns - sides[0].origin_ns + sides[0].tick_ns) * 1e-9,
+        ended=course.ended,
+        largest_departure_m=departure_m(sides[0], sides[2]),
+        recorded=summarise(sides[0], wall_s=None),
+        reproduced=summarise(sides[1], wall_s=None),
+        what_if=summarise(sides[2], wall_s=None),
+        recording=str(path),
+        report=str(path.with_suffix(".html")),
+        page=str(path.with_name("what-if.html")),
+    )
+    _write(Path(result.page), write_page(result, sides[0], sides[2]))
+    Common(json=json).show(result, lambda: _picture(result))
+    return 0 if result.what_if.steps else 1
+
+
+def _warn(flight: Path, recorded: Header) -> None:
+    """Say why the reproduction may not be exact."""
+    whole = recording_info(flight)
+    texts = [f"{text}: decisions may differ" for text in other_versions(recorded)]
+    if whole.missing or whole.dropped:
+        texts.append(f"{whole.missing + whole.dropped} records are missing in the recording")
+    if not whole.finished:
+        texts.append("the recording is torn: flown up to its end")
+    for text in texts:
+        messages().print(text, style="yellow", markup=False, soft_wrap=True)
+
+
+def _start(history: History) -> NDArray[np.float64]:
+    """State (n_x,) in which the recorded flight began, as far as it is known."""
+    flight = history.flight
+    return np.array(flight.truths[0].state if flight.truths else flight.estimates[0].mean)
+
+
+def _link(given: tuple[str, ...], overrides: tuple[str, ...]) -> str:
+    """What the link is called that positions come over."""
+    words = [text for text in given if "=" not in text]
+    if not given:
+        return CONFIGURED if any(text.strip().startswith("link.") for text in overrides) else RECORDED
+    if (len(given) > 1 and words) or not set(words) <= {RECORDED, CONFIGURED}:
+        typed = " --link ".join(given)
+        raise UsageError(f"--link {typed}: give `{RECORDED}` or `{CONFIGURED}` alone, or KEY=VALUE, as in loss=0.5")
+    return words[0] if words else ", ".join(given)
+
+
+def _relinked(history: History, link: LinkConfig, seed: int | None) -> Relinked:
+    """Another link for the positions of a recording."""
+    simulated, before = bool(history.flight.truths), history.config
+    noise_m = before.sim.camera.noise_std_m if simulated else before.estimator.position_std_m
+    return Relinked(history, link, before.sim.seed if seed is None else seed, noise_m)
+
+
+class _Memory:
+    """A sink that keeps everything, in order."""
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        self.entries.append((topic, at_ns, record))
+
+
+def _reproduced(history: History, was: Prepared, model: LinearModel) -> tuple[Entry, ...]:
+    """The recorded flight again, nothing changed."""
+    memory = _Memory()
+    memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
+    fly(history, was.config, was.controller, model, memory, lambda: 0)
+    return tuple(memory.entries)
+
+
+def _recorded(
+    history: History, now: Prepared, model: LinearModel, other: OtherLink | None, path: Path, recorded: Header
+) -> tuple[Course, RecorderStatus]:
+    """Fly what was changed, and record it."""
+    recorder = SyncRecorder(path, now.config.log, onlookers=Onlookers(Views()))
+    try:
+        put_header(recorder, now, recorded.started_ns)
+        course = fly(history, now.config, now.controller, model, recorder, time.perf_counter_ns, other)
+    finally:
+        status = recorder.close()
+    return course, status
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+
+
+def _picture(result: WhatIf) -> RenderableType:
+    table = Table()
+    for heading in HEADINGS:
+        table.add_column(heading, overflow="fold")
+    for row in side_by_side(result):
+        table.add_row(*map(Text, row))
+    places = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
+    return Group(*map(Text, story(result)), table, *map(Text, places))

@@ -1,0 +1,1 @@
+"""A recorded flight flown by another controller, schedule or link: what would have been."""

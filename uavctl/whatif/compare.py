@@ -1,0 +1,158 @@
+"""What a what-if is worth, and its figures: the recorded flight, the same reproduced, the one that might have been."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from logs.encoding import encode
+from logs.flight_data import FlightData
+from logs.summary import FlightSummary
+from sim.vehicle import LinearModel
+from uavctl.data import Decision, Estimate, Plan, Record, Setpoint, Truth
+from uavctl.whatif.history import Entry, History
+
+Array = NDArray[np.float64]
+AHEAD_S = 1.0
+_COMPARED = (Decision, Plan, Setpoint)
+R = TypeVar("R", bound=Record)
+
+
+class Reproduction(msgspec.Struct, frozen=True, kw_only=True):
+    """The recorded flight flown again with nothing changed, beside the recorded one: what is not ours shows here."""
+
+    identical: bool  # every plan, decision and setpoint, bit for bit
+    decisions: int  # compared
+    largest_state: float  # difference at a tick [m, m/s, m/s²]
+    largest_input: float  # difference of inputs as decided [input units]
+
+
+class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
+    """How well the model tells the recorded flight: what it does not is disturbance, or an error of the model."""
+
+    source: str
+    ahead_s: float
+    moves: int  # that were predicted: from each boundary, under the setpoints flown
+    r2: float | None  # share of their variance that was predicted, over all axes; None with fewer than two
+    rms_m: float | None  # of what was not
+
+
+class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
+    """A recorded flight, and what might have been; field names are the keys of `--json`."""
+
+    flight: str
+    reproduction: Reproduction
+    model: ModelFit
+    controller: str
+    link: str  # "recorded", "configured": simulated from [link], or the keys that were changed for what is flown alone
+    changed: tuple[str, ...]  # as they were given
+    compared_s: float  # up to here both can be told
+    ended: str  # why not further
+    largest_departure_m: float  # of the position, from the recorded one
+    recorded: FlightSummary  # up to compared_s, as the others
+    reproduced: FlightSummary
+    what_if: FlightSummary
+    recording: str  # of the flight that might have been
+    report: str
+    page: str
+
+
+def until(entries: Iterable[Entry], end_ns: int) -> list[Entry]:
+    """The part of a recording up to a tick, that included [ns]."""
+    return [entry for entry in entries if entry[1] <= end_ns]
+
+
+def reproduction(recorded: FlightData, again: FlightData) -> Reproduction:
+    """How a flight that should be the recorded one compares with it."""
+    return Reproduction(
+        identical=all(_same(_of(recorded, kind), _of(again, kind)) for kind in _COMPARED),
+        decisions=len(recorded.decisions),
+        largest_state=max(
+            _largest({one.at_ns: one.state for one in flight.truths} for flight in (recorded, again)),
+            _largest({one.at_ns: one.mean for one in flight.estimates} for flight in (recorded, again)),
+        ),
+        largest_input=_largest(
+            {one.at_ns: one.input for one in flight.decisions if one.input is not None} for flight in (recorded, again)
+        ),
+    )
+
+
+def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
+    """Predict the motion of the next second from each boundary of the recorded flight.
+
+    From the true states where they are known, else from the estimates; in stretches without a setpoint nothing is.
+
+    Args:
+        history: The recorded flight.
+        model: The model, of as many states as the recorded plant.
+        source: What it is called.
+    """
+    flight = history.flight
+    known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
+    states = {one.at_ns: np.array(one.state if isinstance(one, Truth) else one.mean) for one in known}
+    steps = max(1, round(AHEAD_S * 1e9 / model.dt_ns))
+    ahead_ns = steps * model.dt_ns
+    boundaries = [
+        d.at_ns for d in flight.decisions if d.boundary and d.at_ns in states and d.at_ns + ahead_ns in states
+    ]
+    moved, told = [], []
+    for at_ns in boundaries:
+        predicted = _predicted(history, model, states[at_ns], at_ns, at_ns + ahead_ns)
+        if predicted is not None:
+            index = list(model.position_index)
+            moved.append((states[at_ns + ahead_ns] - states[at_ns])[index])
+            told.append((predicted - states[at_ns])[index])
+    rest = np.array(moved) - np.array(told)
+    spread = float(np.sum(np.square(np.array(moved) - np.mean(moved, axis=0)))) if len(moved) > 1 else 0.0
+    return ModelFit(
+        source=source,
+        ahead_s=ahead_ns * 1e-9,
+        moves=len(moved),
+        r2=1.0 - float(np.sum(np.square(rest))) / spread if spread > 0.0 else None,
+        rms_m=float(np.sqrt(np.mean(np.sum(np.square(rest), axis=1)))) if moved else None,
+    )
+
+
+def _predicted(history: History, model: LinearModel, x: Array, begin_ns: int, end_ns: int) -> Array | None:
+    """State at the end under the setpoints that were flown; None if any was not."""
+    tick_ns = max(1, history.flight.tick_ns)
+    for at_ns in range(begin_ns, end_ns, tick_ns):
+        accel = history.setpoints.get(at_ns)
+        if accel is None or not history.taken.get(at_ns, False):
+            return None
+        u = np.array([accel[axis] for axis in model.axes]) / model.accel_per_input
+        a, b, _ = model.transition(min(tick_ns, end_ns - at_ns))
+        x = a @ x + b @ u
+    return x
+
+
+def departure_m(recorded: FlightData, other: FlightData) -> float:
+    """Largest distance between two flights at a boundary: of the true states if known, else of the estimates [m]."""
+    index = list(recorded.design.position_index)
+    sides = [
+        {one.at_ns: np.array(one.state)[index] for one in flight.truths}
+        if recorded.truths
+        else {one.at_ns: np.array(one.mean)[index] for one in flight.estimates}
+        for flight in (recorded, other)
+    ]
+    common = sides[0].keys() & sides[1].keys()
+    return max((float(np.linalg.norm(sides[1][at_ns] - sides[0][at_ns])) for at_ns in common), default=0.0)
+
+
+def _of(flight: FlightData, kind: type[Record]) -> tuple[Record, ...]:
+    return {Decision: flight.decisions, Plan: flight.plans, Setpoint: flight.setpoints}[kind]
+
+
+def _same(some: tuple[Record, ...], others: tuple[Record, ...]) -> bool:
+    return len(some) == len(others) and all(encode(a) == encode(b) for a, b in zip(some, others, strict=True))
+
+
+def _largest(sides: Iterable[dict[int, tuple[float, ...]]]) -> float:
+    """Largest difference of vectors of the same time."""
+    some, others = sides
+    gaps = (np.abs(np.array(some[at]) - np.array(others[at])).max(initial=0.0) for at in some.keys() & others.keys())
+    return max(map(float, gaps), default=0.0)

@@ -1,0 +1,196 @@
+"""A recording's inputs through a control loop, its positions moved to where that would have brought the vehicle."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from msgspec.structs import replace
+
+from sim.vehicle import LinearModel
+from uavctl.config import Config
+from uavctl.data import Datagram, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3
+from uavctl.flight.controller import Controller
+from uavctl.loop import MOCAP, VEHICLE, ControlLoop
+from uavctl.whatif.departure import Departure
+from uavctl.whatif.history import History
+from uavctl.whatif.rewrite import Axes
+
+TRUTH = "/sim/truth"
+# As in identification: without setpoints for longer than this, the vehicle does as it likes.
+LONGEST_PAUSE_NS = 500_000_000
+_WHOLE = "the recording ends"
+
+
+class OtherLink(Protocol):
+    """A link that positions come over in place of the recorded one."""
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Positions sent so far, and how many of them were lost."""
+        ...
+
+    def due(self, to_ns: int, departure: Departure) -> list[tuple[int, bytes]]:
+        """What arrives up to and including `to_ns`, as (arrival [ns], bytes)."""
+        ...
+
+
+@dataclass
+class Course:
+    """How a flight went, as far as it can be told.
+
+    Attributes:
+        departure: From the recorded one.
+        end_ns: Tick up to which both were flown on setpoints [ns].
+        ended: Why not further.
+    """
+
+    departure: Departure
+    end_ns: int = 0
+    ended: str = _WHOLE
+
+
+def fly(
+    history: History,
+    config: Config,
+    controller: Controller,
+    model: LinearModel,
+    sink: Sink,
+    stopwatch: Callable[[], int],
+    other: OtherLink | None = None,
+) -> Course:
+    """Fly a recorded flight otherwise.
+
+    Args:
+        history: The recorded flight.
+        config: What flies in it now; connections, frame and source are those of the recording.
+        controller: Its controller.
+        model: How the vehicle answers to setpoints that differ from the recorded ones.
+        sink: Gets what a recording of this flight holds, but for its header.
+        stopwatch: Time for the timing records [ns].
+        other: The link that positions come over; else they come when they came.
+    """
+    tap = _Tap(sink)
+    loop = ControlLoop(config, controller, tap, stopwatch)
+    flight = _Flight(history, loop, tap, Course(Departure(model)), other)
+    for _, _, record in history.entries:
+        if isinstance(record, StepInput):
+            flight.tick(record)
+        elif isinstance(record, Datagram) and not record.outgoing:
+            flight.arrive(record)
+        elif isinstance(record, Refused):
+            loop.refused(record.link, record.counts, record.at_ns)
+        elif isinstance(record, Truth):
+            flight.truths.append(record)
+        if flight.over:
+            break
+    else:
+        flight.tell(max((truth.at_ns for truth in flight.truths), default=0))
+    return flight.course
+
+
+class _Tap:
+    """A sink that notes the setpoint of the tick."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self.setpoint: Vec3 | None = None
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        if isinstance(record, Setpoint):
+            self.setpoint = record.accel_mps2
+        self._sink.put(topic, at_ns, record)
+
+
+class _Flight:
+    """One flight in progress."""
+
+    def __init__(self, history: History, loop: ControlLoop, tap: _Tap, course: Course, other: OtherLink | None) -> None:
+        self._history, self._loop, self._tap, self._other = history, loop, tap, other
+        self.course = course
+        self.truths: deque[Truth] = deque()  # of boundaries whose tick may not have run
+        self.over = False
+        daemon = history.config.daemon
+        self._positions_link = VEHICLE if daemon.vehicle == daemon.mocap else MOCAP
+        self._axes = Axes(history.config.frame)
+        self._begun = False
+        self._apart_ns: int | None = None  # since when one of the two is not flown on setpoints
+
+    def arrive(self, record: Datagram) -> None:
+        """Let a recorded datagram come, its positions moved, or taken out where another link carries them."""
+        data = self._moved(record.data, record.at_ns)
+        if data or not record.data:
+            self._loop.receive(record.link, data, record.at_ns)
+
+    def tick(self, record: StepInput) -> None:
+        """Decide, and let the vehicle answer to what is decided otherwise."""
+        at_ns = record.at_ns
+        if self._other is not None:
+            for arrival_ns, data in self._other.due(at_ns, self.course.departure):
+                self._loop.receive(self._positions_link, data, arrival_ns)
+        for command in record.commands:
+            self._loop.order(command)
+        self._tap.setpoint = None
+        deque(self._loop.tick(record.tick, at_ns, record.missed_ticks, record.stop), maxlen=0)
+        self._loop.timing(record.tick, at_ns, lateness_ns=0, send_ns=0)
+        self._steer(at_ns)
+        self.tell(at_ns)
+
+    def tell(self, to_ns: int) -> None:
+        """Put down where the vehicle would have been at the boundaries up to `to_ns`."""
+        departure = self.course.departure
+        while self.truths and self.truths[0].at_ns <= to_ns:
+            told = self.truths.popleft()
+            at_ns = told.at_ns
+            if departure.begun_ns is not None:
+                told = replace(
+                    told,
+                    position_m=_plus(told.position_m, departure.position_m(at_ns)),
+                    velocity_mps=_plus(told.velocity_mps, departure.velocity_mps(at_ns)),
+                    state=tuple((np.array(told.state) + departure.state(at_ns)).tolist()),
+                    input=tuple((np.array(told.input) + departure.input(at_ns)).tolist()),
+                )
+            if self._other is not None:
+                sent, lost = self._other.counts
+                told = replace(told, sent=sent, lost=lost)
+            self._tap.put(TRUTH, at_ns, told)
+
+    def _steer(self, at_ns: int) -> None:
+        course, was, now = self.course, self._history.setpoints.get(at_ns), self._tap.setpoint
+        taken = self._history.taken[at_ns]
+        if was is not None and now is not None and taken:
+            self._begun, self._apart_ns = True, None
+            course.departure.steer(at_ns, (now[0] - was[0], now[1] - was[1], now[2] - was[2]))
+        elif self._begun and self._apart_ns is None:
+            self._apart_ns = at_ns
+            reason = "" if self._loop.decision is None else self._loop.decision.reason
+            course.ended = "no setpoint of the recording flies the vehicle any more" if now is not None else reason
+        if self._apart_ns is None:
+            course.end_ns, course.ended = at_ns, _WHOLE
+        else:
+            self.over = at_ns - self._apart_ns > LONGEST_PAUSE_NS
+
+    def _moved(self, data: bytes, at_ns: int) -> bytes:
+        departure = self.course.departure
+        if self._other is None and departure.begun_ns is None:
+            return data
+        parts: list[bytes] = []
+        done = 0
+        for seen in self._axes.seen(data):
+            captured_ns = self._history.captured_ns(seen, at_ns)
+            if captured_ns is None:
+                continue
+            begin = data.index(seen.frame.data, done)
+            parts.append(data[done:begin])
+            done = begin + len(seen.frame.data)
+            if self._other is None:
+                where, how_fast = departure.position_m(captured_ns), departure.velocity_mps(captured_ns)
+                parts.append(self._axes.moved(seen, where, how_fast))
+        return b"".join((*parts, data[done:]))
+
+
+def _plus(a: Vec3, b: Vec3) -> Vec3:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
