@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 
-.PHONY: fly test test-clients docs clean
+.PHONY: fly test test-clients mutation docs clean
 
 fly: $(STAMP)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -21,8 +21,14 @@ test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVPROXY_PYTHON=$(CURDIR)/$(CLIENTS)/mavproxy/bin/python \
 	$(VENV)/bin/python -m pytest -n 0 tests/clients
 
+# The safety core: every branch is run by its own tests, and every change of it fails one (docs/safety-core.md).
+mutation: $(STAMP)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt cosmic-ray
+	$(VENV)/bin/python tools/mutation.py
+
 docs: $(STAMP)
 	$(VENV)/bin/python tools/check.py --write-docs
+	$(VENV)/bin/python tools/pictures.py
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'

@@ -1,22 +1,48 @@
-"""One cache of policy libraries for a whole test run, and what is collected only when it is asked for by its path."""
+"""One cache of policy libraries for a whole test run, what is collected only when asked for, and in which order."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
+# Half of a run's time. They begin, so that no worker is left alone with one of them in the end.
+LONGEST = (
+    "test_campaign_cmd", "test_report", "test_properties", "test_operation", "test_closed_loop", "test_soak",
+    "test_fly", "test_general_plants", "test_identify", "test_take_off", "test_engagement", "test_bench_loop",
+    "test_sim_quadrotor_peers", "test_late", "test_library_solver", "test_sources",
+)  # fmt: skip
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     # Real clients need interpreters of their own: `make test-clients`.
     asked = any("clients" in argument for argument in config.args)
     return True if collection_path.name == "clients" and not asked else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disk() -> Iterator[None]:
+    """Nothing here cuts the power, and without that nobody can see whether a file has reached the disk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For flights whose page nobody reads: drawing one takes longer than to fly."""
+    monkeypatch.setattr("uavctl.cli.flying.write_report", lambda *_: None)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from uavctl.data import ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.data import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
-from uavctl.flight.mission import hold
+from uavctl.flight.mission import Room, hold
+from uavctl.flight.reach import GateParameters
 from uavctl.flight.step import Controller, ControlState, StepOutput, initial_state, step
 from uavctl.naming import names_of
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook
@@ -115,8 +116,14 @@ def stub_inputs(seq: int, horizon: int, n_u: int) -> Array:
 
 
 def make_controller(
-    solver: StubSolver | None = None, *, horizon: int = HORIZON, land: bool = True, **changes: float
+    solver: StubSolver | None = None,
+    *,
+    horizon: int = HORIZON,
+    land: bool = True,
+    sigma: float = math.inf,
+    **changes: float,
 ) -> Controller:
+    """A controller; with its `sigma` it believes any position, so that a stub's inputs need not fit the samples."""
     plant = solver.plant if solver is not None else small_plant()
     fallback = FallbackParameters(brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, land=land, recover_samples=3)
     return Controller(
@@ -124,15 +131,29 @@ def make_controller(
         design_id="stub",
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
-        mission=hold(np.zeros(plant.n_x), plant.position_index, limits=np.zeros(0), horizon=horizon, dt_ns=DT_NS),
+        mission=hold(
+            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=room_of(plant)
+        ),
         names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
         fallback=fallback,
         limits=LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=100.0),
+        trust=GateParameters(sigma=sigma, margin_m=0.0, jump_ns=500 * MS),
         link=LinkEstimateParameters(promised=0.5),
         dt_ns=DT_NS,
         tick_ns=TICK_NS,
     )
+
+
+def room_of(plant: Plant, half_m: float = 5.0) -> Room:
+    """Places up to `half_m` from the middle; from a speed v it comes to rest v / 2 further."""
+    n = len(plant.axes)
+    rest, stop = np.zeros((n, plant.n_x)), np.zeros((n, plant.n_x))
+    for axis, (position, velocity) in enumerate(zip(plant.position_index, plant.velocity_index, strict=True)):
+        rest[axis, position] = stop[axis, position] = 1.0
+        stop[axis, velocity] = 0.5
+    axes = tuple(("north", "east", "down").index(axis) for axis in plant.axes)
+    return Room(axes=axes, lower=np.full(n, -half_m), upper=np.full(n, half_m), rest=rest, stop=stop)
 
 
 def sample(
@@ -182,6 +203,7 @@ def inputs_of(
     samples: Iterable[PositionSample],
     *,
     stop_from: int | None = None,
+    commands: Mapping[int, tuple[Command, ...]] | None = None,
     status: Callable[[int], VehicleStatus | None] = lambda tick: vehicle(),
 ) -> list[StepInput]:
     """Tick inputs: every sample in the first tick after its arrival; left-out ticks count as missed."""
@@ -201,6 +223,7 @@ def inputs_of(
                 vehicle=status(tick),
                 missed_ticks=0 if before is None else tick - before - 1,
                 stop=stop_from is not None and tick >= stop_from,
+                commands=(commands or {}).get(tick, ()),
             )
         )
         before = tick

@@ -35,8 +35,10 @@ class Peer:
     def vision(self, usec: int, x: float = 1.0, y: float = 2.0, z: float = -3.0, v1: bool = False) -> bytes:
         return self.send("vision_position_estimate", usec, x, y, z, 0.0, 0.0, 0.0, NO_COVARIANCE, v1=v1)
 
-    def heartbeat(self, custom_mode: int = OFFBOARD, base_mode: int = 129, autopilot: int = 12, kind: int = 2) -> bytes:
-        return self.send("heartbeat", kind, autopilot, base_mode, custom_mode, 4, 3)
+    def heartbeat(
+        self, custom_mode: int = OFFBOARD, base_mode: int = 129, autopilot: int = 12, kind: int = 2, status: int = 4
+    ) -> bytes:
+        return self.send("heartbeat", kind, autopilot, base_mode, custom_mode, status, 3)
 
     def local_position(self, boot_ms: int, x: float = 1.0, y: float = 2.0, z: float = -3.0) -> bytes:
         return self.send("local_position_ned", boot_ms, x, y, z, 0.1, 0.2, 0.3)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from logs.disk import DiskFile, OutputFile
 from logs.recorder import SyncRecorder
+from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity, raw_topic
 
 HEADER = Header(
@@ -111,7 +112,7 @@ class _File:
 def record_flight(path: Path, count: int, chunk_bytes: int = 1024) -> list[Item]:
     """A finished recording of `flight(count)`; returns what was put."""
     items = flight(count)
-    recorder = SyncRecorder(path, chunk_bytes, clock=Clock())
+    recorder = SyncRecorder(path, LogConfig(chunk_bytes=chunk_bytes), clock=Clock())
     for topic, at_ns, record in items:
         recorder.put(topic, at_ns, record)
     status = recorder.close()
@@ -122,7 +123,9 @@ def record_flight(path: Path, count: int, chunk_bytes: int = 1024) -> list[Item]
 def write_two_segments(path: Path) -> None:
     """`flight(100)` on a disk whose seventh operation fails: the second file begins in the middle."""
     clock = Clock()
-    recorder = SyncRecorder(path, 1024, open_file=Disk(lambda number: number == 6).open, clock=clock)
+    recorder = SyncRecorder(
+        path, LogConfig(chunk_bytes=1024), open_file=Disk(lambda number: number == 6).open, clock=clock
+    )
     for topic, at_ns, record in flight(100):
         clock.now_s += 0.1
         recorder.put(topic, at_ns, record)

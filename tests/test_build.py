@@ -25,7 +25,7 @@ def test_the_paper_s_plant_is_as_printed() -> None:
 
 
 def test_a_room_has_three_states_an_axis() -> None:
-    plant = build_plant(load_config("room", ["plant.gain=[1, 1, 0.5]"]))
+    plant = build_plant(load_config("room", ["plant.gain=[1, 1, 0.5]", "plant.drag_1ps=[0, 0, 0.3]"]))
     assert (plant.n_x, plant.n_u, plant.axes) == (9, 3, ("north", "east", "down"))
     # Steady state of v' = a - c v with a = g u: v = g u / c.
     speed = np.linalg.matrix_power(plant.a, 2000) @ np.zeros(9)

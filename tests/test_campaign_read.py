@@ -92,6 +92,22 @@ def test_wrong_keys_and_values_are_told_at_once_with_line_and_nearest_name(tmp_p
     assert 'controller[0].kind: "lgq" is not a choice (nearest valid name "lqg")' in told[2]
 
 
+def test_a_quadrotor_which_campaigns_do_not_fly_is_refused_where_it_stands(tmp_path: Path) -> None:
+    quadrotor = '"sim.start_position_m=[0, 0, -1.5]", "sim.plant=quadrotor"'
+    why = 'sim.plant is "quadrotor", and campaigns fly the linear plant; set sim.plant = "linear"'
+    (told,) = problems(tmp_path, f"set = [{quadrotor}]\n", controller("lqg"))
+    assert told.startswith(f"3: set[1]: {why}")
+    (told,) = problems(tmp_path, controller("lqg", f"set = [{quadrotor}]"))
+    assert told.startswith(f"6: controller[0].set[1]: {why}")
+    text = (Path(__file__).parents[1] / "uavctl/presets/room.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace("[sim]", '[sim]\nplant = "quadrotor"'), encoding="utf-8")
+    file = tmp_path / "campaign.toml"
+    file.write_text('name = "mine"\nconfig = "mine.toml"\n' + controller("lqg"), encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        read_campaign(file)
+    assert refused.value.problems[0].startswith(f"{file}:2: config: {why}")
+
+
 def test_wrong_overrides_are_told_where_they_stand(tmp_path: Path) -> None:
     told = problems(
         tmp_path,

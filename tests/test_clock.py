@@ -48,6 +48,24 @@ def test_missed_ticks_are_counted_and_not_made_up() -> None:
     assert ticker.next().at_ns > clock.now_ns
 
 
+def test_a_wait_that_lasted_until_a_later_tick_was_due_gives_that_one() -> None:
+    clock = Clock(150)
+    ticker = Ticker(PERIOD, ALIGN, clock)
+    due = ticker.next()
+    clock.now_ns = 200 + PERIOD - 1
+    assert ticker.overslept(due) == due
+    due = ticker.next()
+    assert due == Due(1, 200 + PERIOD, 0)
+    clock.now_ns = 200 + 3 * PERIOD + 7
+    assert ticker.overslept(due) == Due(3, 200 + 3 * PERIOD, 2)
+    assert ticker.next() == Due(4, 200 + 4 * PERIOD, 0)
+    clock.now_ns = 200 + 6 * PERIOD
+    due = ticker.next()
+    assert due == Due(6, 200 + 6 * PERIOD, 1)
+    clock.now_ns += 2 * PERIOD
+    assert ticker.overslept(due) == Due(8, 200 + 8 * PERIOD, 3)
+
+
 def test_ticks_done_and_missed_add_up_in_any_weather() -> None:
     clock = Clock(0)
     ticker = Ticker(PERIOD, ALIGN, clock)
@@ -55,6 +73,8 @@ def test_ticks_done_and_missed_add_up_in_any_weather() -> None:
     last = -1
     for n in range(5000):
         due = ticker.next()
+        clock.now_ns = max(clock.now_ns, due.at_ns) + (n * n * 6007) % 97
+        due = ticker.overslept(due)
         done, missed = done + 1, missed + due.missed
         assert due.tick == last + 1 + due.missed == done + missed - 1
         assert due.at_ns == 200 + due.tick * PERIOD

@@ -14,7 +14,7 @@ from uavctl.data import Setpoint, SetpointSource, Vec3
 from uavctl.frames import Convention
 from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
-from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text, TimeSync
+from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Landed, Message, Origin, Position, Text, TimeSync
 
 CAMERA = Peer(17, 18)
 GOOD = CAMERA.vision(1000)
@@ -41,8 +41,18 @@ def setpoint(accel: Vec3 = (0.5, -1.0, 0.25), yaw: float | None = None, at_ns: i
     ],
 )
 def test_position_messages(data: bytes, name: str) -> None:
+    level = (1.0, 0.0, 0.0, 0.0)
+    euler = name != "ATT_POS_MOCAP"
     assert positions(data) == [
-        Position(system=17, component=18, name=name, stamp_us=7_000, position_m=(1.5, -2.5, -0.25))
+        Position(
+            system=17,
+            component=18,
+            name=name,
+            stamp_us=7_000,
+            position_m=(1.5, -2.5, -0.25),
+            attitude=level,
+            euler=euler,
+        )
     ]
 
 
@@ -114,7 +124,9 @@ VEHICLE = Peer(1, 1)
     [
         (
             VEHICLE.heartbeat(),
-            Heartbeat(system=1, component=1, vehicle_type=2, autopilot=12, base_mode=129, custom_mode=6 << 16),
+            Heartbeat(
+                system=1, component=1, vehicle_type=2, autopilot=12, base_mode=129, custom_mode=6 << 16, system_status=4
+            ),
         ),
         (VEHICLE.send("timesync", 0, -5), TimeSync(system=1, component=1, tc1_ns=0, ts1_ns=-5)),
         (VEHICLE.send("extended_sys_state", 0, 1), Landed(system=1, component=1, landed=True)),
@@ -134,8 +146,16 @@ VEHICLE = Peer(1, 1)
             VEHICLE.send("statustext", 4, b"bad \x1b[2J\xff text\t"),
             Text(system=1, component=1, severity=4, text="bad ?[2J\ufffd text"),
         ),
-        (VEHICLE.send("command_ack", 21, 0), Ack(system=1, component=1, command=21, result=0)),
-        (VEHICLE.send("attitude", 1, 0, 0, 0, 0, 0, 0), None),
+        (
+            VEHICLE.send("command_ack", 21, 4, 0, 0, 245, 25),
+            Ack(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
+        ),
+        (VEHICLE.send("gps_global_origin", 1, 2, 3), Origin(system=1, component=1)),
+        (
+            VEHICLE.send("attitude", 1, 0.5, 0.25, -1.0, 0, 0, 0),
+            Attitude(system=1, component=1, angles_rad=(0.5, 0.25, -1.0)),
+        ),
+        (VEHICLE.send("attitude", 1, math.nan, 0, 0, 0, 0, 0), None),
     ],
 )
 def test_other_messages(data: bytes, message: Message | None) -> None:
@@ -308,7 +328,7 @@ def test_what_would_harm_a_vehicle_is_not_encoded(accel: Vec3, yaw: float | None
 
 def test_other_outgoing_messages() -> None:
     encoder = Encoder(245, 25)
-    beat, request, land = read(encoder.heartbeat() + encoder.timesync(0, 77) + encoder.land(3, 4))
+    beat, request, land = read(encoder.heartbeat() + encoder.timesync(0, 77) + encoder.command(21, (), 3, 4))
     assert (beat.type, beat.autopilot, beat.base_mode) == (18, 8, 0)
     assert (request.tc1, request.ts1) == (0, 77)
     assert (land.get_type(), land.command, land.target_system, land.target_component) == ("COMMAND_LONG", 21, 3, 4)

@@ -88,6 +88,7 @@ def test_overrides_take_toml_values_bare_strings_and_the_last_one_wins() -> None
     assert (config.fallback.brake_gain_1ps, config.fallback.recover_samples) == (2.0, 3)
 
 
+@pytest.mark.fault(33)
 @pytest.mark.parametrize(
     ("old", "new", "key", "words"),
     [
@@ -136,6 +137,7 @@ def test_one_wrong_key_is_told_with_its_line(old: str, new: str, key: str, words
     assert place == f"my.toml:{wanted}"
 
 
+@pytest.mark.fault(33)
 def test_all_problems_come_at_once() -> None:
     text = changed("dt_s = 1.0", 'dt_s = "fast"').replace("[cost]", "[csot]").replace("loss = 0.3", "loss = 2")
     keys = {problem.split(": ")[1] for problem in problems(text, "limits.slew_mps3=-1", "nowhere=1")}
@@ -167,6 +169,7 @@ def test_toml_syntax_errors_have_their_line(text: str, line: int) -> None:
     assert problem.startswith(f"my.toml:{line}: TOML syntax: ")
 
 
+@pytest.mark.fault(33)
 def test_a_missing_file_names_the_presets(tmp_path: Path) -> None:
     for name in (str(tmp_path / "nothing.toml"), "papr"):
         with pytest.raises(ConfigError, match=r"no such file or preset.*paper, room"):

@@ -335,7 +335,7 @@ def test_the_room_s_offset_weight_is_exact_and_a_small_one_is_not(room_solver: C
     heavy, light = ConicSolver(room(offset_weight=3e4)), ConicSolver(room(offset_weight=1.0))
     rng = np.random.default_rng(12)
     in_reach: list[Array] = []
-    while len(in_reach) < 20:
+    while len(in_reach) < 8:
         x = ROOM_TARGET + rng.uniform(-1.0, 1.0, 9) * np.tile([1.0, 0.6, 0.5], 3)
         answer = heavy.solve(0, x, ROOM_TARGET)
         if answer.status is SolveStatus.OPTIMAL and is_hard(answer):

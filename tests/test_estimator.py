@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from uavctl.data import Estimate, PositionSample
-from uavctl.flight.estimator import DUPLICATE, TOO_OLD, History, absorb, begin, estimate, set_input
+from uavctl.flight.estimator import DUPLICATE, TOO_OLD, History, absorb, begin, belief_at, estimate, set_input
 from uavctl.flight.kalman import Kalman, make_kalman
 from uavctl.flight.propagation import make_propagation
 from uavctl.smpc.plant import Plant
@@ -60,6 +60,32 @@ def test_propagation_is_the_matrix_exponential_over_any_part_of_a_step() -> None
         want = expm(generator * dt_ns * 1e-9)
         np.testing.assert_allclose(f, want[:4, :4], rtol=0, atol=2e-12)
         np.testing.assert_allclose(g, want[:4, 4:], rtol=0, atol=2e-12)
+
+
+def test_a_span_asked_for_again_gives_the_same_bits_and_cannot_be_written_to() -> None:
+    plant, rng = small_plant(), np.random.default_rng(3)
+    propagation = make_propagation(plant, DT_NS)
+    spans = [*rng.integers(1, DT_NS, 200).tolist(), DT_NS]
+    for dt_ns in (*spans, *spans[::-1]):
+        fresh = make_propagation(plant, DT_NS).over(dt_ns)
+        for known, new in zip(propagation.over(dt_ns), fresh, strict=True):
+            assert known.tobytes() == new.tobytes() and not known.flags.writeable
+    assert len(propagation.parts) < 100  # arbitrary stamps do not fill the memory
+
+
+def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:
+    kalman, history = make()
+    rng = np.random.default_rng(4)
+    given = history
+    for tick in range(4 * TICKS):  # boundaries with their marks among them
+        at_ns = START_NS + tick * TICK_NS
+        due = [sample(at_ns - 3 * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0))] if tick % 3 == 1 else []
+        history, given = (absorb(kalman, one, at_ns, due)[0] for one in (history, given))
+        u = rng.normal(size=1)
+        history = set_input(kalman, history, at_ns, u)
+        given = set_input(kalman, given, at_ns, u, belief_at(kalman, given, at_ns))
+        later_ns = at_ns + TICK_NS // 2
+        assert repr(estimate(kalman, given, later_ns)) == repr(estimate(kalman, history, later_ns))
 
 
 def brute_force(

@@ -40,6 +40,7 @@ TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 
 
+@pytest.mark.fault(1)
 def test_row_1_one_loss_is_played_out_in_the_same_tick() -> None:
     outputs = run(make_controller(), inputs_of(range(5 * TICKS), one_a_step(lost=[3])))
     assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
@@ -49,6 +50,7 @@ def test_row_1_one_loss_is_played_out_in_the_same_tick() -> None:
     assert lost.setpoint is not None
 
 
+@pytest.mark.fault(2)
 def test_row_2_a_burst_shorter_than_the_horizon_is_played_out() -> None:
     burst = range(3, 3 + HORIZON - 1)
     outputs = run(make_controller(), inputs_of(range(8 * TICKS), one_a_step(lost=burst)))
@@ -59,6 +61,7 @@ def test_row_2_a_burst_shorter_than_the_horizon_is_played_out() -> None:
         assert output.decision.input == tuple(stub_inputs(2, HORIZON, 1)[output.decision.age_steps or 0])
 
 
+@pytest.mark.fault(3)
 def test_row_3_fallback_in_the_very_tick_in_which_the_age_reaches_the_horizon() -> None:
     outputs = run(make_controller(), inputs_of(range(8 * TICKS), one_a_step(lost=range(3, 99))))
     entered = (2 + HORIZON) * TICKS
@@ -68,6 +71,7 @@ def test_row_3_fallback_in_the_very_tick_in_which_the_age_reaches_the_horizon() 
     assert outputs[entered].decision.reason == "age of information 4 has reached H = 4"
 
 
+@pytest.mark.fault(3)
 def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
     rng = np.random.default_rng(30)
     steps = 5000
@@ -96,6 +100,7 @@ def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
     assert_sound(outputs)
 
 
+@pytest.mark.fault(4)
 def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> None:
     late = sample(boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS, position_m=(0.1, 0.0, 0.0))
     samples = [*one_a_step(lost=[3, 4, 5]), late]
@@ -110,6 +115,7 @@ def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> 
     assert rebased.plan.states[0] == rebased.estimate.mean  # predicted to the boundary, not as it was captured
 
 
+@pytest.mark.fault(5)
 def test_row_5_a_packet_overtaken_by_a_newer_one_is_no_news_but_improves_the_estimate() -> None:
     older = sample(boundary_ns(2) - 50 * MS, boundary_ns(3) + 10 * MS, position_m=(0.05, 0.0, 0.0))
     newer = sample(boundary_ns(3) - 60 * MS, boundary_ns(3) - 55 * MS)
@@ -124,6 +130,7 @@ def test_row_5_a_packet_overtaken_by_a_newer_one_is_no_news_but_improves_the_est
     assert [output.decision.age_steps for output in overtaken] == [output.decision.age_steps for output in lost]
 
 
+@pytest.mark.fault(5)
 def test_row_5_a_packet_older_than_the_window_is_dropped_and_counted() -> None:
     old = sample(boundary_ns(0) - 50 * MS, boundary_ns(12), position_m=(5.0, 0.0, 0.0))
     plain = run(make_controller(), inputs_of(range(13 * TICKS), one_a_step()))
@@ -134,6 +141,7 @@ def test_row_5_a_packet_older_than_the_window_is_dropped_and_counted() -> None:
     assert [output.estimate for output in outputs] == [output.estimate for output in plain]
 
 
+@pytest.mark.fault(6)
 def test_row_6_duplicates_are_dropped_and_counted() -> None:
     samples = one_a_step()
     twice = [*samples, *(msgspec.structs.replace(one, received_ns=one.received_ns + 40 * MS) for one in samples)]
@@ -145,6 +153,7 @@ def test_row_6_duplicates_are_dropped_and_counted() -> None:
     assert sum(codes(output).get("sample-duplicate", 0) for output in outputs) == 8
 
 
+@pytest.mark.fault(7)
 def test_row_7_a_backlog_burst_is_one_solve_with_the_newest() -> None:
     at_ns = boundary_ns(4)
     backlog = [sample(at_ns - n * 20 * MS, at_ns) for n in range(140)]
@@ -180,6 +189,7 @@ BAD_SAMPLES = {
 }
 
 
+@pytest.mark.fault(12)
 @pytest.mark.parametrize("fault", BAD_SAMPLES)
 def test_row_12_a_sample_that_is_not_finite_or_absurd_counts_as_lost(fault: str) -> None:
     spoil = BAD_SAMPLES[fault]
@@ -193,12 +203,14 @@ def test_row_12_a_sample_that_is_not_finite_or_absurd_counts_as_lost(fault: str)
     assert codes(boundaries(outputs)[3]) == {"sample-invalid": 1}
 
 
+@pytest.mark.fault(12)
 def test_row_12_values_at_their_limits_count() -> None:
     edge = sample(START_NS, position_m=(1000.0, -1000.0, 1000.0), velocity_mps=(100.0, -100.0, 0.0), std_m=1000.0)
     output = run(make_controller(), inputs_of(range(1), [edge]))[0]
     assert (output.decision.accepted, output.decision.rejected) == (1, 0)
 
 
+@pytest.mark.fault(18)
 @pytest.mark.parametrize(
     ("captured_ns", "code"),
     [
@@ -223,12 +235,14 @@ def test_row_18_impossible_stamps_are_refused_without_an_exception(captured_ns: 
     assert [output.estimate for output in outputs] == [output.estimate for output in plain]
 
 
+@pytest.mark.fault(18)
 def test_row_18_a_sample_that_arrives_after_the_tick_is_refused() -> None:
     early = StepInput(tick=0, at_ns=START_NS, samples=(sample(START_NS, START_NS + 1),), vehicle=vehicle())
     output = run(make_controller(), [early])[0]
     assert codes(output) == {"sample-future": 1}
 
 
+@pytest.mark.fault(18)
 def test_row_18_flying_across_2_to_the_32_milliseconds_changes_nothing() -> None:
     shift = 2**32 * MS - boundary_ns(3)
 
@@ -249,6 +263,7 @@ def test_row_18_flying_across_2_to_the_32_milliseconds_changes_nothing() -> None
     assert all(a == b for a, b in means)
 
 
+@pytest.mark.fault(21)
 def test_row_21_missed_ticks_are_counted_and_there_is_one_setpoint_a_tick() -> None:
     ticks = [tick for tick in range(6 * TICKS) if not 2 * TICKS <= tick < 4 * TICKS + 2]
     outputs = run(make_controller(), inputs_of(ticks, one_a_step()))
@@ -263,6 +278,7 @@ def test_row_21_missed_ticks_are_counted_and_there_is_one_setpoint_a_tick() -> N
     assert stamps == [START_NS + tick * TICK_NS for tick in ticks]
 
 
+@pytest.mark.fault(21)
 def test_row_21_a_missed_boundary_at_which_the_age_reaches_the_horizon_is_the_fallback_in_the_next_tick() -> None:
     late = sample(
         boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS
@@ -280,6 +296,7 @@ def test_row_21_a_missed_boundary_at_which_the_age_reaches_the_horizon_is_the_fa
         assert decision.reason == "age of information 4 has reached H = 4"
 
 
+@pytest.mark.fault(21)
 def test_row_21_oversleeping_past_the_horizon_is_the_fallback_in_the_tick_that_wakes() -> None:
     ticks = [*range(TICKS), *range(9 * TICKS + 1, 10 * TICKS)]
     outputs = run(make_controller(), inputs_of(ticks, one_a_step(steps=1)))

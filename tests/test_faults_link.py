@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_link, packets, samples, statuses
+from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.peers import SourceConfig
@@ -18,8 +18,11 @@ from uavctl.data import PositionSample, Setpoint, SetpointSource, Severity
 from uavctl.mavlink import codec
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.encoder import Encoder
+from uavctl.mavlink.hand_over import HandOver
 from uavctl.mavlink.link import Item, Link
-from uavctl.mavlink.mode import HandOver, Sending, State
+from uavctl.mavlink.mode import Sending, State
+from uavctl.mavlink.request import Ask
+from uavctl.mavlink.sight import View
 
 NOW = 50_000 * SECOND
 CAMERA = Peer(17, 18)
@@ -47,6 +50,7 @@ class Source:
 # --- rows 10 and 11: bit errors, truncated and oversized datagrams -----------------------------------
 
 
+@pytest.mark.fault(10)
 @pytest.mark.parametrize("bit", range(len(GOOD) * 8))
 def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) -> None:
     link = make_link()
@@ -55,6 +59,7 @@ def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) 
     assert sum(link.stats(NOW).bad.values()) == 1
 
 
+@pytest.mark.fault(11)
 @pytest.mark.parametrize("length", [0, 1, 5, 11, len(GOOD) - 1])
 def test_row_11_a_truncated_datagram_costs_nothing_else(length: int) -> None:
     link = make_link()
@@ -63,6 +68,7 @@ def test_row_11_a_truncated_datagram_costs_nothing_else(length: int) -> None:
     assert link.stats(NOW).bad == ({"truncated": 1} if length else {})
 
 
+@pytest.mark.fault(11)
 def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
     link = make_link()
     (event,) = events(link.receive(GOOD * 2000, NOW))
@@ -70,6 +76,7 @@ def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
     assert len(samples(link.receive(GOOD, NOW + MS))) == 1
 
 
+@pytest.mark.fault(10, 11)
 def test_rows_10_and_11_are_reported_once_a_second() -> None:
     link = make_link()
     told = [event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS))]
@@ -82,6 +89,7 @@ def test_rows_10_and_11_are_reported_once_a_second() -> None:
 # --- row 12: values that are none ----------------------------------------------------------------------
 
 
+@pytest.mark.fault(12)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3.4e38, -1e6])
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
 @pytest.mark.parametrize("make", [CAMERA.vision, Peer(1, 1).local_position])
@@ -94,6 +102,7 @@ def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., by
 # --- row 16: strangers ---------------------------------------------------------------------------------
 
 
+@pytest.mark.fault(16)
 def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
     link, ours, other = make_link(), Peer(1, 1), Peer(2, 1)
     assert len(statuses(link.receive(ours.heartbeat(), NOW))) == 1
@@ -104,10 +113,11 @@ def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
         told += events(items)
     assert [(event.code, event.severity) for event in told] == [("second-vehicle", Severity.ERROR)] * 2
     assert link.stats(NOW).bad == {"second-vehicle": 10}
-    assert link.land(NOW)[5] == 245
+    assert read(link.ask(Ask.LAND, 0.0))[0].target_system == 1
     assert len(statuses(link.receive(ours.heartbeat(), NOW))) == 1
 
 
+@pytest.mark.fault(16)
 def test_row_16_unknown_messages_are_counted() -> None:
     link = make_link()
     for _, data in packets("px4-offboard.tlog"):
@@ -119,6 +129,7 @@ def test_row_16_unknown_messages_are_counted() -> None:
 # --- rows 17 to 20: clocks -----------------------------------------------------------------------------
 
 
+@pytest.mark.fault(17)
 def test_row_17_the_wall_clock_is_never_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> int:
         raise AssertionError("the wall clock was asked")
@@ -134,6 +145,7 @@ def test_row_17_the_wall_clock_is_never_asked(monkeypatch: pytest.MonkeyPatch) -
     assert sample.received_ns == NOW + 80 * MS
 
 
+@pytest.mark.fault(18)
 def test_row_18_stamps_from_the_future_are_refused() -> None:
     link = make_link()
     source = Source(link)
@@ -145,6 +157,7 @@ def test_row_18_stamps_from_the_future_are_refused() -> None:
     assert sample.captured_ns == source.at_ns + 30 * MS
 
 
+@pytest.mark.fault(18)
 def test_row_18_the_boot_clock_wraps_after_49_7_days() -> None:
     link, vehicle = make_link(source=SourceConfig(messages=("LOCAL_POSITION_NED",))), Peer(1, 1)
     for n in range(200):
@@ -154,6 +167,7 @@ def test_row_18_the_boot_clock_wraps_after_49_7_days() -> None:
     assert link.stats(NOW).bad == {}
 
 
+@pytest.mark.fault(18)
 def test_row_18_our_own_boot_clock_wraps() -> None:
     link = make_link()
     link.receive(Peer(1, 1).heartbeat(), NOW)
@@ -183,6 +197,7 @@ def offset_after(link: Link, at_ns: int, offset_ns: int) -> int | None:
 OFFSET = 40_000 * SECOND
 
 
+@pytest.mark.fault(19)
 def test_row_19_slow_round_trips_are_dropped() -> None:
     link = make_link()
     assert reply(link, NOW, OFFSET, round_trip_ns=11 * MS)
@@ -192,6 +207,7 @@ def test_row_19_slow_round_trips_are_dropped() -> None:
     assert offset_after(link, NOW + SECOND, OFFSET) == OFFSET
 
 
+@pytest.mark.fault(19)
 def test_row_19_deviating_answers_are_dropped_until_five_agree() -> None:
     link = make_link()
     assert reply(link, NOW, OFFSET)
@@ -204,6 +220,7 @@ def test_row_19_deviating_answers_are_dropped_until_five_agree() -> None:
     assert link.stats(NOW).bad == {"timesync": 4}  # the fifth in a row is believed
 
 
+@pytest.mark.fault(19)
 def test_row_19_a_drifting_clock_is_followed() -> None:
     link, drift = make_link(), 50e-6
     for n in range(600):
@@ -215,6 +232,7 @@ def test_row_19_a_drifting_clock_is_followed() -> None:
         assert abs(got - offset) < MS
 
 
+@pytest.mark.fault(20)
 def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
     link = make_link()
     source = Source(link)
@@ -227,6 +245,7 @@ def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
     assert link.stats(NOW).bad == {"stamp-leap": 4}
 
 
+@pytest.mark.fault(20)
 def test_row_20_the_restart_is_told_once() -> None:
     link = make_link()
     source = Source(link)
@@ -237,13 +256,19 @@ def test_row_20_the_restart_is_told_once() -> None:
     assert [event.code for event in told].count("clock-resync") == 1
 
 
+@pytest.mark.fault(20)
 def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     link, vehicle, hand_over = make_link(), Peer(1, 1), HandOver()
     (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW))
-    assert hand_over.update(NOW, flying, ready=True, land=False)[0] is Sending.SETPOINTS
-    (booted,) = statuses(link.receive(vehicle.heartbeat(4 << 16 | 3 << 24, 1), NOW + 5 * SECOND))
-    assert hand_over.update(NOW + 5 * SECOND, booted, ready=True, land=False)[0] is Sending.NOTHING
-    assert hand_over.state is State.RELEASED
+    assert hand_over.update(View(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
+    later = NOW + 5 * SECOND
+    items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later)
+    assert [event.code for event in events(items)] == ["vehicle-reboot"]
+    (booted,) = statuses(items)
+    assert hand_over.update(View(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
+    assert hand_over.state is State.RELEASED  # though it says that it is armed, in OFFBOARD
+    items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND)
+    assert not events(items)  # told once
 
 
 # --- mutated messages with a right checksum --------------------------------------------------------------
@@ -365,6 +390,6 @@ def test_random_bytes_cost_nothing_but_themselves() -> None:
 
 def test_our_own_output_survives_our_own_input() -> None:
     encoder = Encoder(99, 1)
-    data = encoder.heartbeat() + encoder.timesync(0, 5) + encoder.land(1, 1)
+    data = encoder.heartbeat() + encoder.timesync(0, 5) + encoder.command(21, (), 1, 1)
     assert decode(data).bad == {}
     assert decode(data).total == 3

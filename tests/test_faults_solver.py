@@ -57,6 +57,7 @@ SOLVER_FAULTS: dict[str, tuple[Fault, SolveStatus]] = {
 }
 
 
+@pytest.mark.fault(22)
 @pytest.mark.parametrize("fault", SOLVER_FAULTS)
 def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_recorded(fault: str) -> None:
     inject, status = SOLVER_FAULTS[fault]
@@ -72,6 +73,7 @@ def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_reco
     assert {output.decision.mode for output in outputs} == {TRACK}
 
 
+@pytest.mark.fault(22)
 def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond() -> None:
     inject, status = SOLVER_FAULTS["infeasible"]
     controller, _ = with_faults(dict.fromkeys(range(3, 12), inject))
@@ -86,12 +88,14 @@ def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond()
     assert flown(outputs)[12:] == [(12, 0), (13, 0)]
 
 
+@pytest.mark.fault(22)
 def test_row_22_a_programming_error_is_not_hidden() -> None:
     controller, _ = with_faults({0: raising(AttributeError("a bug"))})
     with pytest.raises(AttributeError):
         run(controller, inputs_of(range(1), one_a_step()))
 
 
+@pytest.mark.fault(23)
 @pytest.mark.parametrize("offset", [-1, 1, -4])
 def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
@@ -111,6 +115,7 @@ def spoiled(name: str, value: float) -> Fault:
     return fault
 
 
+@pytest.mark.fault(24)
 @pytest.mark.parametrize("name", ["inputs", "states", "reference"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, value: float) -> None:
@@ -130,6 +135,7 @@ WRONG_SHAPES: dict[str, Fault] = {
 }
 
 
+@pytest.mark.fault(24)
 @pytest.mark.parametrize("fault", WRONG_SHAPES)
 def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
     controller, _ = with_faults({3: WRONG_SHAPES[fault]})
@@ -138,6 +144,7 @@ def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
     assert flown(outputs)[3] == (2, 1)
 
 
+@pytest.mark.fault(24)
 @pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
 def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: float, sent: float) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
@@ -148,6 +155,7 @@ def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: f
     assert output.decision.input == (sent,)
 
 
+@pytest.mark.fault(24)
 def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> None:
     rng = np.random.default_rng(24)
     steps = 1500

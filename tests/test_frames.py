@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from uavctl.data import Vec3
-from uavctl.frames import Convention, Frame, rotate
+from uavctl.frames import Convention, Frame, axes_turn, from_axes, rotate
 
 CONVENTIONS: tuple[Convention, ...] = ("ned", "enu", "flu")
 metres = st.floats(-1e3, 1e3)
@@ -109,3 +110,24 @@ def test_what_is_no_rotation_gives_none(q: tuple[float, float, float, float]) ->
 def test_a_body_at_heading_east_moves_east() -> None:
     half = math.sqrt(0.5)
     assert rotate((half, 0.0, 0.0, half), (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_the_turn_of_a_convention_is_its_change_of_axes(convention: Convention) -> None:
+    for vector in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, -2.0, 3.0)):
+        assert rotate(axes_turn(convention), vector) == pytest.approx(Frame(convention).to_ned(vector), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_turn_onto_directions_takes_the_axes_there(seed: int) -> None:
+    directions = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0].T
+    right_handed = np.linalg.det(directions) > 0
+    turn = from_axes(directions.tolist())
+    for number, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+        sign = 1.0 if right_handed or number < 2 else -1.0
+        assert rotate(turn, axis) == pytest.approx(tuple(sign * directions[number]), abs=1e-12)
+
+
+def test_half_turns_lose_no_digits() -> None:
+    assert from_axes([(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)]) == (0.0, 1.0, 0.0, 0.0)
+    assert from_axes([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]) == (1.0, 0.0, 0.0, 0.0)

@@ -41,7 +41,7 @@ def test_cost_is_that_of_the_problem_written_down_again_and_every_row_is_kept(na
     made = case(name)
     assert abs(made.answer.gap) < 1e-7
     assert made.answer.cost == pytest.approx(reduced_cost(made.design, made.x), rel=1e-6)
-    least = margins(made.design, ConicSolver(made.design), made.x)
+    least = margins(made.design, made.solver, made.x)
     assert {row: margin for row, margin in least.items() if margin < -1e-6} == {}
 
 

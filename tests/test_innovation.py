@@ -17,6 +17,7 @@ from uavctl.config import load_config
 from uavctl.data import PositionSample
 from uavctl.errors import DesignError
 from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, first_belief, make_kalman, predicted, updated
+from uavctl.smpc.bias import with_bias
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, make_design
@@ -167,8 +168,8 @@ def test_back_offs_of_the_first_stages_are_honest() -> None:
 def test_a_room_keeps_its_three_components_and_its_terminal_margin() -> None:
     design = room()
     assert [component.states.tolist() for component in decompose(design)] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
-    assert check_schedule(design) == pytest.approx(0.05973, abs=1e-4)
-    assert check_schedule(make_design(spec("room"))) == pytest.approx(0.05988, abs=1e-4)
+    assert check_schedule(design) == pytest.approx(0.05176, abs=1e-4)
+    assert check_schedule(make_design(spec("room"))) == pytest.approx(0.05241, abs=1e-4)
 
 
 def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
@@ -227,13 +228,14 @@ def test_a_configuration_plans_with_one_plant_and_estimates_with_the_other() -> 
     design, controller, plant = build_design(config), build_controller(config), build_plant(config)
     np.testing.assert_array_equal(controller.plant.e, plant.e)
     np.testing.assert_array_equal(controller.plant.w, plant.w)
-    np.testing.assert_array_equal(controller.kalman.w, plant.w)
-    form = innovations(plant, 0.005, 0.2, 5)
+    drift = config.estimator.bias_drift
+    np.testing.assert_array_equal(controller.kalman.w, with_bias(plant, drift).w)
+    form = innovations(plant, 0.005, 0.2, 5, drift)
     np.testing.assert_array_equal(design.estimate_cov, form.estimate_cov)
     np.testing.assert_array_equal(design.plant.e, form.plant.e)
     # Ten positions a second, 0.07 s on their way at most: the newest is 0.17 s old at most.
     often = build_spec(load_config("room", ["risk.estimate=innovations", "source.rate_hz=10"]))
-    np.testing.assert_array_equal(often.estimate_cov, innovations(plant, 0.005, 0.17, 5).estimate_cov)
+    np.testing.assert_array_equal(often.estimate_cov, innovations(plant, 0.005, 0.17, 5, drift).estimate_cov)
 
 
 def test_exact_plans_with_the_plant_itself() -> None:

@@ -24,6 +24,7 @@ from uavctl.build import build_design
 from uavctl.cli.app import run
 from uavctl.code_id import decider_id
 from uavctl.config import load_config
+from uavctl.config.log import LogConfig
 from uavctl.data import Header, Plan, PolicyLibrary
 from uavctl.errors import RecordingError
 from uavctl.library_bytes import StoredLibrary, decode, encode
@@ -201,7 +202,9 @@ def with_library() -> list[Item]:
 def test_each_later_segment_begins_with_the_library_too(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     clock = Clock()
-    recorder = SyncRecorder(path, 1024, open_file=Disk(lambda number: number == 9).open, clock=clock)
+    recorder = SyncRecorder(
+        path, LogConfig(chunk_bytes=1024), open_file=Disk(lambda number: number == 9).open, clock=clock
+    )
     items = with_library()
     for topic, at_ns, record in items:
         clock.now_s += 0.1
@@ -224,7 +227,9 @@ def test_each_later_segment_begins_with_the_library_too(tmp_path: Path) -> None:
 def test_wherever_a_write_fails_the_library_is_told_once(tmp_path: Path, failing: int) -> None:
     path = tmp_path / "flight.mcap"
     clock = Clock()
-    recorder = SyncRecorder(path, 1024, open_file=Disk(lambda number: number == failing).open, clock=clock)
+    recorder = SyncRecorder(
+        path, LogConfig(chunk_bytes=1024), open_file=Disk(lambda number: number == failing).open, clock=clock
+    )
     items = with_library()
     for topic, at_ns, record in items:
         clock.now_s += 0.1

@@ -119,8 +119,9 @@ def independent_cost(design: Design, name: str, ask: Asked, answer: Answer, cova
 def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) -> None:
     """(19) from M: tightened rows of all stages, the terminal condition with all disturbances, rest from N on."""
     one = case(name)
-    design, checked = one.design, 0
-    for ask, answer, _ in answered(name):
+    design, checked = one.design, Counter[str]()
+    for ask, answer, exact in answered(name):
+        assert (answer.terminal_miss > KEPT) == (exact.terminal_miss > KEPT)
         if answer.terminal_miss > KEPT:
             continue  # from there nothing keeps all of (19)
         thetas = flown(one, ask, answer)
@@ -142,8 +143,9 @@ def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) 
         assert np.all(answer.inputs @ design.input_set.c.T <= design.input_set.b)
         cost = independent_cost(design, name, ask, answer, float(found.covariance[0]))
         assert answer.cost == pytest.approx(cost, rel=1e-6)
-        checked += 1
-    assert checked > 35
+        checked[ask.kind] += 1
+    assert set(checked) == set(KINDS)
+    assert checked.total() > 30  # of 70: from many states no place to rest is within the room's reach
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -308,7 +310,7 @@ def test_along_closed_loops_every_answer_is_certified_and_nearly_all_to_a_tenth_
 
 def test_late_positions_have_libraries_of_their_own_that_agree_with_the_exact_program() -> None:
     design = small(late=1)
-    solver, exact = LibrarySolver(design, make_library(design)), ConicSolver(design)
+    solver, exact = LibrarySolver(design, make_library(design, most=16)), ConicSolver(design)
     rng = np.random.default_rng(71)
     costs = []
     for _ in range(40):

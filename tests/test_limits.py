@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,20 @@ def test_zero_after_a_value_that_is_not_finite_is_slew_limited_too() -> None:
 
 def test_an_impossible_previous_setpoint_does_not_lead_out_of_bounds() -> None:
     assert gate((2.0, 2.0, 0.0), (50.0, math.nan, -math.inf), TICK_S, LIMITS) == ((2.0, 1.0, 0.0), ("slew-east",))
+
+
+@pytest.mark.parametrize("changed", ["want", "previous", "bounds"])
+def test_vectors_that_are_no_triples_are_an_error_and_not_limited_in_part(changed: str) -> None:
+    pair: Vec3 = (1.0, 1.0)  # type: ignore[assignment]
+    want, previous = (pair if changed == name else ZERO for name in ("want", "previous"))
+    limits = replace(LIMITS, accel_mps2=pair) if changed == "bounds" else LIMITS
+    with pytest.raises(ValueError, match="zip"):
+        gate(want, previous, TICK_S, limits)
+
+
+def test_nobody_changes_the_limits_in_flight() -> None:
+    with pytest.raises(FrozenInstanceError):
+        replace(LIMITS).slew_mps3 = 99.0  # type: ignore[misc]
 
 
 def test_every_setpoint_of_100000_random_steps_with_faults_is_finite_bounded_and_slew_limited() -> None:

@@ -13,6 +13,7 @@ from uavctl.config.types import EstimatorConfig
 from uavctl.data import Setpoint, SetpointSource, Severity
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.link import Link
+from uavctl.mavlink.request import Ask
 
 NOW = 50_000 * SECOND
 SETPOINT = Setpoint(at_ns=NOW, accel_mps2=(0.5, 0.0, -0.25), source=SetpointSource.PLAN)
@@ -178,7 +179,7 @@ def test_the_vehicles_words_are_events() -> None:
 def test_setpoint_and_landing_go_to_the_vehicle() -> None:
     link = make_link(daemon=DaemonConfig(tick_s=0.05, system_id=200, component_id=30))
     link.receive(Peer(7, 3).heartbeat(), NOW)
-    setpoint, land = read(link.setpoint(SETPOINT) + link.land(NOW))
+    setpoint, land = read(link.setpoint(SETPOINT) + link.ask(Ask.LAND, 0.0))
     assert (setpoint.get_type(), setpoint.target_system, setpoint.target_component) == (
         "SET_POSITION_TARGET_LOCAL_NED",
         7,
@@ -259,17 +260,29 @@ def test_requests_are_answered_with_our_time() -> None:
     link = make_link()
     link.due(NOW)
     link.receive(Peer(1, 1).send("timesync", 0, -77) + Peer(1, 1).send("timesync", 0, 78), NOW + 3 * MS)
-    answers = [read(data)[0] for data in link.due(NOW + 50 * MS)]
+    answers = [read(data)[0] for data in link.answers()]
     assert [(raw.tc1, raw.ts1) for raw in answers] == [(NOW + 3 * MS, -77), (NOW + 3 * MS, 78)]
     assert link.due(NOW + 51 * MS) == ()
+    link.receive(Peer(1, 1).heartbeat(), NOW + 52 * MS)
+    assert link.answers() == ()  # the last datagram's only
 
 
 def test_a_flood_of_requests_is_answered_in_part() -> None:
     link = make_link()
     link.due(NOW)
-    for n in range(1000):
-        link.receive(Peer(1, 1).send("timesync", 0, n), NOW)
-    assert len(link.due(NOW + MS)) == 8
+    for window in range(3):
+        answers: list[bytes] = []
+        for n in range(1000):
+            link.receive(Peer(1, 1).send("timesync", 0, n), NOW + window * 50 * MS + n * MS // 25)
+            answers += link.answers()
+        assert [read(data)[0].ts1 for data in answers] == list(range(8))
+    assert link.stats(NOW).bad == {"timesync-flood": 3 * 992}
+
+
+def test_a_flood_of_requests_in_one_datagram_is_too() -> None:
+    link = make_link()
+    link.receive(b"".join(Peer(1, 1).send("timesync", 0, n) for n in range(100)), NOW)
+    assert len(link.answers()) == 8
 
 
 def test_our_own_words_sent_back_are_ignored() -> None:

@@ -80,16 +80,18 @@ def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() ->
     assert SETPOINT not in rig.run(2, deaf=True)
 
 
-def test_a_silent_vehicle_gets_no_setpoints_until_it_is_heard_again() -> None:
+def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_own_failsafe() -> None:
     rig = Rig()
     rig.run(40)
-    during = rig.run(100, deaf=True)
-    assert during.count(SETPOINT) <= 61  # three seconds without a heartbeat
-    assert SETPOINT not in rig.run(20, deaf=True)
-    rig.heartbeat(OFFBOARD)
-    assert rig.run(20, deaf=True).count(SETPOINT) == 20
+    assert rig.run(55, deaf=True).count(SETPOINT) == 55  # not silent yet: heartbeats come once a second
+    rig.run(10, deaf=True)
+    during = rig.run(60, deaf=True)
+    assert during.count(SETPOINT) == 60
+    assert {s.source for s in rig.memory.of(Setpoint)[-60:]} <= {SetpointSource.BRAKE, SetpointSource.HOLD}
+    rig.run(100, deaf=True)  # fallback.brake_s and hold_s are over
+    assert SETPOINT not in rig.run(50, deaf=True)
     told = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
-    assert len(told) == 2 and "lost" in told[0] and "back" in told[1]
+    assert len(told) == 1 and "lost" in told[0]
 
 
 def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
@@ -154,5 +156,9 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
             after.heartbeat(OFFBOARD, armed=False)
         sent += after.run(1, deaf=True)
     assert after.loop.decision is not None and after.loop.decision.mode is ControlMode.WAIT
-    assert set(sent) == {"HEARTBEAT", "TIMESYNC", SETPOINT}  # no command: neither arming nor a mode
+    assert set(sent) == {"HEARTBEAT", "TIMESYNC", SETPOINT, LAND}
+    commands = {
+        m.command for d in after.memory.of(Datagram) if d.outgoing for m in decode(d.data) if m.get_type() == LAND
+    }
+    assert commands == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}  # neither arming nor a mode
     assert {s.accel_mps2 for s in after.memory.of(Setpoint)} == {(0.0, 0.0, 0.0)}

@@ -1,7 +1,8 @@
-"""Missions: waypoints in their order, motions the plant can make, limits that move, and their configuration."""
+"""Missions: waypoints in their order, motions the plant can make, limits that move."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,23 @@ from numpy.typing import NDArray
 from uavctl.build import build_controller, build_design
 from uavctl.build_mission import build_mission, build_trajectory
 from uavctl.config import load_config
-from uavctl.config.load import dump_config, parse
 from uavctl.config.types import Config
 from uavctl.data import GaveWay
 from uavctl.errors import ConfigError, DesignError
-from uavctl.flight.mission import Fence, Mission, MissionState, Waypoint, advance, ask_for, wanted
+from uavctl.flight.mission import (
+    Fence,
+    Mission,
+    MissionState,
+    Room,
+    Trajectory,
+    Waypoint,
+    advance,
+    ask_for,
+    over,
+    resume,
+    stay,
+    wanted,
+)
 from uavctl.naming import names_of, tell, tell_all
 from uavctl.smpc.design import Design
 
@@ -35,6 +48,7 @@ def on_a_line(*places_m: float, hold_s: float = 1.0, fences: tuple[Fence, ...] =
         limits=np.array([5.0, 5.0]),
         horizon=4,
         dt_ns=DT_NS,
+        room=Room((0,), np.array([-4.0]), np.array([4.0]), np.array([[1.0, 0.0]]), np.array([[1.0, 0.5]])),
         fences=fences,
     )
 
@@ -95,6 +109,64 @@ def test_a_fence_that_is_no_closer_than_the_limits_is_none_and_of_several_the_cl
     _, outlook = ask_for(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
     assert outlook.limits is not None
     assert outlook.limits[:, 0].tolist() == [2.5] * 5
+
+
+def moving_north(rows: int) -> Mission:
+    """A metre a Δt for some rows, then a horizon (4 rows) of rest."""
+    north = np.minimum(np.arange(rows + 4, dtype=np.float64), rows - 1)
+    states = np.column_stack([north, np.zeros(rows + 4)])
+    still = np.zeros((rows + 4, 4, 2))
+    motion = Trajectory(states=states, anchors=states, path_states=still, path_inputs=still[:, :, :1])
+    fence = Fence(row=0, times_ns=np.array([0.0, 10.0]) * SECOND_NS, values=np.array([5.0, 0.0]))
+    return replace(on_a_line(0.0, fences=(fence,)), trajectory=motion)
+
+
+def test_a_trajectory_stands_still_for_an_order_and_a_fence_does_not() -> None:
+    mission, state = moving_north(8), MissionState(start_ns=0)
+    assert wanted(mission, state, 3 * DT_NS) == (3.0, 0.0)
+    left = stay(stay(state, (0.5, 0.0), 3 * DT_NS), (0.7, 0.0), 4 * DT_NS)
+    assert wanted(mission, left, 5 * DT_NS) == (0.7, 0.0)
+    assert advance(mission, left, (0.0, 0.0), 5 * DT_NS) == left
+    target, outlook = ask_for(mission, left, 5 * DT_NS)
+    assert target.tolist() == [0.7, 0.0]
+    assert outlook.path is None
+    assert outlook.limits is not None
+    assert outlook.limits[0, 0] == pytest.approx(4.5)  # after 1 s of its own time
+    again = resume(left, 8 * DT_NS)
+    assert [wanted(mission, again, n * DT_NS)[0] for n in (8, 9, 12, 13)] == [3.0, 4.0, 7.0, 7.0]
+    _, outlook = ask_for(mission, again, 10 * DT_NS)
+    assert outlook.limits is not None
+    assert outlook.limits[0, 0] == pytest.approx(4.0)
+    assert resume(again, 9 * DT_NS) == again
+
+
+def test_a_mission_is_over_where_its_trajectory_ends_and_after_its_last_waypoint_s_time() -> None:
+    mission, state = moving_north(8), MissionState(start_ns=0)
+    assert [over(mission, state, n * DT_NS) for n in (0, 6, 7, 8, 30)] == [False, False, True, True, True]
+    assert not over(mission, stay(state, (0.0, 0.0), 7 * DT_NS), 8 * DT_NS)
+    line = on_a_line(0.0, 1.0, hold_s=0.4)
+    arrived = MissionState(start_ns=0, waypoint=1, arrived_ns=5 * DT_NS)
+    assert [over(line, arrived, n * DT_NS) for n in (5, 6, 7, 8)] == [False, False, True, True]
+    assert not over(line, replace(arrived, waypoint=0), 8 * DT_NS)
+    assert not over(line, replace(arrived, arrived_ns=None), 8 * DT_NS)
+
+
+def test_the_end_of_a_mission_is_configured_and_needs_something_that_ends() -> None:
+    config, design = room_with("mission.waypoints=[[1,1,-1]]", "mission.then=land")
+    assert build_mission(config, design).land
+    assert not build_mission(load_config("room"), design).land
+    with pytest.raises(ConfigError, match=r"mission\.then.*no end to come after"):
+        load_config("room", ["mission.then=land"])
+    with pytest.raises(ConfigError, match=r"mission\.then"):
+        load_config("room", ["mission.waypoints=[[1,1,-1]]", "mission.then=loiter"])
+
+
+def test_a_configured_trajectory_is_over_at_its_last_sample() -> None:
+    motion = "times_s=[1.0,5.0],positions_m=[[0,0,-1],[1,0.5,-1]]"
+    config, design = room_with(f"mission={{trajectory={{{motion}}},then='land'}}")
+    mission, state = build_mission(config, design), MissionState(start_ns=0)
+    ends = [n for n in range(40) if over(mission, state, n * DT_NS)]
+    assert ends[0] == 25  # 5 s
 
 
 def circle(seconds: float = 12.0, radius_m: float = 0.9, turn_s: float = 10.0) -> tuple[list[float], list[list[float]]]:
@@ -210,191 +282,6 @@ def test_a_fence_that_the_design_cannot_take_is_refused(fence: str, key: str, wo
     with pytest.raises(DesignError, match=words) as raised:
         build_mission(config, design)
     assert raised.value.key == key
-
-
-MISSION = """
-[mission]
-waypoints = [[1.0, 1.0, -1.0],
-             [4.0, 0.0, 1.0]]
-hold_s = [1.0, -2.0, 3.0]
-
-[[fence]]
-state = "north"
-side = "upper"
-times_s = [5.0, 4.0]
-values = [2.0]
-
-[[fence]]
-state = "up"
-side = "lower"
-times_s = [0.0]
-values = [1.0]
-
-[[fence]]
-state = 0
-side = "lower"
-times_s = [-1.0]
-values = [-3.5]
-sides = 1
-
-[[fence]]
-state = "north"
-side = "upper"
-times_s = [0.0, 1.0, 2.0]
-values = [1.0, -3.0, -4.0]
-"""
-BEYOND = "values = [1.0, -3.0, -4.0]"
-
-
-def problems(text: str, *overrides: str) -> list[str]:
-    with pytest.raises(ConfigError) as raised:
-        parse(ROOM + text, "my.toml", overrides)
-    return str(raised.value).splitlines()
-
-
-def test_all_that_is_wrong_with_a_mission_is_told_at_once_with_its_line() -> None:
-    first = ROOM.count("\n") + 1
-    lines = dict(enumerate(MISSION.splitlines(), first))
-    told = problems(MISSION)
-    wanted_words = [
-        ("waypoints[1][0]", "north 4 m is outside the admissible box [-3, 3]", "             [4.0, 0.0, 1.0]]"),
-        ("waypoints[1][2]", "down 1 m is outside", "             [4.0, 0.0, 1.0]]"),
-        ("mission.hold_s", "has 3 entries, there are 2 waypoints", "hold_s = [1.0, -2.0, 3.0]"),
-        ("mission.hold_s", "negative", "hold_s = [1.0, -2.0, 3.0]"),
-        ("fence[0].times_s[1]", "4 s is not after 5 s", "times_s = [5.0, 4.0]"),
-        ("fence[0].values", "has 1 entries, there are 2 times", "values = [2.0]"),
-        ("fence[1].state", '"up" is no axis of the plant', 'state = "up"'),
-        ("fence[2].times_s[0]", "begins at -1 s", "times_s = [-1.0]"),
-        ("fence[2].values[0]", "-3.5 is beyond sets.state_lower[0] = -3", "values = [-3.5]"),
-        ("fence[3].values[1]", "-3 as upper limit leaves nothing up to sets.state_lower[0] = -3", BEYOND),
-        ("fence[3].values[2]", "-4 as upper limit leaves nothing up to sets.state_lower[0] = -3", BEYOND),
-        ("fence[2].sides", 'unknown key (nearest valid name "side")', "sides = 1"),
-    ]
-    for key, words, line in wanted_words:
-        (one,) = [text for text in told if key in text and words in text]
-        assert lines[int(one.split(":")[1])] == line
-    assert len(told) == len(wanted_words)
-
-
-@pytest.mark.parametrize(
-    ("trajectory", "key", "words"),
-    [
-        ("times_s=[0,1],positions_m=[[0,0,-1]]", "positions_m", "has 1 entries, there are 2 times"),
-        ("times_s=[0],positions_m=[[0,0,-1]]", "times_s", "at least 2"),
-        ("times_s=[0,1,1],positions_m=[[0,0,-1],[0,0,-1],[0,0,-1]]", "times_s[2]", "1 s is not after 1 s"),
-        ("times_s=[0,nan],positions_m=[[0,0,-1],[0,0,-1]]", "times_s[1]", "nan is not a finite number"),
-        ("times_s=[0,1],positions_m=[[0,0,-1],[0,9,-1]]", "positions_m[1][1]", "east 9 m is outside"),
-        ("times_s=[0,1],positions_m=[[0,0,-1],[0,0]]", "positions_m[1]", "length 3"),
-        (
-            "times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]],velocities_mps=[[0,0,0]]",
-            "velocities_mps",
-            "has 1 entries, there are 2 times",
-        ),
-        (
-            "times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]],velocities_mps=[[0,0,0],[0,0,0]],interpolation='linear'",
-            "velocities_mps",
-            "no meaning",
-        ),
-    ],
-)
-def test_a_wrong_trajectory_is_told(trajectory: str, key: str, words: str) -> None:
-    (told,) = problems("", f"mission.trajectory={{{trajectory}}}")
-    assert f"mission.trajectory.{key}: " in told
-    assert words in told
-
-
-def test_what_does_not_go_together_is_told() -> None:
-    motion = "mission.trajectory={times_s=[0,1],positions_m=[[0,0,-1],[0,0,-1]]}"
-    fence = 'fence=[{state=0,side="upper",times_s=[0],values=[1]}]'
-    (both,) = problems("", motion, "mission.waypoints=[[0,0,-1]]")
-    assert "mission.waypoints: there is a trajectory as well" in both
-    told = problems("", motion, fence, "solver.method=printed")
-    assert sorted(one.split("solver.method: ")[1].split(";")[0] for one in told) == [
-        '"printed" follows no trajectory',
-        '"printed" knows no limits that move',
-    ]
-    (no_table,) = problems("", "fence=[3]")
-    assert "fence[0]: expected a table, got 3" in no_table
-
-
-def with_file(tmp_path: Path, samples: str) -> Config:
-    (tmp_path / "way.csv").write_text(samples, encoding="utf-8")
-    text = ROOM + '\n[mission.trajectory]\nfile = "way.csv"\n'
-    return parse(text, str(tmp_path / "my.toml")).config
-
-
-@pytest.mark.parametrize("head", ["", "t,x,y,z\n", "\ufefftime,north,east,down\n\n"])
-def test_samples_come_from_a_file_beside_the_configuration(tmp_path: Path, head: str) -> None:
-    config = with_file(tmp_path, head + "0, 0, 0, -1\n2.5,1, 0.5 ,-1\n")
-    motion = config.mission.trajectory
-    assert (motion.times_s, motion.positions_m) == ((0.0, 2.5), ((0.0, 0.0, -1.0), (1.0, 0.5, -1.0)))
-    assert (motion.velocities_mps, motion.file) == ((), "")
-    # The configuration is complete in itself: a recording's header needs no other file.
-    assert parse(dump_config(config), "header").config == config
-
-
-def test_seven_columns_are_velocities_too(tmp_path: Path) -> None:
-    motion = with_file(tmp_path, "0,0,0,-1,0,0,0\n2,1,0,-1,0.1,0.2,0.3\n").mission.trajectory
-    assert motion.velocities_mps == ((0.0, 0.0, 0.0), (0.1, 0.2, 0.3))
-
-
-def test_bad_rows_of_a_file_are_told_with_file_and_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError) as raised:
-        with_file(tmp_path, "t,x,y,z\n0,0,0,-1\n1,zero,0,-1\n2,0,0\n3,0,0,nan\n4,0,0,-1,0,0,0\n")
-    told = str(raised.value).splitlines()
-    assert [one.split("way.csv:")[1].split(";")[0] for one in told] == [
-        '3: "zero" is not a finite number',
-        "4: has 3 columns",
-        '5: "nan" is not a finite number',
-        "6: has 7 columns, the first row has 4",
-    ]
-    assert all("my.toml:" in one and "mission.trajectory.file: " in one for one in told)
-
-
-def test_of_many_bad_rows_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError) as raised:
-        with_file(tmp_path, "0,0,0,-1\n" + "x,0,0,-1\n" * 12)
-    told = str(raised.value).splitlines()
-    assert len(told) == 6
-    assert "way.csv: 7 more" in told[-1]
-
-
-@pytest.mark.parametrize(
-    ("samples", "told"),
-    [
-        ("t,x,y,z\n0,0,0,-1\n\n2,0,0,-1\n1,0,0,-1\n", ["5: mission.trajectory.times_s[2]: 1 s is not after 2 s"]),
-        ("-1,0,0,-1\n1,0,0,-1\n", ["1: mission.trajectory.times_s[0]: begins at -1 s, before the mission does"]),
-        (
-            "0,0,0,-1\n1,0,9,-1\n",
-            ["2: mission.trajectory.positions_m[1][1]: east 9 m is outside the admissible box [-2.5, 2.5]"],
-        ),
-        ("t,x,y,z\n0,0,0,-1\n", [" mission.trajectory.times_s: has 1 entries, a motion has at least 2"]),
-    ],
-)
-def test_samples_that_do_not_fit_are_told_with_their_own_file_and_line(
-    tmp_path: Path, samples: str, told: list[str]
-) -> None:
-    with pytest.raises(ConfigError) as raised:
-        with_file(tmp_path, samples)
-    lines = str(raised.value).splitlines()
-    assert [one.split(";")[0] for one in lines] == [f"{tmp_path / 'way.csv'}:{one}" for one in told]
-
-
-@pytest.mark.parametrize(("samples", "words"), [("", "has no rows"), ("t,x\n", "has no rows")])
-def test_an_empty_file_is_told(tmp_path: Path, samples: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        with_file(tmp_path, samples)
-
-
-def test_a_file_that_is_not_there_or_no_text_is_told(tmp_path: Path) -> None:
-    text = ROOM + '\n[mission.trajectory]\nfile = "way.csv"\n'
-    with pytest.raises(ConfigError, match="cannot be read"):
-        parse(text, str(tmp_path / "my.toml"))
-    (tmp_path / "way.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="is not UTF-8 text"):
-        parse(text, str(tmp_path / "my.toml"))
-    with pytest.raises(ConfigError, match="samples in the table as well"):
-        parse(text + "times_s = [0.0]\n", str(tmp_path / "my.toml"))
 
 
 def test_what_gave_way_is_told_in_words() -> None:

@@ -1,177 +1,105 @@
-"""Hand-over: every pair of the table, names of modes, the recorded flight."""
+"""The table of the hand-over: every pair of what is and what is seen, against a grid written down by hand."""
 
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import pytest
-from mavlink_rig import SECOND, make_link, packets, statuses
 
-from uavctl.data import VehicleStatus
-from uavctl.mavlink.mode import (
-    HEARTBEAT_TIMEOUT_NS,
-    TRANSITIONS,
-    HandOver,
-    Seen,
-    Sending,
-    State,
-    describe_mode,
-    look,
-)
+from uavctl.mavlink.mode import LEAVES_NONE, TRANSITIONS, Seen, Sending, State, drawing, page
 
-NOW = 100 * SECOND
-
-
-def vehicle(at_ns: int = NOW, *, armed: bool = True, external: bool = True, mode: str = "OFFBOARD") -> VehicleStatus:
-    return VehicleStatus(at_ns=at_ns, autopilot="px4", armed=armed, mode=mode, external=external)
-
-
-PILOT = vehicle(external=False, mode="POSCTL")
-
-
-def in_state(state: State) -> HandOver:
-    hand_over = HandOver()
-    hand_over.state = state
-    return hand_over
+# W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, X released, L landing,
+# S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
+GRID = """
+     reboot land refused silence take-off engage left disarmed other granted external pending
+W    W      W    F       W       W        W      X    R+       R+    W       E*       W
+R    R      R    F       W       M+       B+     R    R+       R+    R       E*       R
+M    F      D    F       M       M        M      M    M        X     A+      M        M+
+A    F      L    F       A       A        A      A    A        X     C+      A        A+
+C    F      L    L       C       C        C      C    F        X     G+      C        C+
+G    F      L    L       G       G        G      G    F        X     E*      G        G+
+B    X      X    X       B       B        B      B    D        X     E*      B        B+
+E    X      L    E       E*      E        E      E    D        X     E       E*       E
+X    X      X    X       X       X        B+     X    D        X     X       X        X
+L    L      L    F       L       L        L      L    D        X     S       L        L
+S    S      S    F       S       S        S      S    D        X     S       S        S
+D    D      D    D       D       D        D      D    D        D     D       D        D
+F    F      F    F       F       F        F      F    F        F     F       F        F
+"""
+LETTERS = dict(zip("WRMACGBEXLSDF", State, strict=True))
+SENDING = {"": Sending.NOTHING, "+": Sending.NEUTRAL, "*": Sending.SETPOINTS}
 
 
-SEEN = {
-    Seen.SILENCE: (None, False),
-    Seen.PILOT: (PILOT, False),
-    Seen.EXTERNAL: (vehicle(), False),
-    Seen.LAND: (vehicle(), True),
-}
-W, R, E, X, L = State.WAITING, State.READY, State.ENGAGED, State.RELEASED, State.LANDING
-NOTHING, NEUTRAL, FLY, LAND = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS, Sending.LAND
-WANTED = {
-    #    silence        pilot          external   landing asked for
-    W: ((W, NOTHING), (R, NEUTRAL), (E, FLY), (W, NOTHING)),
-    R: ((W, NOTHING), (R, NEUTRAL), (E, FLY), (R, NOTHING)),
-    E: ((E, NOTHING), (X, NOTHING), (E, FLY), (L, LAND)),
-    X: ((X, NOTHING), (X, NOTHING), (X, NOTHING), (X, NOTHING)),
-    L: ((L, NOTHING), (L, NOTHING), (L, NOTHING), (L, NOTHING)),
-}
+def wanted() -> dict[tuple[State, Seen], tuple[State, Sending]]:
+    head, *rows = (line.split() for line in GRID.strip().splitlines())
+    return {
+        (LETTERS[letter], Seen(seen)): (LETTERS[cell[0]], SENDING[cell[1:]])
+        for letter, *cells in rows
+        for seen, cell in zip(head, cells, strict=True)
+    }
 
 
-@pytest.mark.parametrize(("state", "column"), list(product(State, range(len(Seen)))))
-def test_every_pair(state: State, column: int) -> None:
-    seen = list(Seen)[column]
-    status, land = SEEN[seen]
-    hand_over = in_state(state)
-    sending, events = hand_over.update(NOW, status, ready=True, land=land)
-    assert (hand_over.state, sending) == WANTED[state][column]
-    moved = WANTED[state][column][0] is not state
-    assert ("hand-over" in {event.code for event in events}) == moved
+@pytest.mark.parametrize("pair", list(product(State, Seen)), ids=lambda pair: f"{pair[0].name}-{pair[1].name}")
+def test_every_pair(pair: tuple[State, Seen]) -> None:
+    assert TRANSITIONS[pair] == wanted()[pair]
 
 
-def test_the_table_is_complete() -> None:
-    assert set(TRANSITIONS) == set(product(State, Seen))
+def test_the_grid_and_the_table_are_complete() -> None:
+    assert set(wanted()) == set(TRANSITIONS) == set(product(State, Seen))
 
 
-def test_only_who_is_engaged_sends_setpoints_or_asks_for_landing() -> None:
-    for (before, seen), (after, sending) in TRANSITIONS.items():
-        if sending is FLY:
-            assert (after, seen) == (E, Seen.EXTERNAL)
-        if sending is LAND:
-            assert before is E
+@pytest.mark.fault(25)
+def test_setpoints_are_sent_by_who_is_engaged_only() -> None:
+    flying = {(after, seen) for (_, seen), (after, sending) in TRANSITIONS.items() if sending is Sending.SETPOINTS}
+    assert flying == {(State.ENGAGED, seen) for seen in (Seen.EXTERNAL, Seen.GRANTED, Seen.SILENCE)}
+    assert TRANSITIONS[State.ENGAGED, Seen.OTHER] == (State.RELEASED, Sending.NOTHING)
 
 
-@pytest.mark.parametrize("state", [X, L])
-def test_nothing_leads_out_of_released_and_landing(state: State) -> None:
-    assert {TRANSITIONS[state, seen] for seen in Seen} == {(state, NOTHING)}
+@pytest.mark.fault(25)
+def test_only_an_order_leads_out_of_released_and_towards_arming() -> None:
+    out = {seen for seen in Seen if TRANSITIONS[State.RELEASED, seen][0] is not State.RELEASED}
+    assert out == {Seen.ENGAGE, Seen.DISARMED}
+    assert TRANSITIONS[State.WAITING, Seen.LEFT] == (State.RELEASED, Sending.NOTHING)
+    towards = {seen for (before, seen), (after, _) in TRANSITIONS.items() if before is not after is State.MODE}
+    assert towards == {Seen.TAKE_OFF}
 
 
-@pytest.mark.parametrize("status", [PILOT, vehicle(armed=False)])
-def test_the_pilot_takes_over_for_good(status: VehicleStatus) -> None:
-    hand_over = HandOver()
-    assert hand_over.update(NOW, vehicle(), ready=True, land=False)[0] is FLY
-    sending, events = hand_over.update(NOW, status, ready=True, land=False)
-    assert sending is NOTHING
-    assert status.mode in events[0].text
-    for _ in range(3):
-        assert hand_over.update(NOW, vehicle(), ready=True, land=False) == (NOTHING, ())
+def test_no_way_leads_back_from_landing_into_flight() -> None:
+    reached, todo = set[State](), [State.LANDING]
+    while todo:
+        state = todo.pop()
+        reached.add(state)
+        # From released the operator may order it back: that is a flight anew.
+        ways = {TRANSITIONS[state, seen][0] for seen in Seen if seen is not Seen.ENGAGE}
+        todo += [one for one in ways if one not in reached]
+    assert reached == {State.LANDING, State.SETTLING, State.RELEASED, State.DONE, State.FAILED}
 
 
-def test_no_neutral_stream_before_the_controller_is_ready() -> None:
-    hand_over = HandOver()
-    assert hand_over.update(NOW, PILOT, ready=False, land=False)[0] is NOTHING
-    assert hand_over.update(NOW, PILOT, ready=True, land=False)[0] is NEUTRAL
+@pytest.mark.fault(31)
+def test_what_a_daemon_that_ends_leaves_behind_has_had_setpoints_or_may_have() -> None:
+    left = set(State) - LEAVES_NONE
+    assert left == {*LETTERS.values()} - {State.READY, State.SETTLING, State.DONE}
+    assert {after for after, sending in TRANSITIONS.values() if sending is Sending.SETPOINTS} <= left
 
 
-def test_silence_while_engaged_is_told_once_and_ends() -> None:
-    hand_over = HandOver()
-    hand_over.update(NOW, vehicle(), ready=True, land=False)
-    late = NOW + HEARTBEAT_TIMEOUT_NS
-    assert hand_over.update(late, vehicle(), ready=True, land=False) == (FLY, ())
-    sending, events = hand_over.update(late + 1, vehicle(), ready=True, land=False)
-    assert (sending, [event.code for event in events]) == (NOTHING, ["heartbeat"])
-    assert hand_over.update(late + 2, vehicle(), ready=True, land=False) == (NOTHING, ())
-    sending, events = hand_over.update(late + 3, vehicle(late), ready=True, land=False)
-    assert (sending, [event.code for event in events]) == (FLY, ["heartbeat"])
+def test_every_state_has_an_end() -> None:
+    for start in State:
+        reached, todo = set[State](), [start]
+        while todo:
+            state = todo.pop()
+            reached.add(state)
+            todo += [after for seen in Seen if (after := TRANSITIONS[state, seen][0]) not in reached]
+        assert reached & {State.DONE, State.FAILED}
 
 
-def test_landing_is_asked_for_in_silence_too() -> None:
-    hand_over = in_state(E)
-    assert hand_over.update(NOW + 10 * SECOND, vehicle(), ready=False, land=True)[0] is LAND
+def test_the_drawing_has_every_way_once() -> None:
+    lines = drawing().splitlines()
+    ways = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
+    assert sum("-->" in line for line in lines) == len(ways) + 3  # the beginning, two ends
+    assert "    RELEASED --> RETURNING: engage" in lines
 
 
-@pytest.mark.parametrize(
-    ("status", "land", "seen"),
-    [
-        (None, False, Seen.SILENCE),
-        (None, True, Seen.LAND),
-        (vehicle(NOW - 4 * SECOND), False, Seen.SILENCE),
-        (vehicle(armed=False), False, Seen.PILOT),
-        (PILOT, False, Seen.PILOT),
-        (vehicle(), False, Seen.EXTERNAL),
-    ],
-)
-def test_what_a_tick_sees(status: VehicleStatus | None, land: bool, seen: Seen) -> None:
-    assert look(NOW, status, land=land) is seen
-
-
-@pytest.mark.parametrize(
-    ("autopilot", "kind", "custom", "name", "external"),
-    [
-        ("px4", 2, 6 << 16, "OFFBOARD", True),
-        ("px4", 2, 4 << 16 | 3 << 24, "AUTO.LOITER", False),
-        ("px4", 2, 4 << 16 | 6 << 24, "AUTO.LAND", False),
-        ("px4", 2, 4 << 16 | 99 << 24, "AUTO.99", False),
-        ("px4", 2, 3 << 16, "POSCTL", False),
-        ("px4", 2, 77 << 16, "MODE_77", False),
-        ("px4", 2, 4, "MODE_0", False),
-        ("ardupilot", 2, 4, "GUIDED", True),
-        ("ardupilot", 13, 4, "GUIDED", True),
-        ("ardupilot", 2, 9, "LAND", False),
-        ("ardupilot", 2, 5, "LOITER", False),
-        ("ardupilot", 2, 0, "STABILIZE", False),
-        ("ardupilot", 2, 20, "GUIDED_NOGPS", False),
-        ("ardupilot", 2, 29, "MODE_29", False),
-        ("ardupilot", 1, 4, "MODE_4", False),  # a plane: 4 is not GUIDED there
-        ("ardupilot", 2, 6 << 16, "MODE_393216", False),
-        ("unknown", 2, 4, "MODE_4", False),
-    ],
-)
-def test_mode_names(autopilot: str, kind: int, custom: int, name: str, external: bool) -> None:
-    assert describe_mode(autopilot, kind, custom) == (name, external)
-
-
-def test_a_recorded_flight() -> None:
-    """PX4: OFFBOARD, its failsafe after the stream stops, OFFBOARD again by itself: not for us any more."""
-    link, hand_over = make_link(), HandOver()
-    sent: list[tuple[str, Sending]] = []
-    for at_ns, data in packets("px4-offboard.tlog"):
-        for status in statuses(link.receive(data, at_ns)):
-            sending, _ = hand_over.update(at_ns, status, ready=True, land=False)
-            if not sent or sent[-1] != (status.mode, sending):
-                sent.append((status.mode, sending))
-    assert sent == [
-        ("AUTO.LOITER", NEUTRAL),
-        ("AUTO.TAKEOFF", NEUTRAL),
-        ("AUTO.LOITER", NEUTRAL),
-        ("OFFBOARD", FLY),
-        ("AUTO.LOITER", NOTHING),
-        ("OFFBOARD", NOTHING),
-        ("AUTO.LAND", NOTHING),
-        ("OFFBOARD", NOTHING),  # disarmed after its landing
-    ]
+def test_the_page_of_the_documentation_is_the_table_s() -> None:
+    told = (Path(__file__).resolve().parent.parent / "docs" / "hand-over.md").read_text(encoding="utf-8")
+    assert told == page() and drawing() in told

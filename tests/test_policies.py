@@ -131,7 +131,9 @@ def test_every_cut_is_below_the_cost_of_every_feasible_policy(name: str) -> None
             cost = covariance.cost(theta)
             cuts = level - slope @ covariance.backoffs(theta)
             assert np.all(cuts <= cost * (1.0 + 1e-7))
-            far += bool(cost > 1.01 * policies[0].cost)
+            # Under the room's terminal gain, which is of least cost itself, no policy that is drawn costs 1 % more than
+            # the cheapest: there, a thousand times what the comparison forgives.
+            far += bool(cost > (1.01 if name == "paper" else 1.0001) * policies[0].cost)
         assert far > 5
 
 

@@ -25,7 +25,7 @@ from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
 from uavctl.smpc.feasibility import optimal_cost
 from uavctl.smpc.horizon import Horizon, horizon_of
-from uavctl.smpc.library import make_library
+from uavctl.smpc.library import Library, make_library
 from uavctl.smpc.library_solver import LibrarySolver
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.risk import kappa
@@ -43,9 +43,14 @@ class Kind:
     plan: float
 
 
+MADE: dict[str, Library] = {}
+
+
 def from_library(design: Design) -> Solver:
-    """A small library: what it cannot certify, the exact program answers."""
-    return LibrarySolver(design, make_library(design, most=16))
+    """A small library, made once for a design: what it cannot certify, the exact program answers."""
+    if design.design_id not in MADE:
+        MADE[design.design_id] = make_library(design, most=12)
+    return LibrarySolver(design, MADE[design.design_id])
 
 
 # The library's plans are within its tolerance of the optimum; where a cost is flat they may be far apart.

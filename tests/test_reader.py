@@ -7,6 +7,7 @@ from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_fligh
 
 from logs.reader import header, read, records, segment_files
 from logs.recorder import SyncRecorder
+from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Event, Record, Setpoint
 from uavctl.errors import RecordingError
 
@@ -67,7 +68,7 @@ def test_missing_segment_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     disk = Disk(lambda number: number in (6, 30))
     clock = Clock()
-    recorder = SyncRecorder(path, 1024, open_file=disk.open, clock=clock)
+    recorder = SyncRecorder(path, LogConfig(chunk_bytes=1024), open_file=disk.open, clock=clock)
     for topic, at_ns, record in flight(200):
         clock.now_s += 0.1
         recorder.put(topic, at_ns, record)

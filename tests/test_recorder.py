@@ -9,8 +9,9 @@ from recording_fakes import Clock, Disk, flight, own
 
 from logs.disk import DiskFile, OutputFile
 from logs.reader import read, records
-from logs.recorder import Recorder, SyncRecorder
+from logs.recorder import BATCH, Recorder, SyncRecorder, portion
 from logs.topics import RecorderNote
+from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Event, Severity
 from uavctl.errors import RecordingError
 
@@ -113,10 +114,21 @@ def test_close_gives_up_on_a_disk_that_hangs(tmp_path: Path) -> None:
 
 
 def test_status_may_be_asked_while_it_writes(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flight.mcap", chunk_bytes=1024)
+    recorder = Recorder(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024))
     seen = []
     for topic, at_ns, record in flight(3000):
         recorder.put(topic, at_ns, record)
         seen.append(recorder.status().written)
     assert recorder.close().ok
     assert seen == sorted(seen)
+
+
+def test_a_backlog_that_a_busy_computer_left_is_written_soon() -> None:
+    waiting, rounds = 192, 0
+    while waiting > BATCH:
+        waiting += 24 - portion(waiting)  # 24 more come in the time of a round, 1200 a second
+        rounds += 1
+    assert rounds <= 8  # 160 ms
+    assert portion(0) == portion(2 * BATCH) == BATCH
+    assert portion(1000) == 128  # of more than that a tick would notice
+    assert portion(8000) == 1000  # unless the queue gets full

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import pytest
-from flight_rig import DT_NS, HORIZON, MS, START_NS, estimator_parameters, sample, small_plant
+from flight_rig import HORIZON, MS, START_NS, make_controller, sample
 
 from uavctl.data import PositionSample, StepInput
 from uavctl.flight.estimator import begin
-from uavctl.flight.kalman import make_kalman
-from uavctl.flight.samples import STAMP_TOLERANCE_NS, Intake, take
+from uavctl.flight.samples import STAMP_TOLERANCE_NS, Intake, Trust, take
 
-KALMAN = make_kalman(small_plant(), estimator_parameters(), DT_NS)
+CONTROLLER = make_controller()
 
 
 def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> Intake:
     """Intake after several ticks, each (time in ms, samples)."""
-    intake = Intake(history=begin(KALMAN, START_NS, START_NS), accepted=0, refused=(), fresh=0)
+    history = begin(CONTROLLER.kalman, START_NS, START_NS)
+    intake = Intake(history=history, trust=Trust(), moved=False, accepted=0, refused=(), fresh=0)
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
-        intake = take(KALMAN, intake.history, inp, horizon, intake.fresh)
+        intake = take(CONTROLLER.kalman, CONTROLLER.reach, intake.history, intake.trust, inp, horizon, intake.fresh)
     return intake
 
 

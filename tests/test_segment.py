@@ -109,6 +109,7 @@ def test_segment_names_in_numeric_order(tmp_path: Path) -> None:
     assert [one.name for one in later_segments(path)] == [f"a.b[1]-{number}.mcap" for number in (2, 3, 10, 11)]
 
 
+@pytest.mark.fault(29)
 def test_room_is_checked_before_a_flight(tmp_path: Path) -> None:
     path = tmp_path / "new" / "flight.mcap"
     assert check_room(path, 0) > 0

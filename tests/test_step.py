@@ -28,7 +28,7 @@ from flight_rig import (
 )
 
 from uavctl.data import ControlMode, SetpointSource, SolveStatus, VehicleStatus
-from uavctl.flight.mission import hold
+from uavctl.flight.mission import Waypoint
 
 WAIT, TRACK, BRAKE = ControlMode.WAIT, ControlMode.TRACK, ControlMode.BRAKE
 
@@ -165,4 +165,4 @@ def test_ticks_must_divide_the_step_and_the_target_must_fit() -> None:
     with pytest.raises(ValueError, match="does not divide"):
         replace(controller, tick_ns=DT_NS // 3)
     with pytest.raises(ValueError, match="target"):
-        replace(controller, mission=hold(np.zeros(2), (0,), np.zeros(0), horizon=HORIZON, dt_ns=DT_NS))
+        replace(controller, mission=replace(controller.mission, waypoints=(Waypoint(np.zeros(2), 0),)))

@@ -29,16 +29,10 @@ from flight_rig import (
 
 from uavctl.data import ControlMode, SetpointSource, SolveStatus, VehicleStatus
 
-WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = (
-    ControlMode.WAIT,
-    ControlMode.TRACK,
-    ControlMode.BRAKE,
-    ControlMode.HOLD,
-    ControlMode.LAND,
-    ControlMode.STOPPED,
-)
+WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
 
 
+@pytest.mark.fault(3)
 def test_fallback_brakes_holds_and_lands_once_each_in_its_time() -> None:
     outputs = run(make_controller(), inputs_of(range(220), moving(0)))
     begins = {mode: modes(outputs).index(mode) for mode in (TRACK, BRAKE, HOLD, LAND, STOPPED)}
@@ -68,12 +62,14 @@ def test_braking_takes_the_predicted_velocity_to_zero() -> None:
     assert {None if one is None else one.accel_mps2 for one in holding} == {(0.0, 0.0, 0.0)}
 
 
+@pytest.mark.fault(3)
 def test_without_landing_it_holds_on_and_recovers_however_late() -> None:
     silent = range(1, 100)
     outputs = run(make_controller(land=False), inputs_of(range(105 * TICKS), one_a_step(lost=silent)))
     assert modes(boundaries(outputs))[60:] == [HOLD] * 42 + [TRACK] * 3
 
 
+@pytest.mark.fault(9)
 def test_recovers_with_a_new_plan_at_the_third_fresh_sample_in_a_row() -> None:
     lost = [*range(1, 6), *range(8, 12), 13]  # four lost in a row break it, one does not
     outputs = boundaries(run(make_controller(), inputs_of(range(17 * TICKS), one_a_step(lost))))
@@ -85,6 +81,7 @@ def test_recovers_with_a_new_plan_at_the_third_fresh_sample_in_a_row() -> None:
     assert "track" in [event.code for event in recovered.events]
 
 
+@pytest.mark.fault(9)
 def test_a_late_sample_is_not_a_fresh_one() -> None:
     late_ns = HORIZON * DT_NS // 3
     old = [sample(boundary_ns(n) - 50 * MS, boundary_ns(n) - 50 * MS + late_ns) for n in range(6, 20)]
@@ -116,6 +113,32 @@ def silent_in(ticks: range) -> Callable[[int], VehicleStatus | None]:
     return lambda tick: None if tick in ticks else vehicle()
 
 
+@pytest.mark.fault(27)
+def test_a_vehicle_that_falls_silent_in_flight_is_braked_and_held_and_flown_again_when_it_is_back() -> None:
+    silent = range(10, 30)
+    outputs = run(make_controller(), inputs_of(range(40), moving(60, 0.5), status=silent_in(silent)))
+    assert modes(outputs)[:11] == [TRACK] * 10 + [BRAKE]
+    assert outputs[10].decision.reason == "no vehicle is heard; the fallback's time runs on"
+    assert set(modes(outputs)[10:30]) <= {BRAKE, HOLD}
+    assert all(one.setpoint is not None for one in outputs)
+    assert modes(outputs)[-5:] == [TRACK] * 5
+
+
+@pytest.mark.fault(27)
+@pytest.mark.parametrize("heard_again", [160, 161, 163])  # at a boundary, and between
+def test_a_vehicle_that_was_silent_for_longer_than_it_is_held_lands_though_positions_are_there(
+    heard_again: int,
+) -> None:
+    outputs = run(make_controller(), inputs_of(range(170), moving(60, 0.5), status=silent_in(range(10, heard_again))))
+    muted = next(tick for tick, one in enumerate(outputs) if one.setpoint is None)
+    assert 10 + 60 <= muted <= 10 + 40 + 60 + 1  # hold_s = 3 s after at most brake_s = 2 s
+    assert set(modes(outputs)[muted:heard_again]) == {HOLD}
+    assert all(one.setpoint is None for one in outputs[muted:])
+    assert modes(outputs)[heard_again : heard_again + 2] == [LAND, STOPPED]
+    assert [tick for tick, one in enumerate(outputs) if one.land] == [heard_again]
+
+
+@pytest.mark.fault(27)
 @pytest.mark.parametrize(("heard_again", "lands"), [(20, 116), (100, 116), (130, 130)])
 def test_the_fallback_s_time_runs_on_while_the_vehicle_is_silent(heard_again: int, lands: int) -> None:
     # The speed does not matter: a brake that is not sent does not slow down, and brake_s = 2 s ends it at tick 56.
@@ -153,6 +176,7 @@ def test_without_any_plan_the_fallback_takes_over_at_once() -> None:
     assert outputs[0].decision.reason == "no plan is left to fly"
 
 
+@pytest.mark.fault(34)
 @pytest.mark.parametrize("land", [True, False])
 def test_operator_stop_brakes_then_hands_over_and_never_flies_a_plan_again(land: bool) -> None:
     stop = 10
@@ -173,6 +197,7 @@ def test_operator_stop_brakes_then_hands_over_and_never_flies_a_plan_again(land:
     assert all(output.setpoint is None for output in outputs[stop + ends :])
 
 
+@pytest.mark.fault(34)
 def test_operator_stop_without_a_vehicle_to_hand_over_only_stops() -> None:
     outputs = run(make_controller(), inputs_of(range(6), one_a_step(), stop_from=2, status=lambda tick: None))
     assert modes(outputs) == [WAIT, WAIT, STOPPED, STOPPED, STOPPED, STOPPED]
@@ -180,6 +205,7 @@ def test_operator_stop_without_a_vehicle_to_hand_over_only_stops() -> None:
     assert [output.setpoint is None for output in outputs] == [False] * 2 + [True] * 4
 
 
+@pytest.mark.fault(34)
 def test_operator_stop_before_the_first_position_hands_over_in_the_next_tick() -> None:
     outputs = run(make_controller(), inputs_of(range(5), [], stop_from=2))
     assert modes(outputs) == [WAIT, WAIT, HOLD, LAND, STOPPED]

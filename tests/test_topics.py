@@ -5,14 +5,15 @@ import json
 import msgspec
 import pytest
 
-from logs.topics import TOPICS, definition, raw_link, record_type, topics_page
+from logs.topics import TOPICS, definition, is_view, raw_link, record_type, topics_page
+from logs.view_topics import PLOTS, VIEWS
 from uavctl import data
 from uavctl.data import Datagram, Decision, Record, raw_topic
 
 
 def test_every_recorded_type_has_one_topic() -> None:
     # Not on their own topic: parts of other records, and what never leaves the process.
-    inside = {"Record", "PositionSample", "GaveWay", "Datagram", "Outgoing"}
+    inside = {"Record", "PositionSample", "GaveWay", "Command", "Datagram", "Outgoing"}
     types = {
         name
         for name, kind in vars(data).items()
@@ -58,3 +59,23 @@ def test_page_lists_every_topic_and_field() -> None:
             assert f"| `{field.name}` |" in section
     assert "| `position_m` | array of number |" in page
     assert "| `solve` | `SolveStatus` or null |" in page
+
+
+def test_topics_for_viewers_are_no_records() -> None:
+    names = {view.name for view in VIEWS}
+    assert len(names) == len(VIEWS) and not names & {topic.name for topic in TOPICS}
+    for name in names:
+        assert is_view(name) and definition(name).encoding == definition(name).schema_encoding == "protobuf"
+        with pytest.raises(KeyError):
+            record_type(name)
+    assert not any(is_view(topic.name) for topic in TOPICS) and not is_view("/raw/vehicle/in")
+
+
+def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
+    page = topics_page()
+    for view in VIEWS:
+        assert page.count(f"| `{view.name}` | `{view.schema_name}` |") == 1
+    for kind, name in PLOTS.items():
+        section = page.split(f"## `{name}`")[1].split("## ")[0]
+        for field in msgspec.structs.fields(kind):
+            assert f"| `{field.name}` |" in section

@@ -1,4 +1,4 @@
-"""All checks of the tree, one stage after the other; the first that fails ends the run.
+"""All checks of the tree: the quick ones side by side, then the tests; the first that fails ends the run.
 
 `make test` and continuous integration run this; `--write-docs` only writes the generated pages.
 """
@@ -12,17 +12,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from logs.topics import topics_page
 from uavctl.campaign.reference import campaign_page
 from uavctl.config.reference import render
+from uavctl.mavlink.mode import page as hand_over_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {
     ROOT / "docs" / "configuration.md": render,
     ROOT / "docs" / "campaign-keys.md": campaign_page,
     ROOT / "docs" / "topics.md": topics_page,
+    ROOT / "docs" / "hand-over.md": hand_over_page,
 }
 BIN = Path(sys.executable).parent
 _THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
@@ -68,7 +71,7 @@ def check_pages() -> str:
     return ""
 
 
-def check_wheel() -> str:
+def check_wheel(cache: str) -> str:
     """Build the wheel, install it outside the checkout, and fly from there."""
     with tempfile.TemporaryDirectory(prefix="uavctl-wheel-") as name:
         folder = Path(name)
@@ -79,49 +82,64 @@ def check_wheel() -> str:
         run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel])
         # -P and PYTHONPATH: the installed package, not the checkout beside the working directory.
         flight = ("loopback", "--config", "paper", "--duration", "20", "--json", "--out", str(folder / "flights"))
-        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": str(folder / "cache")}
+        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": cache}
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
             raise StageError(f"the wheel was not what was imported, but {where.strip()}")
         return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
 
 
-def check_tests() -> str:
-    """All tests; pytest's own closing line is the last one, and no test at all is a failure (exit code 5)."""
-    code = subprocess.run([BIN / "pytest", "-n", "2"], cwd=ROOT, env={**os.environ, **_THREADS}, check=False).returncode
-    if code != 0:
-        raise StageError(f"pytest: exit code {code}")
-    return ""
+def check_tests(cache: str) -> None:
+    """All tests; pytest's own closing line is the last one, and no test at all is a failure (exit code 5).
+
+    A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
+    """
+    command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_THREADS, "UAVCTL_CACHE": cache}, check=False)
+    if done.returncode != 0:
+        raise StageError(f"pytest: exit code {done.returncode}")
 
 
-STAGES: tuple[tuple[str, Callable[[], str]], ...] = (
-    ("ruff check", lambda: run([BIN / "ruff", "check"])),
-    ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
-    ("mypy", lambda: run([BIN / "mypy"])),
-    ("import contracts", lambda: run([BIN / "lint-imports"])),
-    ("generated pages of docs/", check_pages),
-    ("wheel, outside the checkout", check_wheel),
-    ("pytest", check_tests),
-)
+def stages(cache: str) -> tuple[tuple[str, Callable[[], str]], ...]:
+    """Everything but the tests, what takes longest first; policy libraries are kept in `cache`."""
+    return (
+        ("mypy", lambda: run([BIN / "mypy"])),
+        ("wheel, outside the checkout", lambda: check_wheel(cache)),
+        ("ruff check", lambda: run([BIN / "ruff", "check"])),
+        ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
+        ("import contracts", lambda: run([BIN / "lint-imports"])),
+        ("generated pages of docs/", check_pages),
+    )
+
+
+def passes(name: str, stage: Callable[[], str]) -> bool:
+    """Run a stage and say how it ended."""
+    start = time.monotonic()
+    try:
+        stage()
+    except StageError as error:
+        say(f"{error}\nFAILED  {name}")
+        return False
+    say(f"ok  {name} ({time.monotonic() - start:.1f} s)")
+    return True
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the stages; 0 if all of them pass."""
+    """Run the stages, two at a time, then the tests; 0 if all of them pass."""
     if list(arguments) == ["--write-docs"]:
         for page, text in PAGES.items():
             page.write_text(text(), encoding="utf-8")
         return 0
-    for name, stage in STAGES:
-        start = time.monotonic()
-        if stage is check_tests:
-            say(f"{name} ...")
+    with tempfile.TemporaryDirectory(prefix="uavctl-check-cache-") as cache:
+        with ThreadPoolExecutor(2) as pool:
+            if not all(list(pool.map(lambda one: passes(*one), stages(cache)))):
+                return 1
+        say("pytest ...")
         try:
-            stage()
+            check_tests(cache)
         except StageError as error:
-            say(f"{error}\nFAILED  {name}")
+            say(f"{error}\nFAILED  pytest")
             return 1
-        if stage is not check_tests:
-            say(f"ok  {name} ({time.monotonic() - start:.1f} s)")
     return 0
 
 

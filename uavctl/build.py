@@ -15,6 +15,7 @@ from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
+from uavctl.flight.reach import GateParameters
 from uavctl.library_store import library_for
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conic import ConicSolver
@@ -74,7 +75,7 @@ def build_spec(config: Config) -> DesignSpec:
     return DesignSpec(
         plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
-        input_set=Polytope.from_box(sets.input_lower, sets.input_upper),
+        input_set=_planned_inputs(config),
         q_x=np.diag(config.cost.state),
         q_u=np.diag(config.cost.input),
         horizon=smpc.horizon,
@@ -100,6 +101,13 @@ def build_spec(config: Config) -> DesignSpec:
     )
 
 
+def _planned_inputs(config: Config) -> Polytope:
+    """U of the plans: what is flown against a bias of up to bias_max stays free, and both together keep the limits."""
+    free = config.estimator.bias_max
+    lower, upper = (np.array(side) for side in (config.sets.input_lower, config.sets.input_upper))
+    return Polytope.from_box((lower + free).tolist(), (upper - free).tolist())
+
+
 def _seen(config: Config, plant: Plant) -> tuple[Plant, NDArray[np.float64] | None]:
     """The plant that is planned with, and the covariance of what the estimator does not see of it."""
     if config.risk.estimate == "exact":
@@ -109,7 +117,8 @@ def _seen(config: Config, plant: Plant) -> tuple[Plant, NDArray[np.float64] | No
     since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
     age_s = min(dt_s, since_s + link.delay_s + link.jitter_s)
     # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
-    form = innovations(plant, config.estimator.position_std_m, age_s, config.smpc.tau + 1)
+    estimator = config.estimator
+    form = innovations(plant, estimator.position_std_m, age_s, config.smpc.tau + 1, estimator.bias_drift)
     return form.plant, form.estimate_cov
 
 
@@ -154,6 +163,21 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     return PrintedSolver(design)
 
 
+def build_estimator(config: Config) -> EstimatorParameters:
+    """What the filter believes of its samples."""
+    estimator = config.estimator
+    return EstimatorParameters(
+        position_std_m=estimator.position_std_m,
+        velocity_std_mps=estimator.velocity_std_mps,
+        initial_std=estimator.initial_std,
+        window_s=estimator.window_s,
+        max_position_m=estimator.max_position_m,
+        max_velocity_mps=estimator.max_velocity_mps,
+        bias_drift=estimator.bias_drift,
+        bias_max=estimator.bias_max,
+    )
+
+
 def build_controller(config: Config, design: Design | None = None, library: Library | None = None) -> Controller:
     """Everything constant that a control tick needs; design and policy library are made if they are not given.
 
@@ -171,14 +195,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
         names=build_names(design),
         link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
         late_steps=len(design.late),
-        estimator=EstimatorParameters(
-            position_std_m=estimator.position_std_m,
-            velocity_std_mps=estimator.velocity_std_mps,
-            initial_std=estimator.initial_std,
-            window_s=estimator.window_s,
-            max_position_m=estimator.max_position_m,
-            max_velocity_mps=estimator.max_velocity_mps,
-        ),
+        estimator=build_estimator(config),
         fallback=FallbackParameters(
             brake_gain_1ps=fallback.brake_gain_1ps,
             brake_s=fallback.brake_s,
@@ -187,6 +204,11 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
             recover_samples=fallback.recover_samples,
         ),
         limits=LimitsParameters(accel_mps2=limits.accel_mps2, slew_mps3=limits.slew_mps3),
+        trust=GateParameters(
+            sigma=estimator.gate_sigma,
+            margin_m=estimator.gate_m,
+            jump_ns=round(fallback.jump_s * NANOSECONDS),
+        ),
         dt_ns=round(config.plant.dt_s * NANOSECONDS),
         tick_ns=round(config.daemon.tick_s * NANOSECONDS),
     )

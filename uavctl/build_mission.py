@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
-from uavctl.flight.mission import Fence, Mission, Trajectory, Waypoint, hold
-from uavctl.flight.trajectory import Motion, along, follow
+from uavctl.flight.mission import Fence, Mission, Room, Trajectory, Waypoint, hold
+from uavctl.flight.trajectory import Motion, along, follow, room
 from uavctl.naming import Names, names_of
 from uavctl.smpc.components import decompose
 from uavctl.smpc.design import Design
@@ -36,6 +36,7 @@ def build_mission(config: Config, design: Design) -> Mission:
         design.state_set.b,
         horizon=design.horizon,
         dt_ns=round(plant.dt_s * NANOSECONDS),
+        room=_resting(design),
     )
     if given.waypoints:
         holds_s = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,) * len(given.waypoints)
@@ -48,6 +49,7 @@ def build_mission(config: Config, design: Design) -> Mission:
         mission,
         trajectory=build_trajectory(given.trajectory, design) if given.trajectory.times_s else None,
         fences=tuple(_fence(number, one, design) for number, one in enumerate(config.fence)),
+        land=given.then == "land",
     )
 
 
@@ -83,6 +85,13 @@ def build_trajectory(given: TrajectoryConfig, design: Design) -> Trajectory:
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
     return along(plant, motion, design.horizon, design.horizon - design.terminal.tau, *_room(design))
+
+
+def _resting(design: Design) -> Room | None:
+    try:
+        return room(design.plant, design.horizon - design.terminal.tau, *_room(design))
+    except DesignError:
+        return None
 
 
 def _room(design: Design) -> tuple[Array, Array]:

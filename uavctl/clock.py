@@ -49,6 +49,12 @@ class Ticker:
         now_ns = self._now()
         if self._start_ns is None:
             self._start_ns = (now_ns // self._align_ns + 1) * self._align_ns
-        expected = self._tick + 1
-        self._tick = max(expected, (now_ns - self._start_ns) // self._period_ns)
-        return Due(self._tick, self._start_ns + self._tick * self._period_ns, self._tick - expected)
+        return self._newest(self._start_ns, self._tick + 1, now_ns)
+
+    def overslept(self, due: Due) -> Due:
+        """The tick to do after the wait for `due`: itself, unless the wait lasted until a later one was due."""
+        return self._newest(due.at_ns - due.tick * self._period_ns, due.tick - due.missed, self._now())
+
+    def _newest(self, start_ns: int, expected: int, now_ns: int) -> Due:
+        self._tick = max(self._tick, expected, (now_ns - start_ns) // self._period_ns)
+        return Due(self._tick, start_ns + self._tick * self._period_ns, self._tick - expected)

@@ -71,6 +71,7 @@ class Estimate(Record, frozen=True, kw_only=True):
     captured_ns: int
     mean: Vector  # (n_x,)
     cov: Matrix  # (n_x, n_x)
+    bias: Vector = ()  # (n_u,), what acts beside the input, in its units; empty where none is estimated
 
     @property
     def age_s(self) -> float:
@@ -109,6 +110,7 @@ class Plan(Record, frozen=True, kw_only=True):
     iterations: int
     design_id: str
     gave_way: tuple[GaveWay, ...] = ()
+    bias: Vector = ()  # (n_u,), what `states` count on beside `inputs`, in their units
 
 
 class Setpoint(Record, frozen=True, kw_only=True):
@@ -141,7 +143,7 @@ class Decision(Record, frozen=True, kw_only=True):
     rejected: int  # samples refused in this tick (invalid, duplicate, too old)
     reason: str
     target: Vector | None = None  # (n_x,), where the mission wants the vehicle in this step; None before it began
-    waypoint: int | None = None  # number of the waypoint flown to, from 0; None before, and on a trajectory
+    waypoint: int | None = None  # number of the waypoint flown to, from 0; None before, on a trajectory, and on orders
 
 
 class VehicleStatus(Record, frozen=True, kw_only=True):
@@ -154,6 +156,8 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
     external: bool  # in the mode that takes our setpoints
     landed: bool | None = None
     battery_v: float | None = None
+    boots: int = 0  # times that it was seen to start anew
+    alone: bool = True  # no other vehicle has been heard lately
 
 
 class Severity(StrEnum):
@@ -174,6 +178,31 @@ class Event(Record, frozen=True, kw_only=True):
     count: int = 1
 
 
+class Order(StrEnum):
+    """What the operator may ask of a flight while it goes on."""
+
+    GOTO = "goto"  # fly to a place and stay there
+    HOLD = "hold"  # stay where the vehicle comes to rest
+    RESUME = "resume"  # go on with the configured mission where it was left
+    LAND = "land"  # brake and hand over to the vehicle's own landing
+    ENGAGE = "engage"  # ask for the external mode again, after the pilot or the vehicle has left it
+    TAKE_OFF = "take-off"  # ask for the mode, arm, climb and fly; from the ground only
+    STAND_BY = "stand by"  # leave a vehicle that is found armed alone until ENGAGE: a daemon before this one left it
+
+
+ORDER_ACCEPTED = "order-accepted"  # codes of the events that answer orders, one each, in their order
+ORDER_REFUSED = "order-refused"
+
+
+class Command(Record, frozen=True, kw_only=True):
+    """One order of the operator; a place comes with GOTO only, a height with TAKE_OFF, a time with STAND_BY."""
+
+    order: Order
+    position_m: Vec3 | None = None  # local NED
+    height_m: float | None = None  # of the climb, above the ground
+    flown_ns: int | None = None  # when the daemon before this one took the vehicle over
+
+
 class StepInput(Record, frozen=True, kw_only=True):
     """All that one control tick may know; recorded, and enough to replay the tick."""
 
@@ -183,6 +212,7 @@ class StepInput(Record, frozen=True, kw_only=True):
     vehicle: VehicleStatus | None = None
     missed_ticks: int = 0
     stop: bool = False  # the operator asks for the hand-over
+    commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came
 
 
 class Timing(Record, frozen=True, kw_only=True):
@@ -210,6 +240,25 @@ def raw_topic(link: str, *, outgoing: bool) -> str:
     return f"/raw/{link}/{'out' if outgoing else 'in'}"
 
 
+class Refused(Record, frozen=True, kw_only=True):
+    """What a connection dropped before anything looked into it, since this was last told."""
+
+    at_ns: int
+    link: str
+    counts: dict[str, int]  # reason -> count
+
+
+class Checked(Record, frozen=True, kw_only=True):
+    """One item of the check before arming; nothing that the loop decides, so a replay passes it over."""
+
+    at_ns: int
+    name: str
+    state: str  # good, note, undetermined or bad
+    value: str
+    want: str
+    hint: str
+
+
 class LinkStats(Record, frozen=True, kw_only=True):
     """Counters of one connection since the start."""
 
@@ -221,6 +270,10 @@ class LinkStats(Record, frozen=True, kw_only=True):
     bad: dict[str, int]  # reason -> count
     clock_offset_ns: int | None
     clock_source: str  # "timesync", "minimum" or "none"
+    # TIMESYNC with the source of positions; with the vehicle on a link that carries none
+    clock_rtt_ns: int | None = None  # median of the last minute's round trips
+    clock_drift_ppm: float | None = None  # what our clock gains on the peer's
+    clock_rejected: int = 0  # answers that came too late, or deviated
 
 
 class Truth(Record, frozen=True, kw_only=True):
@@ -234,6 +287,7 @@ class Truth(Record, frozen=True, kw_only=True):
     sent: int  # positions sent so far
     lost: int  # of which the channel lost
     mode: str
+    faults: tuple[str, ...] = ()  # what is amiss
 
 
 class Header(Record, frozen=True, kw_only=True):
@@ -292,8 +346,8 @@ class Outgoing(Record, frozen=True, kw_only=True):
 class Flyer(Protocol):
     """What flies: bytes in, bytes out, time as an argument. The simulator is given one."""
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> None:
-        """Take one datagram that arrived at `at_ns`."""
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        """Take one datagram that arrived at `at_ns`; gives what is to be sent at once."""
         ...
 
     def tick(self, tick: int, at_ns: int) -> Iterable[Outgoing]:

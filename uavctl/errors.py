@@ -41,6 +41,10 @@ class ConnectionSpecError(UsageError):
     """A connection URL cannot be understood or opened."""
 
 
+class NotReadyError(UavctlError):
+    """The vehicle must not be armed as things are; names every item that speaks against it."""
+
+
 class RecordingError(UavctlError):
     """A recording cannot be read, or not without loss."""
 
@@ -52,3 +56,15 @@ class LibraryError(UavctlError):
         self.reason = reason
         self.hint = hint
         super().__init__(f"{reason}; {hint}")
+
+
+class VehicleTakenError(UavctlError):
+    """Another daemon flies this vehicle, or answers under its name."""
+
+
+class NotReachedError(UavctlError):
+    """No daemon can be asked: none runs, several do, or the one that does gives no answer."""
+
+
+class KeyFileError(UsageError):
+    """A file of a signing key, or of its stamps, cannot be used."""

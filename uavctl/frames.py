@@ -8,7 +8,7 @@ or left-handed result cannot be configured.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -23,8 +23,23 @@ _SWAP: dict[Convention, Callable[[Vec3], Vec3]] = {
     "enu": lambda v: (v[1], v[0], -v[2]),
     "flu": lambda v: (v[0], -v[1], -v[2]),
 }
+# The same as turns (w, x, y, z): half a turn about (1, 1, 0), or about the first axis.
+_HALF = math.sqrt(0.5)
+_SWAP_TURN: dict[Convention, Quaternion] = {
+    "ned": (1.0, 0.0, 0.0, 0.0),
+    "enu": (0.0, _HALF, _HALF, 0.0),
+    "flu": (0.0, 1.0, 0.0, 0.0),
+}
+_HALF_ROLL: Quaternion = (0.0, 1.0, 0.0, 0.0)  # body axes forward, right, down to forward, left, up
 _QUADRANTS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 _UNIT_TOLERANCE = 0.1
+
+Up = Literal["y", "z"]
+# A right-handed camera frame whose first axis lies level, to (first axis, its right-hand side, down).
+_LEVEL: dict[Up, Callable[[Vec3], Vec3]] = {
+    "y": lambda v: (v[0], v[2], -v[1]),
+    "z": _SWAP["flu"],
+}
 
 
 def _cos_sin(yaw_deg: float) -> tuple[float, float]:
@@ -77,11 +92,45 @@ class Frame:
         cos, sin = self._rotation
         return (cos * x - sin * y, sin * x + cos * y, z)
 
+    def attitude_to_ned(self, attitude: Quaternion, *, euler: bool) -> Quaternion:
+        """A body's attitude in this frame as one in local NED, body axes forward, right, down.
+
+        Args:
+            attitude: body axes to this frame's axes (w, x, y, z).
+            euler: it came as Euler angles, whose body axes point up (forward, left, up) where the frame's do.
+        """
+        if euler and self.convention != "ned":
+            attitude = multiply(attitude, _HALF_ROLL)
+        half_rad = math.radians(self.yaw_deg) / 2
+        turned = multiply(_SWAP_TURN[self.convention], attitude)
+        return multiply((math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)), turned)
+
     def velocity_from_ned(self, velocity_mps: Vec3) -> Vec3:
         """A free vector of local NED in this frame; inverse of `velocity_to_ned`."""
         n, e, d = velocity_mps
         cos, sin = self._rotation
         return _SWAP[self.convention]((cos * n + sin * e, cos * e - sin * n, d))
+
+
+def levelled(position_m: Vec3, attitude: Quaternion, up: Up) -> tuple[Vec3, Quaternion]:
+    """A camera system's pose with both sets of axes, the room's and the body's, turned to forward, right, down.
+
+    Args:
+        position_m: in the room's axes, right-handed [m].
+        attitude: the body's axes to the room's (w, x, y, z); a body that it does not turn has the room's axes.
+        up: which axis of both points up.
+
+    Returns:
+        Position [m] and attitude; forward is the first axis.
+    """
+    w, x, y, z = attitude
+    # One turn of both sets of axes turns the axis of the rotation with them, and leaves its angle.
+    return _LEVEL[up](position_m), (w, *_LEVEL[up]((x, y, z)))
+
+
+def axes_turn(convention: Convention) -> Quaternion:
+    """The turn (w, x, y, z) between local NED and a frame of this convention with the same north; its own inverse."""
+    return _SWAP_TURN[convention]
 
 
 def rotate(q: Quaternion, vector: Vec3) -> Vec3 | None:
@@ -107,3 +156,67 @@ def rotate(q: Quaternion, vector: Vec3) -> Vec3 | None:
         b + w * ty + z * tx - x * tz,
         c + w * tz + x * ty - y * tx,
     )
+
+
+def unit(q: tuple[float, ...]) -> Quaternion | None:
+    """A quaternion of length 1; None if it is no rotation (not finite, or its length is not near 1)."""
+    length = math.sqrt(sum(value * value for value in q))
+    if not abs(length - 1.0) <= _UNIT_TOLERANCE:  # also false for NaN
+        return None
+    w, x, y, z = q
+    return w / length, x / length, y / length, z / length
+
+
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """The rotation q, then p."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def from_euler(angles_rad: Vec3) -> Quaternion | None:
+    """The rotation of roll, pitch and yaw [rad], turned about z, y, x in this order; None if one is not finite."""
+    if not all(map(math.isfinite, angles_rad)):
+        return None
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in angles_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def from_axes(axes: Sequence[Sequence[float]]) -> Quaternion:
+    """The rotation that turns the coordinate axes into three orthonormal directions, each up to its sign.
+
+    Args:
+        axes: the directions; the last one is turned round where they would be a mirror image.
+    """
+    a, b, c = axes
+    right = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    if sum(x * y for x, y in zip(right, c, strict=True)) < 0.0:
+        c = right
+    # Four times the products of the quaternion's parts; the row of the largest one loses no digits.
+    rows = (
+        (1 + a[0] + b[1] + c[2], b[2] - c[1], c[0] - a[2], a[1] - b[0]),
+        (b[2] - c[1], 1 + a[0] - b[1] - c[2], a[1] + b[0], c[0] + a[2]),
+        (c[0] - a[2], a[1] + b[0], 1 - a[0] + b[1] - c[2], b[2] + c[1]),
+        (a[1] - b[0], c[0] + a[2], b[2] + c[1], 1 - a[0] - b[1] + c[2]),
+    )
+    w, x, y, z = max(enumerate(rows), key=lambda row: row[1][row[0]])[1]
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length
+
+
+def to_euler(q: Quaternion) -> Vec3:
+    """Roll, pitch and yaw of a rotation [rad]."""
+    w, x, y, z = q
+    pitch = math.asin(min(max(2.0 * (w * y - x * z), -1.0), 1.0))
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    return roll, pitch, math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -7,20 +7,23 @@ it learns and chooses goes to the sink, in the order in which it happened.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-
-import msgspec
+from collections.abc import Callable, Iterable, Iterator
 
 from uavctl.config import Config
 from uavctl.data import (
+    ORDER_ACCEPTED,
+    ORDER_REFUSED,
+    Command,
     ControlMode,
     Datagram,
     Decision,
     Estimate,
     Event,
+    LinkEstimate,
     Outgoing,
     PositionSample,
     Record,
+    Refused,
     Sink,
     StepInput,
     Timing,
@@ -28,17 +31,27 @@ from uavctl.data import (
     raw_topic,
 )
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
+from uavctl.mavlink.hand_over import HAND_OVER_ORDERS, HandOver
 from uavctl.mavlink.link import Link
-from uavctl.mavlink.mode import HandOver, Seen, Sending, State, look
+from uavctl.mavlink.messages import Ack, Message, Text
+from uavctl.mavlink.mode import LEAVES_NONE, Sending, State
+from uavctl.mavlink.relay import Relay
+from uavctl.mavlink.sight import View
+from uavctl.smpc.plant import Plant
 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
-LAND_REQUESTS = 5
+MAX_ORDERS = 16  # that wait for one tick
 
 
-def make_links(config: Config) -> dict[str, Link]:
-    """The connections' protocol states: one for both roles when the two URLs are the same."""
+def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, Link]:
+    """The connections' protocol states: one for both roles when the two URLs are the same.
+
+    Args:
+        config: the configuration.
+        listen: hears every message of others that is understood.
+    """
     shared = config.daemon.vehicle == config.daemon.mocap
     names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
     return {
@@ -50,6 +63,7 @@ def make_links(config: Config) -> dict[str, Link]:
             clock=config.clock,
             source=config.source,
             estimator=config.estimator,
+            listen=listen,
         )
         for name, roles in names.items()
     }
@@ -66,26 +80,54 @@ class ControlLoop:
         self._sink = sink
         self._stopwatch = stopwatch
         self._links = make_links(config)
-        self._hand_over = HandOver()
+        self._relay = Relay(config.relay)
+        self._hand_over = HandOver(config.hand_over, sees_it_down=config.relay.enabled)
+        self._config = config.hand_over
+        self._heard: tuple[Ack | Text, ...] = ()
         self._state = initial_state()
-        self._inbox: deque[tuple[int, PositionSample | VehicleStatus]] = deque()
+        self._inbox: deque[tuple[int, PositionSample | VehicleStatus | Ack | Text]] = deque()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
-        self._requests = 0
-        self._asked_ns = 0
         self.heard_vehicle = False  # whether the last datagram came from the vehicle that is flown
         self.vehicle: VehicleStatus | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
+        self.link: LinkEstimate | None = None
+        self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
+        self._orders: deque[Command] = deque()
 
     @property
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
         over = self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
-        return over and not self._must_ask_again()
+        return self._hand_over.finished or (over and not self._hand_over.busy)
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> None:
-        """Take one datagram that arrived at `at_ns`; ticks before that time will not see it."""
+    @property
+    def plant(self) -> Plant:
+        """The model that the estimate is one of."""
+        return self._controller.plant
+
+    @property
+    def failure(self) -> str:
+        """What the vehicle was asked for and did not do, with its own reason; empty if it did all."""
+        return self._hand_over.failure
+
+    @property
+    def who_flies(self) -> State:
+        """Where the hand-over stands."""
+        return self._hand_over.state
+
+    @property
+    def leaves_vehicle(self) -> bool | None:
+        """Whether a vehicle would be left behind that has flown on our setpoints; None before one is heard."""
+        return None if self.who_flies is State.WAITING else self.who_flies not in LEAVES_NONE
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
+        """Take one datagram that arrived at `at_ns`; ticks before that time will not see it.
+
+        Returns:
+            What is to be sent at once: answers to requests for our time, never anything that moves the vehicle.
+        """
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         self.heard_vehicle = False
         for item in self._links[link].receive(data, at_ns):
@@ -94,6 +136,15 @@ class ControlLoop:
                 self._put("/uavctl/event", at_ns, item)
             else:
                 self._inbox.append((at_ns, item))
+            if isinstance(item, PositionSample):
+                self._relay.take(item, self._links[link].attitude)
+        return tuple(self._send(link, answer, at_ns) for answer in self._links[link].answers())
+
+    def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
+        """Take the word of a connection that it has dropped something unread."""
+        self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
+        for event in self._links[link].refused(counts, at_ns):
+            self._put("/uavctl/event", at_ns, event)
 
     def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> Iterator[Outgoing]:
         """Run the control tick of grid time `at_ns`; yields the bytes to send, each as soon as it is known.
@@ -108,9 +159,20 @@ class ControlLoop:
         self._state, out = step(self._state, inp, self._controller)
         self._last_step_ns = self._stopwatch() - begun
         self.decision, self.estimate = out.decision, out.estimate
+        self.link = out.link or self.link
         self._record(out, at_ns)
-        yield from self._command(out, at_ns)
+        autopilot = "" if self.vehicle is None else self.vehicle.autopilot
+        for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.decision.rejected):
+            yield self._send(VEHICLE, data, at_ns)
+        yield from self._command(inp, out)
         self._record_stats(at_ns)
+
+    def order(self, command: Command) -> bool:
+        """Queue an order of the operator for the next tick; False if too many wait already."""
+        if len(self._orders) >= MAX_ORDERS:
+            return False
+        self._orders.append(command)
+        return True
 
     def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
         """Record what the shell measured around the last tick."""
@@ -130,41 +192,39 @@ class ControlLoop:
 
     def _gather(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
         """All that the tick may know; recorded first, so that a replay knows when the tick ran."""
-        samples, heard = self._take_due(at_ns)
+        samples, heard, self._heard = self._take_due(at_ns)
         inp = StepInput(
             tick=tick,
             at_ns=at_ns,
             samples=samples,
-            vehicle=self._flyable(at_ns),
+            vehicle=self._hand_over.flown(at_ns, self.vehicle),
             missed_ticks=missed_ticks,
             stop=stop,
+            commands=tuple(self._orders),
         )
+        self._orders.clear()
         self._put("/uavctl/step_input", at_ns, inp)
         for status in heard:
             self._put("/uavctl/vehicle", status.at_ns, status)
         return inp
 
-    def _take_due(self, at_ns: int) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...]]:
-        """Samples and vehicle states that arrived up to `at_ns`; the newest state is taken over."""
+    def _take_due(
+        self, at_ns: int
+    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[Ack | Text, ...]]:
+        """What arrived up to `at_ns`: samples, vehicle states, of which the newest is taken over, and words."""
         samples: list[PositionSample] = []
         heard: list[VehicleStatus] = []
+        words: list[Ack | Text] = []
         while self._inbox and self._inbox[0][0] <= at_ns:
             item = self._inbox.popleft()[1]
             if isinstance(item, VehicleStatus):
                 self.vehicle = item
                 heard.append(item)
-            else:
+            elif isinstance(item, PositionSample):
                 samples.append(item)
-        return tuple(samples), tuple(heard)
-
-    def _flyable(self, at_ns: int) -> VehicleStatus | None:
-        """The vehicle as far as it is ours: none when its heartbeats stopped, not external once the pilot took over."""
-        vehicle = self.vehicle
-        if vehicle is None or look(at_ns, vehicle, land=False) is Seen.SILENCE:
-            return None
-        if self._hand_over.state is State.RELEASED:
-            return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} (released to the pilot)")
-        return vehicle
+            else:
+                words.append(item)
+        return tuple(samples), tuple(heard), tuple(words)
 
     def _record(self, out: StepOutput, at_ns: int) -> None:
         if out.estimate is not None:
@@ -177,30 +237,55 @@ class ControlLoop:
         for event in out.events:
             self._put("/uavctl/event", at_ns, event)
 
-    def _command(self, out: StepOutput, at_ns: int) -> Iterator[Outgoing]:
-        """What the vehicle is told: a setpoint, the request to land, or nothing."""
-        sending, events = self._hand_over.update(at_ns, self.vehicle, ready=out.setpoint is not None, land=out.land)
-        for event in events:
+    def _command(self, inp: StepInput, out: StepOutput) -> Iterator[Outgoing]:
+        """What the vehicle is told: a setpoint, a request, or nothing."""
+        at_ns = inp.at_ns
+        told = self._hand_over.update(self._view(inp, out))
+        self.answers = tuple(_answered(inp.commands, out.events, told.events))
+        for event in told.events:
             self._put("/uavctl/event", at_ns, event)
         link = self._links[VEHICLE]
-        takes = sending in (Sending.SETPOINTS, Sending.NEUTRAL) and not self._pilot_took_over()
+        takes = told.sending is not Sending.NOTHING and not self._pilot_took_over()
         if takes and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
             yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
-        if sending is Sending.LAND or (self._must_ask_again() and at_ns - self._asked_ns >= SECOND_NS):
-            self._requests += 1
-            self._asked_ns = at_ns
-            yield self._send(VEHICLE, link.land(at_ns), at_ns)
+        if told.ask is not None:
+            yield self._send(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns)
+        if self._hand_over.ours and self._hand_over.state in (State.READY, State.MODE, State.ARMING):
+            for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
+                yield self._send(VEHICLE, data, at_ns)
+
+    def _view(self, inp: StepInput, out: StepOutput) -> View:
+        """What the hand-over may know."""
+        plant, estimate = self._controller.plant, out.estimate
+        up_m, up_mps = None, 0.0
+        if estimate is not None and "down" in plant.axes:
+            down = plant.axes.index("down")
+            up_m, up_mps = -estimate.mean[plant.position_index[down]], -estimate.mean[plant.velocity_index[down]]
+        unfit = ""
+        if out.setpoint is None or estimate is None:
+            unfit = "the controller has no estimate of the position"
+        elif estimate.age_s > self._config.fresh_s:
+            unfit = f"the newest position is {estimate.age_s:.1f} s old"
+        return View(
+            at_ns=inp.at_ns,
+            vehicle=self.vehicle,
+            up_s=self._links[VEHICLE].vehicle_up_s(inp.at_ns),
+            ready=out.setpoint is not None,
+            land=out.land,
+            stop=inp.stop,
+            unfit=unfit,
+            up_m=up_m,
+            up_mps=up_mps,
+            heard=self._heard,
+            commands=inp.commands,
+        )
 
     def _pilot_took_over(self) -> bool:
         """Whether a heartbeat that came after this late tick's grid time says that the vehicle is no longer ours."""
-        flown = self.vehicle is not None and self.vehicle.external
-        return flown and any(isinstance(item, VehicleStatus) and not item.external for _, item in self._inbox)
-
-    def _must_ask_again(self) -> bool:
-        """Whether the vehicle was asked to land, does not do so yet, and may be asked again."""
-        vehicle, asked = self.vehicle, self._hand_over.state is State.LANDING
-        return asked and vehicle is not None and vehicle.external and vehicle.armed and self._requests < LAND_REQUESTS
+        flown = self._hand_over.state is State.ENGAGED
+        late = [item for _, item in self._inbox if isinstance(item, VehicleStatus)]
+        return flown and any(self._hand_over.has_left(item) for item in late)
 
     def _send(self, link: str, data: bytes, at_ns: int) -> Outgoing:
         self._put(raw_topic(link, outgoing=True), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=True, data=data))
@@ -216,3 +301,17 @@ class ControlLoop:
 
     def _put(self, topic: str, at_ns: int, record: Record) -> None:
         self._sink.put(topic, at_ns, record)
+
+
+def _answered(
+    commands: tuple[Command, ...], core: Iterable[Event], hand_over: Iterable[Event]
+) -> Iterator[tuple[Command, Event]]:
+    """Each order with the event that answers it; the core and the hand-over answer their own, in order."""
+    mine, theirs = (
+        iter([event for event in events if event.code in (ORDER_ACCEPTED, ORDER_REFUSED)])
+        for events in (hand_over, core)
+    )
+    for command in commands:
+        answer = next(mine if command.order in HAND_OVER_ORDERS else theirs, None)
+        if answer is not None:
+            yield command, answer

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -111,7 +111,10 @@ def compose(spec: CampaignSpec, configuration: str, told: Told | None = None) ->
     for i, controller in enumerate(spec.controller):
         for j, link in enumerate(spec.link):
             if controller.link in (TRUE, link.name):
-                believed[i, link.name] = told.load(configured, _beliefs(spec, i, j))
+                beliefs = _beliefs(spec, i, j)
+                one = believed[i, link.name] = told.load(configured, beliefs)
+                if one and base.sim.plant == "linear":
+                    told.tell(flown(one, beliefs, f"controller[{i}].set"))
     told.tell(
         _fits(f"controller[{i}].set", base, one) for (i, _), one in believed.items() if one and _differs(base, one)
     )
@@ -165,6 +168,23 @@ def _beliefs(spec: CampaignSpec, controller: int, link: int) -> Placed:
         *placed(f"controller[{controller}].set", one.set),
         *(pair for pairs in tunings for pair in pairs),
     )
+
+
+def flown(one: Config, given: Placed, key: str) -> Iterator[Problem]:
+    """A vehicle that campaigns do not fly.
+
+    Args:
+        one: A configuration.
+        given: The overrides that made it.
+        key: Where it stands, if none of them named the vehicle.
+    """
+    if one.sim.plant != "linear":
+        named = (at for at, text in reversed(given) if text.partition("=")[0].strip() == "sim.plant")
+        yield Problem(
+            next(named, key),
+            f'sim.plant is "{one.sim.plant}", and campaigns fly the linear plant',
+            'set sim.plant = "linear", and fly the quadrotor with uavctl loopback',
+        )
 
 
 def _differs(base: Config, one: Config) -> bool:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv, ndtri
+from scipy.special import ndtri
 
+from logs.statistics import exact_interval
 from uavctl.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -54,10 +55,7 @@ def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Pair:
     """
     if not 0 <= hits <= trials or trials == 0:
         raise UsageError(f"{hits} of {trials} is no share; count at least one trial, and no more hits than trials")
-    tail = 0.5 * (1.0 - level)
-    low = 0.0 if hits == 0 else float(betaincinv(hits, trials - hits + 1, tail))
-    high = 1.0 if hits == trials else float(betaincinv(hits + 1, trials - hits, 1.0 - tail))
-    return low, high
+    return exact_interval(hits, trials, 0.5 * (1.0 - level))
 
 
 def bootstrap_mean(values: Array, level: float = LEVEL, seed: int = 0) -> Pair:

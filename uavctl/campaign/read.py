@@ -9,7 +9,7 @@ from typing import cast
 import msgspec
 import numpy as np
 
-from uavctl.campaign.compose import Campaign, Told, compose, placed
+from uavctl.campaign.compose import Campaign, Told, compose, flown, placed
 from uavctl.campaign.spec import TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
 from uavctl.config.checks import dimensions
@@ -40,6 +40,7 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
     if base is None:
         raise ConfigError(told.problems)
+    told.tell(flown(base, placed("set", spec.set), "config"))
     told.tell(_starts(spec, base))
     base = msgspec.structs.replace(base, mission=MissionConfig(), fence=())  # runs go to the target, and nowhere else
     return compose(spec, dump_config(base), told), text

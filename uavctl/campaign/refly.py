@@ -93,6 +93,8 @@ def _parts(run: Again) -> str:
         return "the flight's filter believes in the design's plant, and another one flies"
     if run.config.risk.estimate != "exact":
         return "the design counts on a filter of inexact positions, and the flight has one"
+    if run.config.estimator.bias_drift:
+        return "the flight's filter estimates a bias of the inputs"
     return ""
 
 

@@ -18,7 +18,8 @@ from uavctl.bench import DEFAULT_SIZES, BenchResult, run_bench
 from uavctl.bench.plot import bench_svg
 from uavctl.bench.run import Advance
 from uavctl.build import build_design, build_spec
-from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.bench_loop import bench_loop
+from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
 from uavctl.errors import UsageError
 
 _REFRESH_S = 0.2
@@ -34,9 +35,19 @@ def bench(
     ] = DEFAULT_SIZES.states,
     seed: Annotated[int, Parameter(help="seed of states and policies", validator=validators.Number(gte=0))] = 0,
     plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
+    loop: Annotated[
+        bool, Parameter(negative=(), help="measure the whole control loop on real UDP instead, beside an empty one")
+    ] = False,
+    seconds: Annotated[float, Parameter(help="with --loop: length of a run [s]", validator=POSITIVE)] = 60.0,
+    runs: Annotated[
+        int,
+        Parameter(help="with --loop: runs without --realtime, and as many with it", validator=validators.Number(gte=1)),
+    ] = 5,
     common: Common = DEFAULTS,
 ) -> int:
     """Measure the speed of a decision on this machine, beside the problem as printed, in one run."""
+    if loop:
+        return bench_loop(common, seconds, runs)
     loaded = common.load()
     if plot is not None and not plot.parent.is_dir():
         raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")

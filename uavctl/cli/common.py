@@ -12,6 +12,7 @@ import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Console, RenderableType
 
+from sim.faults import problems
 from uavctl.config import Loaded, explain, load
 from uavctl.errors import ConfigError, DesignError
 
@@ -44,7 +45,11 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
-        return load(self.config, self.overrides)
+        loaded = load(self.config, self.overrides)
+        wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
+        if wrong:
+            raise ConfigError(tuple(loaded.source.tell(problem) for problem in wrong))
+        return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:
         """The same with further overrides, from a command's own options; they win."""

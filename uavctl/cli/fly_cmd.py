@@ -1,4 +1,4 @@
-"""`uavctl fly`: the flight daemon on a real link. It never arms, and never asks for a mode but landing."""
+"""`uavctl fly`: the flight daemon on a real link. Without `--arm` it never asks for a mode but landing."""
 
 from __future__ import annotations
 
@@ -7,21 +7,44 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from rich.markup import escape
 
 from logs.disk import check_room
 from logs.recorder import Recorder
 from logs.summary import render
 from uavctl.build import build_design
+from uavctl.cli.before_arming import checked_before_arming, record_items
 from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
-from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
+from uavctl.cli.engagement import (
+    Engagement,
+    check_places,
+    checked_take_off,
+    goto_overrides,
+    stand_by,
+    tell_verdict,
+)
+from uavctl.cli.flying import (
+    LIVE_PORT,
+    Live,
+    LivePort,
+    conclude,
+    live_line,
+    onlookers,
+    put_header,
+    recording_path,
+    stop_limit_s,
+    stop_on_signals,
+)
+from uavctl.cli.operation import as_realtime, operation
 from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns
-from uavctl.config import Config
+from uavctl.config.security import warnings
+from uavctl.control_messages import control_folder, daemon_name
+from uavctl.control_socket import listening
 from uavctl.daemon import fly as run_daemon
+from uavctl.lock import sole_daemon
 from uavctl.loop import ControlLoop
-from uavctl.transport import Connection, open_connection
-
-LANDING_S = 10.0  # after braking: for asking the vehicle to land
+from uavctl.sealed import connected
 
 
 def fly(
@@ -34,52 +57,92 @@ def fly(
     duration: Annotated[
         float | None, Parameter(help="hand over after this time [s]; else fly on", validator=POSITIVE)
     ] = None,
+    arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
+    takeoff: Annotated[
+        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=POSITIVE)
+    ] = None,
+    goto: Annotated[
+        str | None,
+        Parameter(help="x,y,z in local NED [m]: fly there once in charge and stay", allow_leading_hyphen=True),
+    ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+    control: Annotated[
+        Path | None,
+        Parameter(help="folder of the socket for `uavctl ctl`; else $UAVCTL_CONTROL or $XDG_RUNTIME_DIR/uavctl"),
+    ] = None,
+    realtime: Annotated[
+        bool, Parameter(negative=(), help="SCHED_FIFO, locked memory, garbage collected between ticks only")
+    ] = False,
+    live: Live = False,
+    live_port: LivePort = LIVE_PORT,
 ) -> int:
     """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C hands it back.
+
+    With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there; the end,
+    by Ctrl-C or --duration, is its landing.
 
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
     switches. When the pilot leaves the mode, streaming stops at once and does not come back.
     """
     given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap}
-    overrides = [f'{key}="{value}"' for key, value in given.items() if value is not None]
+    take_off_m = checked_take_off(arm, takeoff)
+    overrides = [*(f'{key}="{value}"' for key, value in given.items() if value is not None), *goto_overrides(goto)]
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
-    with located(loaded):
-        design = build_design(config)
-    path = recording_path(out, config.name)
-    check_room(path, config.log.free_bytes)
-    with located(loaded):
-        prepared = prepare(config, design)
-    connections = _connect(config)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
-    begun = time.perf_counter()
-    with stop_on_signals() as stopped:
-        recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
-        try:
-            put_header(recorder, prepared, monotonic_ns())
-            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
-            messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
-            with live_line(loop, recorder, duration, config.daemon.tick_s):
-                limit_s = config.fallback.brake_s + LANDING_S
-                ticker = Ticker(tick_ns, dt_ns)
-                run_daemon(loop, connections, ticker, stopped, duration_s=duration, stop_limit_s=limit_s)
-        finally:
-            for connection in connections.values():
-                connection.close()
-            status = recorder.close()
+    # First of all, so that a second daemon is refused at once.
+    with (
+        sole_daemon(config.daemon.vehicle) as tenure,
+        listening(control_folder(control), daemon_name(config)) as listener,
+    ):
+        path = recording_path(out, config.name)
+        check_room(path, config.log.free_bytes)
+        with located(loaded):
+            design = build_design(config)
+            check_places(config, design, take_off_m, engagement.goal)
+            prepared = prepare(config, design)
+        begun = time.perf_counter()
+        with (
+            as_realtime(realtime) as collect,
+            stop_on_signals() as stopped,
+            connected(config) as connections,
+            onlookers(live_port if live else None) as looking,
+        ):
+            checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
+            recorder = Recorder(path, config.log, onlookers=looking)
+            try:
+                put_header(recorder, prepared, monotonic_ns())
+                record_items(recorder, checked, monotonic_ns())
+                loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+                for warning in warnings(config.security, config.daemon):
+                    messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+                if tenure.left_ns is not None:
+                    stand_by(loop, tenure.left_ns)
+                messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
+                with (
+                    live_line(loop, recorder, duration, config.daemon.tick_s),
+                    operation(loop, config, path, recorder.status, listener) as beside,
+                ):
+                    asked_for = run_daemon(
+                        loop,
+                        connections,
+                        Ticker(tick_ns, dt_ns),
+                        stopped,
+                        duration_s=duration,
+                        stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
+                        after_tick=(
+                            lambda *_: tenure.note(loop.leaves_vehicle),
+                            lambda *_: engagement.follow(loop),
+                            *beside,
+                            *collect,
+                        ),
+                    )
+                if asked_for:
+                    tenure.note(False)
+            finally:
+                status = recorder.close()
     summary = conclude(path, time.perf_counter() - begun, status)
     common.show(summary, lambda: render(summary))
-    return 0 if summary.steps and status.ok else 1
-
-
-def _connect(config: Config) -> dict[str, Connection]:
-    """Open the connections; one if both URLs are the same.
-
-    Raises:
-        ConnectionSpecError: a URL cannot be understood or opened.
-    """
-    urls = {"vehicle": config.daemon.vehicle}
-    if config.daemon.mocap != config.daemon.vehicle:
-        urls["mocap"] = config.daemon.mocap
-    return {name: open_connection(url) for name, url in urls.items()}
+    tell_verdict(engagement.verdict(loop))
+    return 0 if summary.steps and status.ok and not engagement.verdict(loop) else 1

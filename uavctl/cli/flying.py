@@ -12,27 +12,36 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Protocol
+from typing import Annotated, Protocol
 
+from cyclopts import Parameter
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from logs.flight_data import FlightData
 from logs.journal import RecorderStatus
+from logs.live import live_view
+from logs.onlookers import Onlookers
 from logs.reader import read
 from logs.report import write_report
 from logs.summary import FlightSummary, summarise
 from logs.topics import HEADER, LIBRARY
+from logs.views import Views
 from uavctl import __version__
 from uavctl.cli.common import messages
 from uavctl.cli.prepare import Prepared
 from uavctl.code_id import decider_id
+from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design_record import design_record
 
+LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
+LIVE_PORT = 8765  # where Foxglove looks first
+Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer on this machine; needs uavctl[live]")]
+LivePort = Annotated[int, Parameter(help="TCP port of the live view")]
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
@@ -52,6 +61,21 @@ class Recording(Protocol):
     def status(self) -> RecorderStatus:
         """How it is doing."""
         ...
+
+
+@contextmanager
+def onlookers(live_port: int | None = None) -> Iterator[Onlookers]:
+    """Those who look at a flight: viewers of its recording, and with a port a live view.
+
+    Raises:
+        UsageError: there can be no live view.
+    """
+
+    def tell(port: int) -> None:
+        messages().print(f'live view: ws://localhost:{port} (Foxglove, "Open connection")', soft_wrap=True)
+
+    with live_view(live_port, on_open=tell) as watch:
+        yield Onlookers(Views(), watch)
 
 
 def recording_path(out: Path | None, name: str) -> Path:
@@ -97,6 +121,12 @@ def cpu() -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
+def stop_limit_s(config: Config, *, takes_off: bool) -> float:
+    """How long a hand-over may take [s]; a flight that we began, or that lands by our positions, ends on the ground."""
+    lands = takes_off or config.relay.enabled
+    return config.fallback.brake_s + LANDING_S + (config.hand_over.land_s if lands else 0.0)
+
+
 def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary:
     """Read the recording back, sum it up and write the page beside it.
 
@@ -104,7 +134,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
         RecordingError: the recording cannot be read, or nothing was flown.
     """
     tell_losses(status)
-    flight = FlightData.from_records(read(path))
+    flight = FlightData.from_records(read(path), path)
     page = path.with_suffix(".html")
     summary = summarise(
         flight,
@@ -176,7 +206,7 @@ def _line(loop: ControlLoop) -> str:
 def _alarm(status: RecorderStatus) -> str:
     """What a person has to know of the recording while it is being made."""
     if status.ok:
-        return ""
+        return f"  [yellow]disk gets low: {escape(status.warning)}[/]" if status.warning else ""
     return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
 
 

@@ -6,7 +6,7 @@ import multiprocessing
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
@@ -17,22 +17,37 @@ from cyclopts import Parameter
 from rich.progress import Progress
 
 from logs.disk import check_room
+from logs.onlookers import Onlookers
 from logs.recorder import Recorder, SyncRecorder
 from logs.summary import FlightSummary, render
+from logs.views import Views
 from sim.script import Script
 from sim.server import Ready, serve_in_child
 from sim.world import World
 from uavctl.build import build_design
-from uavctl.cli.common import DEFAULTS, Common, located, messages
-from uavctl.cli.flying import conclude, live_line, put_header, recording_path, stop_on_signals
+from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
+from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_verdict
+from uavctl.cli.flying import (
+    LIVE_PORT,
+    Live,
+    LivePort,
+    conclude,
+    live_line,
+    onlookers,
+    put_header,
+    recording_path,
+    stop_limit_s,
+    stop_on_signals,
+)
 from uavctl.cli.prepare import Prepared, prepare
+from uavctl.cli.sim_door import make_door
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon import fly
 from uavctl.data import Outgoing, Sink, Truth
 from uavctl.errors import UavctlError, UsageError
 from uavctl.loop import ControlLoop
-from uavctl.transport import open_connection
+from uavctl.sealed import connected
 
 START_LIMIT_S = 20.0
 TRUTH = "/sim/truth"
@@ -44,14 +59,28 @@ def loopback(
     udp: Annotated[bool, Parameter(negative=(), help="real UDP sockets and real time, else lockstep")] = False,
     duration: Annotated[float | None, Parameter(help="length of the flight [s]; else duration_s")] = None,
     seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed")] = None,
+    arm: Annotated[bool, Parameter(negative=(), help="begin on the ground, disarmed; needs --takeoff")] = False,
+    takeoff: Annotated[
+        float | None,
+        Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=POSITIVE),
+    ] = None,
+    goto: Annotated[
+        str | None, Parameter(help="x,y,z in local NED [m]: fly there and stay", allow_leading_hyphen=True)
+    ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+    live: Live = False,
+    live_port: LivePort = LIVE_PORT,
 ) -> int:
     """Fly the simulated vehicle over a lossy link, record it, and report.
 
-    In virtual time the same seed gives the same flight, bit for bit.
+    In virtual time the same seed gives the same flight, bit for bit. It begins in the air; with --arm --takeoff HEIGHT
+    on the ground, and after its duration it ends there too.
     """
+    take_off_m = checked_take_off(arm, takeoff)
+    if live and not udp:
+        raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
     given = {"duration_s": duration, "sim.seed": seed}
-    overrides = [f"{key}={value}" for key, value in given.items() if value is not None]
+    overrides = [*(f"{key}={value}" for key, value in given.items() if value is not None), *goto_overrides(goto)]
     loaded = common.with_overrides(overrides).load()
     config = _on_loopback(loaded.config) if udp else loaded.config
     if config.duration_s < config.daemon.tick_s:
@@ -60,39 +89,55 @@ def loopback(
         design = build_design(config)
     path = recording_path(out, config.name)
     check_room(path, config.log.free_bytes)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
     with located(loaded):
+        check_places(config, design, take_off_m, engagement.goal)
         prepared = prepare(config, design)
-    summary = (_real_time if udp else lockstep)(prepared, path)
+    if udp:
+        summary, verdict = _real_time(prepared, path, engagement, live_port if live else None)
+    else:
+        summary, verdict = lockstep(prepared, path, engagement)
     common.show(summary, lambda: render(summary))
-    return 0 if summary.steps and not summary.recorder_dropped else 1
+    tell_verdict(verdict)
+    return 0 if summary.steps and not summary.recorder_dropped and not verdict else 1
 
 
 class _Timed:
     """A loop in virtual time: nothing is ever late, and the time in the core is recorded."""
 
-    def __init__(self, loop: ControlLoop) -> None:
+    def __init__(self, loop: ControlLoop, engagement: Engagement) -> None:
         self._loop = loop
+        self._engagement = engagement
+        self.stop = False
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> None:
-        self._loop.receive(link, data, at_ns)
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        return self._loop.receive(link, data, at_ns)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        yield from self._loop.tick(tick, at_ns)
+        yield from self._loop.tick(tick, at_ns, stop=self.stop)
         self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
+        self._engagement.follow(self._loop)
 
 
 class _InterruptedError(Exception):
     """The operator asked for the end of a flight in virtual time."""
 
 
-def lockstep(prepared: Prepared, path: Path, script: Script | None = None) -> FlightSummary:
-    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn."""
-    config = prepared.config
-    recorder = SyncRecorder(path, config.log.chunk_bytes, config.log.queue)
+def lockstep(
+    prepared: Prepared, path: Path, engagement: Engagement, script: Script | None = None
+) -> tuple[FlightSummary, str]:
+    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn.
+
+    Returns:
+        Its figures, and what it was to do and did not.
+    """
+    config, takes_off = prepared.config, engagement.takes_off
+    recorder = SyncRecorder(path, config.log, onlookers=Onlookers(Views()))
     begun = time.perf_counter()
     try:
         put_header(recorder, prepared, started_ns=0)
-        loop = _Timed(ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns))
+        loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+        timed = _Timed(loop, engagement)
         with (
             suppress(_InterruptedError),
             stop_on_signals() as stopped,
@@ -108,37 +153,49 @@ def lockstep(prepared: Prepared, path: Path, script: Script | None = None) -> Fl
             def record(truth: Truth) -> None:
                 recorder.put(TRUTH, truth.at_ns, truth)
 
-            world = World(config, loop, on_truth=record, on_progress=show, script=script)
+            world = World(config, timed, on_truth=record, on_progress=show, airborne=not takes_off, script=script)
             begun = time.perf_counter()
-            world.run(config.duration_s)
+            world.run(config.duration_s, lambda: takes_off and loop.finished)
+            if takes_off:
+                timed.stop = True
+                world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: loop.finished)
     finally:
         wall_s = time.perf_counter() - begun
         status = recorder.close()
-    return conclude(path, wall_s, status)
+    return conclude(path, wall_s, status), engagement.verdict(loop)
 
 
-def _real_time(prepared: Prepared, path: Path) -> FlightSummary:
-    config = prepared.config
+def _real_time(
+    prepared: Prepared, path: Path, engagement: Engagement, live_port: int | None
+) -> tuple[FlightSummary, str]:
+    config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
-    urls = {"vehicle": config.daemon.vehicle, "mocap": config.daemon.mocap}
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
-        connections = {name: open_connection(url) for name, url in urls.items()}
-        for connection in connections.values():
-            stack.callback(connection.close)
-        recorder = Recorder(path, config.log.chunk_bytes, config.log.queue)
+        connections = stack.enter_context(connected(config))
+        looking = stack.enter_context(onlookers(live_port))
+        recorder = Recorder(path, config.log, onlookers=looking)
         try:
             put_header(recorder, prepared, monotonic_ns())
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
-            stack.enter_context(_simulator(config, recorder))
-            stack.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            simulator = stack.enter_context(ExitStack())
+            simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
+            simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
             begun = time.perf_counter()
-            fly(loop, connections, Ticker(tick_ns, dt_ns), stopped, duration_s=config.duration_s, stop_limit_s=0.0)
+            fly(
+                loop,
+                connections,
+                Ticker(tick_ns, dt_ns),
+                stopped,
+                duration_s=config.duration_s,
+                stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                after_tick=(lambda *_: engagement.follow(loop),),
+            )
             wall_s = time.perf_counter() - begun
-            stack.close()  # the simulator's last words go into the recording
+            simulator.close()  # its last words go into the recording
         finally:
             status = recorder.close()
-    return conclude(path, wall_s, status)
+    return conclude(path, wall_s, status), engagement.verdict(loop)
 
 
 def _on_loopback(config: Config) -> Config:
@@ -151,7 +208,7 @@ def _on_loopback(config: Config) -> Config:
 
 
 @contextmanager
-def _simulator(config: Config, sink: Sink) -> Iterator[None]:
+def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
     """The simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
 
     Raises:
@@ -161,7 +218,8 @@ def _simulator(config: Config, sink: Sink) -> Iterator[None]:
     ours, theirs = context.Pipe(duplex=False)
     stop = context.Event()
     urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
-    child = context.Process(target=serve_in_child, args=(theirs, stop, config, *urls, None, True), name="simulator")
+    arguments = (theirs, stop, config, *urls, None, airborne, make_door(config.security))
+    child = context.Process(target=serve_in_child, args=arguments, name="simulator")
     child.start()
     theirs.close()
     listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)

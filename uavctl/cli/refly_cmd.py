@@ -17,6 +17,7 @@ from uavctl.campaign.again import again
 from uavctl.campaign.refly import Agreement, Reflight, agreement, reflight
 from uavctl.campaign.results import read_cells
 from uavctl.campaign.verdict import SMPC
+from uavctl.cli.engagement import Engagement
 from uavctl.cli.flying import recording_path
 from uavctl.cli.loopback_cmd import lockstep
 from uavctl.cli.prepare import prepare, ready_library
@@ -54,7 +55,8 @@ def fly_again(flight: Reflight, out: Path | None) -> Reflown:
     config = flight.config
     path = recording_path(out, "refly")
     check_room(path, config.log.free_bytes)
-    summary = lockstep(prepare(config, build_design(config)), path, flight.script)
+    as_flown = Engagement(config, take_off_m=None, goto=False)
+    summary, _ = lockstep(prepare(config, build_design(config)), path, as_flown, flight.script)
     return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
 
 

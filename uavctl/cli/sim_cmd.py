@@ -11,10 +11,12 @@ from typing import Annotated, Literal
 import msgspec
 from cyclopts import Parameter, validators
 
+from sim.faults import problems
 from sim.fleet import fleet
 from sim.server import Ready, Seat, serve_all
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common, messages
+from uavctl.cli.common import DEFAULTS, Common, messages
 from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.sim_door import make_door
 from uavctl.cli.sim_view import watching
 from uavctl.config.fault_file import with_faults
 from uavctl.data import Truth
@@ -24,6 +26,8 @@ VEHICLES = {
     "ardupilot": "tcpin://127.0.0.1:5760",
 }
 MOST_VEHICLES = 10
+FASTEST = 1000.0
+LONGEST_S = 1e6
 
 
 def sim(
@@ -44,9 +48,16 @@ def sim(
     ] = None,
     airborne: Annotated[bool, Parameter(negative=(), help="start flying in OFFBOARD or GUIDED")] = False,
     duration: Annotated[
-        float | None, Parameter(help="end after this simulated time [s]; else on Ctrl-C", validator=POSITIVE)
+        float | None,
+        Parameter(
+            help="end after this simulated time [s], at most 1e6; else on Ctrl-C",
+            validator=validators.Number(gt=0, lte=LONGEST_S),
+        ),
     ] = None,
-    speed: Annotated[float, Parameter(help="simulated time per real time", validator=POSITIVE)] = 1.0,
+    speed: Annotated[
+        float,
+        Parameter(help="simulated time per real time, at most 1000", validator=validators.Number(gt=0, lte=FASTEST)),
+    ] = 1.0,
     faults: Annotated[
         Path | None, Parameter(help="TOML file of what happens, as [[fault]] tables with the keys of [[sim.fault]]")
     ] = None,
@@ -54,7 +65,7 @@ def sim(
         int,
         Parameter(
             help="how many at once, 1 to 10. Each has the system id and the seed of the one before plus one, starts "
-            "1 m east of it, and its ports lie 1 (UDP) or 10 (TCP) higher",
+            "1 m from it, and its ports lie 1 (UDP) or 10 (TCP) higher",
             validator=validators.Number(gte=1, lte=MOST_VEHICLES),
         ),
     ] = 1,
@@ -66,12 +77,12 @@ def sim(
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     config = common.with_overrides(overrides).load().config
     if faults is not None:
-        config = with_faults(config, faults)
+        config = with_faults(config, faults, problems)
 
     def forget(truth: Truth) -> None:
         del truth
 
-    seats = fleet(config, vehicle or VEHICLES[config.sim.autopilot], mocap, vehicles, forget)
+    seats = fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
     opened: list[Ready] = []
 
     def ready(ports: Ready) -> None:
@@ -89,6 +100,7 @@ def sim(
             stop=stopped,
             speed=speed,
             on_look=on_look,
+            door=make_door(config.security),
         )
     return 0
 

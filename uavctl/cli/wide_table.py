@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions
+from rich.console import Console, ConsoleOptions, JustifyMethod
 from rich.table import Table
 
 _BETWEEN = 3  # a border and a blank on either side
@@ -18,6 +18,7 @@ class Column:
 
     heading: str
     cells: Sequence[str]
+    justify: JustifyMethod = "right"
 
     @property
     def width(self) -> int:
@@ -32,19 +33,22 @@ class WideTable:
     Attributes:
         first: Column that names the rows, in every table.
         groups: Columns that stay together where there is room for them.
+        sections: Rows that a line is drawn below.
     """
 
     first: Column
     groups: Sequence[Sequence[Column]]
+    sections: frozenset[int] = frozenset()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         del console
         for columns in self._cut(options.max_width - 1 - self.first.width):
             table = Table()
             for column in (self.first, *columns):
-                table.add_column(column.heading, justify="right", no_wrap=True)
-            for row in zip(self.first.cells, *(column.cells for column in columns), strict=True):
-                table.add_row(*row)
+                table.add_column(column.heading, justify=column.justify, no_wrap=True)
+            rows = zip(self.first.cells, *(column.cells for column in columns), strict=True)
+            for number, row in enumerate(rows):
+                table.add_row(*row, end_section=number in self.sections)
             yield table
 
     def _cut(self, room: int) -> list[list[Column]]:

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from uavctl.config import mission_checks, sim_checks
+from uavctl.config import log, mission_checks, peer_checks, security, sim_checks
 from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem as Problem
 from uavctl.config.types import (
     CostConfig,
+    EstimatorConfig,
     Floats,
     LimitsConfig,
     LinkConfig,
@@ -243,6 +244,25 @@ def _limits(limits: LimitsConfig) -> Iterator[Problem]:
 
 
 _CheckFunction = Callable[..., Iterator[Problem]]
+
+
+def _bias(sets: SetsConfig, estimator: EstimatorConfig) -> Iterator[Problem]:
+    if (estimator.bias_drift > 0.0) != (estimator.bias_max > 0.0):
+        missing = "bias_max" if estimator.bias_drift else "bias_drift"
+        yield Problem(
+            f"estimator.{missing}",
+            "is 0, and the other one of bias_drift and bias_max is not",
+            "give both, or neither for a filter without a bias",
+        )
+    for i, (low, high) in enumerate(zip(sets.input_lower, sets.input_upper, strict=False)):
+        if high - low <= 2.0 * estimator.bias_max:
+            yield Problem(
+                "estimator.bias_max",
+                f"{estimator.bias_max:g} on either side leaves nothing of input {i}, {low:g} to {high:g}",
+                f"give less than {0.5 * (high - low):g}, or wider sets.input_lower and input_upper",
+            )
+
+
 _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("plant",), _plant),
     (("plant", "sets"), _sets),
@@ -253,6 +273,12 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("link",), _link),
     (("plant", "daemon"), _tick),
     (("limits",), _limits),
+    (("sets", "estimator"), _bias),
+    (("security",), security.check),
+    (("daemon",), peer_checks.roles),
+    (("daemon", "source"), peer_checks.source),
+    (("daemon", "security"), peer_checks.signing),
+    (("log",), log.check),
     (("sim",), sim_checks.sim),
     (("sim", "daemon"), sim_checks.ids),
     (("plant", "sets", "mission"), mission_checks.mission),

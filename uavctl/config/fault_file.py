@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
 from uavctl.config.data_file import DataFileError, read_lines
 from uavctl.config.index import key_lines
@@ -17,15 +20,23 @@ from uavctl.config.source import Source
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
 
+Check = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[Problem]]
+_Faults = Annotated[tuple[FaultConfig, ...], Meta(description="what happens in the course of a flight")]
+
 
 class _FaultFile(Section, frozen=True, kw_only=True):
     """The whole file."""
 
-    fault: tuple[FaultConfig, ...]
+    fault: _Faults
 
 
-def with_faults(config: Config, path: Path) -> Config:
+def with_faults(config: Config, path: Path, check: Check) -> Config:
     """The configuration with the faults of a file after its own.
+
+    Args:
+        config: the configuration.
+        path: the file.
+        check: what the simulator cannot do of a list of faults, given the kind of autopilot, the list and its key.
 
     Raises:
         ConfigError: With all problems found in the file, each with its line.
@@ -38,6 +49,7 @@ def with_faults(config: Config, path: Path) -> Config:
     script = decode(_FaultFile, parse_toml(text, str(path)), "", found, {})
     given = script.fault if isinstance(script, _FaultFile) else ()
     found.extend(faults("fault", given, config.sim.plant))
+    found.extend(check(config.sim.autopilot, given, "fault"))
     if found:
         source = Source(str(path), key_lines(text))
         raise ConfigError(tuple(source.tell(problem) for problem in found))

@@ -44,6 +44,13 @@ class MissionConfig(Section, frozen=True, kw_only=True):
     accept_m: Annotated[
         float, Meta(gt=0, description="a waypoint is reached when the estimate is this near to it [m]")
     ] = 0.3
+    then: Annotated[
+        Literal["hold", "land"],
+        Meta(
+            description="after the last waypoint's time, or the trajectory's end: `hold` that place, or `land`: brake "
+            "and hand over to the vehicle's own landing"
+        ),
+    ] = "hold"
     trajectory: TrajectoryConfig = TrajectoryConfig()
 
 

@@ -45,6 +45,12 @@ def mission(plant: PlantConfig, sets: SetsConfig, given: MissionConfig) -> Itera
             f"has {len(given.hold_s)} entries, there are {len(given.waypoints)} waypoints",
             "give one number, or one for each waypoint",
         )
+    if given.then == "land" and not given.waypoints and not moves:
+        yield Problem(
+            "mission.then",
+            '"land" has no end to come after: the target is held',
+            "give waypoints or a trajectory; one waypoint with a hold_s will do",
+        )
     holds = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,)
     if min(holds, default=0.0) < 0:
         yield Problem("mission.hold_s", "a time is negative", "give numbers >= 0")

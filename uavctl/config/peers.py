@@ -8,6 +8,9 @@ from msgspec import Meta
 
 from uavctl.config.section import Position, Section
 
+CAMERAS = ("natnet:",)  # URLs of camera systems that are listened to without a bridge
+CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
+
 
 class FrameConfig(Section, frozen=True, kw_only=True):
     """Camera frame to local NED."""
@@ -66,7 +69,11 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     tick_s: Annotated[float, Meta(gt=0, le=0.1, description="time between setpoints; divides Δt [s]")]
     vehicle: Annotated[str, Meta(description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
     mocap: Annotated[
-        str, Meta(description="URL of the source of positions; the same URL as the vehicle's is one connection")
+        str,
+        Meta(
+            description="URL of the source of positions; the same URL as the vehicle's is one connection. "
+            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)"
+        ),
     ] = "udpin://0.0.0.0:14560"
     system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
     component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
+
 from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem
 from uavctl.config.section import Spans
 from uavctl.config.sim import FaultConfig, QuadrotorConfig, SimConfig, WindConfig
+
+# Keys that a kind of fault heeds; the others are spans.
+_OF_KIND = {"wind": ("velocity_mps",), "battery": ("charge",), "parameter": ("name", "value"), "mode": ("name",)}
 
 
 def spans(key: str, given: Spans) -> Iterator[Problem]:
@@ -57,6 +62,10 @@ def faults(key: str, given: tuple[FaultConfig, ...], plant: str) -> Iterator[Pro
 
 
 def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[Problem]:
+    meant = ("at_s", "kind", *_OF_KIND.get(fault.kind, ("for_s",)))
+    for field in msgspec.structs.fields(fault):
+        if field.name not in meant and getattr(fault, field.name) != field.default:
+            yield Problem(f"{key}.{field.name}", f'has no effect with kind "{fault.kind}"', "remove it")
     if fault.kind in ("wind", "battery"):
         if plant == "linear":
             yield Problem(f"{key}.kind", f'plant "linear" has no {fault.kind}', 'set sim.plant = "quadrotor"')

@@ -10,14 +10,18 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from uavctl.config.hand_over import HandOverConfig
 from uavctl.config.link import LinkConfig as LinkConfig
+from uavctl.config.log import LogConfig as LogConfig
 from uavctl.config.mission import FenceConfig as FenceConfig
 from uavctl.config.mission import MissionConfig as MissionConfig
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.preflight import CheckConfig, RelayConfig
 from uavctl.config.section import Floats as Floats
 from uavctl.config.section import Position as Position
 from uavctl.config.section import Rows as Rows
 from uavctl.config.section import Section as Section
+from uavctl.config.security import SecurityConfig as SecurityConfig
 from uavctl.config.sim import SimConfig
 
 
@@ -205,6 +209,34 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     max_velocity_mps: Annotated[
         float, Meta(gt=0, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
     ] = 100.0
+    gate_sigma: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="a position further from the prediction than this many standard deviations, gate_m, and what "
+            "inputs can have done since the newest one, counts as lost",
+        ),
+    ] = 6.0
+    gate_m: Annotated[
+        float, Meta(ge=0, description="margin of that for what the model does not know, as gusts [m]")
+    ] = 0.3
+    bias_drift: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="standard deviation of what an unknown acceleration that stays (wind, uncompensated drag, an "
+            "error of the hover thrust) gains in a second, each input; the filter estimates it, and it is flown "
+            "against; 0: there is none, as printed [input units/√s]",
+        ),
+    ] = 0.0
+    bias_max: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="largest part of it that is flown against, and what plans leave free of each input for that; "
+            "with bias_drift above 0 [input units]",
+        ),
+    ] = 0.0
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):
@@ -217,6 +249,14 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
     hold_s: Annotated[float, Meta(ge=0, description="then zero acceleration for this long [s]")] = 3.0
     land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
     recover_samples: Annotated[int, Meta(ge=1, description="fresh samples in a row before plans are flown again")] = 3
+    jump_s: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="positions that the vehicle cannot have come to, and that agree for this long, are a source "
+            "that moved: brake and land, and plans are not flown again [s]",
+        ),
+    ] = 0.5
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True):
@@ -226,18 +266,6 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
         Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")
     ]
     slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
-
-
-class LogConfig(Section, frozen=True, kw_only=True):
-    """Recording."""
-
-    chunk_bytes: Annotated[int, Meta(ge=1024, le=16384, description="largest chunk of the recording [bytes]")] = 16384
-    queue: Annotated[
-        int, Meta(ge=16, description="records that may wait for the disk; more are dropped and counted")
-    ] = 8192
-    free_bytes: Annotated[int, Meta(ge=0, description="a flight is refused with less free space than this [bytes]")] = (
-        50_000_000
-    )
 
 
 class Config(Section, frozen=True, kw_only=True):
@@ -262,6 +290,10 @@ class Config(Section, frozen=True, kw_only=True):
     fallback: FallbackConfig = FallbackConfig()
     clock: ClockConfig = ClockConfig()
     source: SourceConfig = SourceConfig()
+    hand_over: HandOverConfig = HandOverConfig()
+    check: CheckConfig = CheckConfig()
+    relay: RelayConfig = RelayConfig()
+    security: SecurityConfig = SecurityConfig()
     log: LogConfig = LogConfig()
     mission: MissionConfig = MissionConfig()
     fence: Annotated[tuple[FenceConfig, ...], Meta(description="limits that change in flight")] = ()

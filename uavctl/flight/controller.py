@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from uavctl.data import ControlMode, Plan, Vec3
+from uavctl.data import Command, ControlMode, Plan, Vec3
 from uavctl.flight.estimator import History
 from uavctl.flight.fallback import Fallback, FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
+from uavctl.flight.reach import GateParameters, Reach, make_reach
+from uavctl.flight.samples import Trust
 from uavctl.naming import Names
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
@@ -30,11 +32,13 @@ class Controller:
         estimator: Parameters of the filter.
         fallback: Parameters of the fallback.
         limits: Parameters of the last gate.
+        trust: How far positions are believed.
         dt_ns: Δt [ns].
         tick_ns: Time between ticks [ns]; divides Δt.
         link: What the estimate of the link goes by.
         late_steps: Age up to which the solver counts what it has not seen since [steps].
         kalman: The filter, made from the others.
+        reach: Where the vehicle can be, made from the others.
 
     Raises:
         ValueError: If the ticks do not divide Δt, or a target has not one entry a state.
@@ -49,11 +53,13 @@ class Controller:
     estimator: EstimatorParameters
     fallback: FallbackParameters
     limits: LimitsParameters
+    trust: GateParameters
     dt_ns: int
     tick_ns: int
     link: LinkEstimateParameters
     late_steps: int = 0
     kalman: Kalman = field(init=False, repr=False)
+    reach: Reach = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
@@ -62,6 +68,8 @@ class Controller:
             if waypoint.target.shape != (self.plant.n_x,):
                 raise ValueError(f"target has shape {waypoint.target.shape}, wanted ({self.plant.n_x},)")
         object.__setattr__(self, "kalman", make_kalman(self.plant, self.estimator, self.dt_ns))
+        ticks = self.horizon * self.ticks_per_step
+        object.__setattr__(self, "reach", make_reach(self.plant, self.limits, self.trust, self.tick_ns, ticks))
 
     @property
     def ticks_per_step(self) -> int:
@@ -78,9 +86,11 @@ class ControlState:
         decided_step: Step of the last boundary that was seen.
         plan: The plan that is flown; None if none is.
         fallback: The fallback that flies; None if it does not.
+        trust: What is known of the sources of positions.
         fresh: Fresh samples in a row.
         accel_mps2: The last setpoint.
         mission: How far the mission has come; None before the first decision.
+        order: What the operator ordered of the mission and no decision has taken up yet.
         link: What the boundaries so far have shown of the link.
         link_alarms: What was told of the link and still holds, by event code.
     """
@@ -89,9 +99,11 @@ class ControlState:
     decided_step: int | None = None
     plan: Plan | None = None
     fallback: Fallback | None = None
+    trust: Trust = field(default_factory=Trust)
     fresh: int = 0
     accel_mps2: Vec3 = ZERO
     mission: MissionState | None = None
+    order: Command | None = None
     link: LinkBelief = NOTHING_SEEN
     link_alarms: tuple[str, ...] = ()
 

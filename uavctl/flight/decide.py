@@ -6,13 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.estimator import History, estimate, newest_capture_ns
-from uavctl.flight.fallback import Fallback
+from uavctl.flight.estimator import History, belief_at, estimate, estimated, newest_capture_ns
+from uavctl.flight.fallback import End, Fallback
+from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
-from uavctl.flight.mission import advance, ask_for
+from uavctl.flight.mission import MissionState, advance, ask_for, over
+from uavctl.flight.orders import obey, told, unready
 from uavctl.flight.planning import ask
 from uavctl.smpc.plant import Plant
 
@@ -25,6 +27,7 @@ class Tick:
     boundary_ns: int  # where step k began
     boundary: bool  # the first tick of its step that runs
     history: History
+    belief: Belief | None
     estimate: Estimate | None
     age_steps: int | None
 
@@ -39,6 +42,14 @@ class Choice:
     solve: SolveStatus | None = None
     plan: Plan | None = None
     trouble: str = ""
+    mute: bool = False  # nothing may be sent in this tick
+
+
+_FINAL = {
+    End.BARRED: "positions jumped and are not believed any more",
+    End.STOP: "the operator asked for the hand-over",
+    End.LAND: "landing is due",
+}
 
 
 def place(state: ControlState, inp: StepInput, history: History, controller: Controller) -> Tick:
@@ -50,12 +61,14 @@ def place(state: ControlState, inp: StepInput, history: History, controller: Con
     number, into = divmod(inp.tick, controller.ticks_per_step)
     boundary_ns = inp.at_ns - into * controller.tick_ns
     captured_ns = newest_capture_ns(history, boundary_ns)
+    belief = belief_at(controller.kalman, history, inp.at_ns)
     return Tick(
         number=number,
         boundary_ns=boundary_ns,
         boundary=state.decided_step is None or number > state.decided_step,
         history=history,
-        estimate=estimate(controller.kalman, history, inp.at_ns),
+        belief=belief,
+        estimate=None if belief is None else estimated(controller.kalman, belief),
         age_steps=None if captured_ns is None else (boundary_ns - captured_ns) // controller.dt_ns,
     )
 
@@ -65,17 +78,17 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     if state.fallback is not None and state.fallback.ended:
         return _fall(state, state.fallback, tick, inp.at_ns, controller, "handed over")
     why_not = unready(inp.vehicle)
-    stopping = inp.stop or (state.fallback is not None and state.fallback.stopping)
-    if why_not and stopping:
-        ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns)
+    if inp.stop:
+        state = replace(state, fallback=fb.request(state.fallback, End.STOP, inp.at_ns))
+    if why_not and (inp.stop or (state.fallback is not None and state.fallback.end is End.STOP)):
+        ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns, end=End.STOP)
         return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
-    if inp.vehicle is None and state.fallback is not None:
-        return _wait_out(state, state.fallback, tick, inp.at_ns, controller)
+    if inp.vehicle is None and state.mode is not ControlMode.WAIT:
+        return _wait_out(state, state.fallback or fb.enter(inp.at_ns), tick, inp.at_ns, controller)
     if why_not:
         return Choice(replace(state, plan=None, fallback=None), why_not)
-    if stopping:
-        stopped = fb.request_stop(state.fallback, inp.at_ns)
-        return _fall(state, stopped, tick, inp.at_ns, controller, "the operator asked for the hand-over")
+    if state.fallback is not None and state.fallback.final:
+        return _fall(state, state.fallback, tick, inp.at_ns, controller, _FINAL[state.fallback.end])
     if tick.boundary:
         return _decide(state, tick, inp.at_ns, controller)
     if state.fallback is not None:
@@ -95,7 +108,16 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
     if state.fallback is not None and state.fresh < controller.fallback.recover_samples:
         reason = f"{state.fresh} of {controller.fallback.recover_samples} fresh samples in a row"
         return _fall(state, state.fallback, tick, at_ns, controller, reason)
-    choice = _replan(state, tick, controller)
+    on_time = at_ns == tick.boundary_ns
+    base = tick.estimate if on_time else estimate(controller.kalman, tick.history, tick.boundary_ns)
+    if base is None:
+        return Choice(state, "no estimate of this boundary")
+    mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
+    state = replace(state, mission=mission)
+    if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
+        landing = fb.request(state.fallback, End.LAND, at_ns)
+        return _fall(state, landing, tick, at_ns, controller, "the mission is over: landing")
+    choice = _replan(state, mission, base, tick, controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
@@ -103,30 +125,28 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
     return replace(choice, state=fallen.state, reason=fallen.reason)
 
 
-def _replan(state: ControlState, tick: Tick, controller: Controller) -> Choice:
-    """Ask for a plan if there is news; else, or if that fails, the old one plays out."""
-    base = estimate(controller.kalman, tick.history, tick.boundary_ns)
-    if base is None:
-        return Choice(state, "no news: the plan plays out")
-    mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
-    state = replace(state, mission=mission)
+def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Tick, controller: Controller) -> Choice:
+    """Ask for a plan if there is news, as ordered; else, or if that fails, the old one plays out."""
     if state.plan is not None and base.captured_ns <= state.plan.captured_ns:
         return Choice(state, "no news: the plan plays out")
+    reason = "news: a new plan" if state.order is None else f"news: a new plan, as ordered: {told(state.order)}"
+    mission = obey(controller.mission, mission, state.order, base.mean, tick.boundary_ns)
+    state = replace(state, mission=mission, order=None)
     target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
     outlook = replace(outlook, late=min(tick.age_steps or 0, controller.late_steps))
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:
         return Choice(state, "no new plan: the old one plays out", True, asked.status, None, asked.text)
-    return Choice(replace(state, plan=asked.plan, fallback=None), "news: a new plan", True, asked.status, asked.plan)
+    return Choice(replace(state, plan=asked.plan, fallback=None), reason, True, asked.status, asked.plan)
 
 
 def _fall(
     state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller, reason: str
 ) -> Choice:
     """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
-    fallback = _advanced(fallback, tick, at_ns, controller)
-    if fallback.mode is ControlMode.LAND and not fallback.stopping:
+    fallback = _advanced(state, fallback, tick, at_ns, controller)
+    if fallback.mode is ControlMode.LAND and not fallback.final:
         reason = f"held for {controller.fallback.hold_s:g} s, and positions did not come back: landing"
     fresh = 0 if state.fallback is None else state.fresh
     return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
@@ -135,16 +155,21 @@ def _fall(
 def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Choice:
     """Let the fallback's time run on while the vehicle is silent.
 
-    Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime.
+    Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
+    nothing is sent, so that a vehicle that still listens lands by its own failsafe.
     """
-    later = _advanced(fallback, tick, at_ns, controller)
-    reason = "no vehicle is heard; the fallback's time runs on"
-    return Choice(replace(state, fallback=fallback if later.ended else later), reason)
+    later = _advanced(state, fallback, tick, at_ns, controller)
+    state = replace(state, plan=None, fresh=0 if state.fallback is None else state.fresh)
+    if later.ended:
+        reason = "no vehicle is heard, and the time to hold is over: its own failsafe is left to act"
+        due = fallback if fallback.final else replace(fallback, end=End.LAND)
+        return Choice(replace(state, fallback=due), reason, mute=True)
+    return Choice(replace(state, fallback=later), "no vehicle is heard; the fallback's time runs on")
 
 
-def _advanced(fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Fallback:
+def _advanced(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Fallback:
     speed_mps = float(np.linalg.norm(velocity(tick.estimate, controller.plant)))
-    return fb.advance(fallback, at_ns, speed_mps, controller.fallback)
+    return fb.advance(fallback, at_ns, speed_mps, state.accel_mps2, controller.fallback)
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
@@ -154,14 +179,3 @@ def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
     speeds = dict(zip(plant.axes, (estimated.mean[index] for index in plant.velocity_index), strict=True))
     north, east, down = (speeds.get(axis, 0.0) for axis in AXES)
     return north, east, down
-
-
-def unready(vehicle: VehicleStatus | None) -> str:
-    """Why the vehicle does not take setpoints; empty if it does."""
-    if vehicle is None:
-        return "no vehicle is heard"
-    if not vehicle.armed:
-        return "the vehicle is not armed"
-    if not vehicle.external:
-        return f"the vehicle is in mode {vehicle.mode}, which takes no setpoints"
-    return ""

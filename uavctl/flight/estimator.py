@@ -25,10 +25,13 @@ _SAMPLE, _INPUT, _MARK = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """What is known after an entry: the belief (None before the first sample) and the input that acts."""
+    """What is known after an entry: the belief (None before the first sample) and the input that acts.
+
+    The input is None while others fly the vehicle.
+    """
 
     belief: Belief | None
-    input: Array
+    input: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,7 @@ class Entry:
 
     key: tuple[int, int, str, int]  # time, kind, source, capture time as stamped
     sample: PositionSample | None
-    input: Array | None
+    input: Array | None  # of an input change; None: others fly from here on
     after: Node
 
 
@@ -74,7 +77,7 @@ def begin(kalman: Kalman, origin_ns: int, at_ns: int) -> History:
     return History(
         origin_ns=origin_ns,
         horizon_ns=_horizon_ns(kalman, at_ns),
-        anchor=Node(belief=None, input=np.zeros(kalman.n_u)),
+        anchor=Node(belief=None, input=None),
     )
 
 
@@ -117,12 +120,24 @@ def absorb(
     return history, tuple(taken), tuple(refused)
 
 
-def set_input(kalman: Kalman, history: History, at_ns: int, u: Array) -> History:
-    """Note that input `u` (n_u,) acts from `at_ns` on; `at_ns` never goes back."""
-    if np.array_equal(history.newest.input, u):
+def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, belief: Belief | None = None) -> History:
+    """Note that an input acts from now on.
+
+    Args:
+        kalman: The filter.
+        history: State before.
+        at_ns: Time now [ns]; it never goes back, and nothing that is known is later.
+        u: The input (n_u,); None: others fly.
+        belief: What `belief_at` gives at `at_ns`, if that has been asked.
+    """
+    before = history.newest.input
+    if before is u or (before is not None and u is not None and np.array_equal(before, u)):
         return history
-    entry = Entry(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=history.anchor)
-    return _inserted(kalman, history, [entry])
+    after = Node(belief=belief or belief_at(kalman, history, at_ns), input=u)
+    entry = Entry(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=after)
+    place = bisect_right(history.entries, entry.key, key=lambda one: one.key)
+    marks = (replace(mark, after=after) for mark in history.entries[place:])  # of the same instant
+    return replace(history, entries=(*history.entries[:place], entry, *marks))
 
 
 def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
@@ -130,16 +145,19 @@ def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
 
     A time before the newest entry leaves out what came after it; a time before the window has no estimate.
     """
-    node = _known(history, at_ns)
-    if node.belief is None or node.belief.at_ns > at_ns:
-        return None
-    belief = predicted(kalman, history.origin_ns, node.belief, node.input, at_ns)
-    n_x = kalman.n_x
+    belief = belief_at(kalman, history, at_ns)
+    return None if belief is None else estimated(kalman, belief)
+
+
+def estimated(kalman: Kalman, belief: Belief) -> Estimate:
+    """What a belief says to others."""
+    n_x, largest = kalman.n_x - kalman.n_bias, kalman.parameters.bias_max
     return Estimate(
-        at_ns=at_ns,
+        at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,
         mean=tuple(belief.mean[:n_x].tolist()),
         cov=tuple(map(tuple, belief.cov[:n_x, :n_x].tolist())),
+        bias=tuple(np.clip(belief.mean[n_x : kalman.n_x], -largest, largest).tolist()),
     )
 
 
@@ -147,6 +165,24 @@ def newest_capture_ns(history: History, at_ns: int) -> int | None:
     """Capture time of the newest sample from up to `at_ns`; None where there is no estimate."""
     belief = _known(history, at_ns).belief
     return None if belief is None or belief.at_ns > at_ns else belief.captured_ns
+
+
+def belief_at(kalman: Kalman, history: History, at_ns: int) -> Belief | None:
+    """The belief at `at_ns` from all that had happened by then; None where there is none, as with `estimate`."""
+    node = _known(history, at_ns)
+    if node.belief is None or node.belief.at_ns > at_ns:
+        return None
+    return predicted(kalman, history.origin_ns, node.belief, node.input, at_ns)
+
+
+def coasted(kalman: Kalman, history: History, belief: Belief, at_ns: int) -> Belief:
+    """An earlier belief moved on to `at_ns` by the inputs that acted, without what samples have shown since."""
+    u = _known(history, belief.at_ns).input
+    for entry in history.entries:
+        if entry.key[1] == _INPUT and belief.at_ns < entry.key[0] < at_ns:
+            belief = predicted(kalman, history.origin_ns, belief, u, entry.key[0])
+            u = entry.input
+    return predicted(kalman, history.origin_ns, belief, u, at_ns)
 
 
 def _known(history: History, at_ns: int) -> Node:
@@ -186,4 +222,4 @@ def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry) -> Node:
         belief = predicted(kalman, origin_ns, belief, node.input, entry.key[0])
     if entry.sample is not None:
         belief = first_belief(kalman, entry.sample) if belief is None else updated(kalman, belief, entry.sample)
-    return Node(belief=belief, input=node.input if entry.input is None else entry.input)
+    return Node(belief=belief, input=entry.input if entry.key[1] == _INPUT else node.input)

@@ -3,6 +3,9 @@
 Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W); it is redrawn at each
 boundary. So the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w:
 mean 0, covariance W, uncorrelated with x. With u piecewise constant this is exact at any instant.
+
+Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.bias`). While others fly the
+vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 from uavctl.data import PositionSample, Vec3
 from uavctl.flight.limits import AXES
 from uavctl.flight.propagation import Propagation, make_propagation
+from uavctl.smpc.bias import with_bias
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -31,6 +35,8 @@ class EstimatorParameters:
         window_s: Samples later than this are refused [s].
         max_position_m: Largest plausible position, each axis [m].
         max_velocity_mps: Largest plausible velocity, each axis [m/s].
+        bias_drift: Standard deviation of what an input's bias gains in a second [input units / √s]; 0: there is none.
+        bias_max: Largest bias that is counted on, each input [input units]; it begins with a quarter as deviation.
     """
 
     position_std_m: float
@@ -39,6 +45,8 @@ class EstimatorParameters:
     window_s: float
     max_position_m: float
     max_velocity_mps: float
+    bias_drift: float = 0.0
+    bias_max: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +56,9 @@ class Kalman:
     Attributes:
         propagation: F and G of z = (x, w).
         w: Covariance W (n_w, n_w).
-        n_x: Number of states.
+        n_x: Number of states, with the biases.
         n_u: Number of inputs.
+        n_bias: Number of biases, the last of the states: n_u, or 0 where none is estimated.
         axes: Index (0 north, 1 east, 2 down) of each axis that the plant has.
         shown: State index of each axis' position, then of each axis' velocity.
         parameters: Noise and window.
@@ -59,6 +68,7 @@ class Kalman:
     w: Array
     n_x: int
     n_u: int
+    n_bias: int
     axes: tuple[int, ...]
     shown: NDArray[np.intp]
     parameters: EstimatorParameters
@@ -76,11 +86,14 @@ class Belief:
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
     """The filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
+    n_bias = plant.n_u if parameters.bias_drift else 0
+    seen = with_bias(plant, parameters.bias_drift) if n_bias else plant
     return Kalman(
-        propagation=make_propagation(plant, dt_ns),
-        w=plant.w,
-        n_x=plant.n_x,
+        propagation=make_propagation(seen, dt_ns),
+        w=seen.w,
+        n_x=seen.n_x,
         n_u=plant.n_u,
+        n_bias=n_bias,
         axes=tuple(AXES.index(axis) for axis in plant.axes),
         shown=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
         parameters=parameters,
@@ -92,29 +105,51 @@ def captured_ns(sample: PositionSample) -> int:
     return min(sample.captured_ns, sample.received_ns)
 
 
-def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array, at_ns: int) -> Belief:
-    """The belief at `at_ns`; the grid's boundaries cut the way at the same places whatever came in."""
+def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_ns: int) -> Belief:
+    """The belief at `at_ns`; the grid's boundaries cut the way at the same places whatever came in.
+
+    Args:
+        kalman: The filter.
+        origin_ns: A boundary of the grid [ns].
+        belief: The belief before.
+        u: Input that acts (n_u,); None while others fly the vehicle.
+        at_ns: Time to predict for [ns].
+    """
     now_ns, mean, cov = belief.at_ns, belief.mean, belief.cov
+    if now_ns >= at_ns:
+        return belief
     dt_ns, n_x = kalman.propagation.dt_ns, kalman.n_x
+    acting = np.zeros(kalman.n_u) if u is None else u
     while now_ns < at_ns:
         boundary_ns = now_ns - (now_ns - origin_ns) % dt_ns + dt_ns
         stop_ns = min(at_ns, boundary_ns)
         f, g = kalman.propagation.over(stop_ns - now_ns)
-        mean = f @ mean + g @ u
+        mean = f @ mean + g @ acting
         cov = _symmetric(f @ cov @ f.T)
         if stop_ns == boundary_ns:
             mean[n_x:] = 0.0
             cov[:n_x, n_x:] = 0.0
             cov[n_x:, :n_x] = 0.0
             cov[n_x:, n_x:] = kalman.w
+            if u is None and kalman.n_bias:
+                _forget_bias(kalman, mean, cov)
         now_ns = stop_ns
     return Belief(at_ns=now_ns, captured_ns=belief.captured_ns, mean=mean, cov=cov)
+
+
+def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
+    """Put the biases of a belief back to what they begin with, in place."""
+    bias = slice(kalman.n_x - kalman.n_bias, kalman.n_x)
+    mean[bias] = 0.0
+    cov[bias] = 0.0
+    cov[:, bias] = 0.0
+    cov[bias, bias] = np.eye(kalman.n_bias) * (0.25 * kalman.parameters.bias_max) ** 2
 
 
 def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     """The belief after the first sample: what it shows, and zero for what it does not."""
     n_x, n_w = kalman.n_x, kalman.w.shape[0]
-    values, variances = _shown(kalman, sample)
+    values, variances = shown_by(kalman, sample)
     index = kalman.shown[: len(values)]
     mean = np.zeros(n_x + n_w)
     mean[index] = values
@@ -123,13 +158,15 @@ def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     cov = np.zeros((n_x + n_w, n_x + n_w))
     cov[:n_x, :n_x] = np.diag(diagonal)
     cov[n_x:, n_x:] = kalman.w
+    if kalman.n_bias:
+        _forget_bias(kalman, mean, cov)
     at_ns = captured_ns(sample)
     return Belief(at_ns=at_ns, captured_ns=at_ns, mean=mean, cov=cov)
 
 
 def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
     """Kalman update; the covariance in Joseph's form, which stays symmetric and positive semidefinite."""
-    values, variances = _shown(kalman, sample)
+    values, variances = shown_by(kalman, sample)
     index = kalman.shown[: len(values)]
     noise = np.diag(variances)
     ph = belief.cov[:, index]
@@ -144,7 +181,7 @@ def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
     )
 
 
-def _shown(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
+def shown_by(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
     """Values that a sample shows (positions, then velocities if it has them) and their variances."""
     parameters, axes = kalman.parameters, kalman.axes
     values = _of_axes(sample.position_m, axes)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.data import Vector
+from uavctl.data import Vec3, Vector
+from uavctl.flight.limits import AXES
 from uavctl.smpc.answer import Outlook, Path
 
 Array = NDArray[np.float64]
@@ -63,6 +64,43 @@ class Fence:
 
 
 @dataclass(frozen=True, eq=False)
+class Room:
+    """Where the plant may rest, and where it comes to rest.
+
+    Attributes:
+        axes: Index (0 north, 1 east, 2 down) of each axis that the plant has.
+        lower: Least place to rest at of each axis (n_axes,) [m]: the terminal set fits the limits there.
+        upper: Largest.
+        rest: Equilibrium for each metre of each axis (n_axes, n_x).
+        stop: Place (n_axes, n_x) at which a state comes to rest by inputs that brake, as a linear map of it.
+    """
+
+    axes: tuple[int, ...]
+    lower: Array
+    upper: Array
+    rest: Array
+    stop: Array
+
+    def refusal(self, position_m: Vec3) -> str:
+        """Why nothing may rest at a place; empty if it may."""
+        for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
+            if not lower <= position_m[axis] <= upper:
+                return f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
+        return ""
+
+    def at(self, position_m: Vec3) -> Vector:
+        """The equilibrium (n_x,) at a place."""
+        return self._equilibrium(np.array([position_m[axis] for axis in self.axes]))
+
+    def stopped(self, state: Vector) -> Vector:
+        """The equilibrium (n_x,) that a state is braked to, inside the limits."""
+        return self._equilibrium(np.clip(self.stop @ np.array(state), self.lower, self.upper))
+
+    def _equilibrium(self, places: Array) -> Vector:
+        return tuple((places @ self.rest).tolist())
+
+
+@dataclass(frozen=True, eq=False)
 class Mission:
     """What is asked for in a flight; constant.
 
@@ -73,8 +111,10 @@ class Mission:
         limits: Right sides of the state set's rows (m_x,).
         horizon: H [steps].
         dt_ns: Δt [ns].
+        room: Where the operator may send the vehicle to; None if the plant cannot rest wherever it is sent.
         trajectory: The motion to follow; None to fly to the waypoints.
         fences: Moving limits.
+        land: Whether to land at the end; else the last place is held.
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -83,8 +123,10 @@ class Mission:
     limits: Array
     horizon: int
     dt_ns: int
+    room: Room | None
     trajectory: Trajectory | None = None
     fences: tuple[Fence, ...] = ()
+    land: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,11 +137,17 @@ class MissionState:
         start_ns: Its time zero [ns].
         waypoint: Number of the waypoint flown to, from 0.
         arrived_ns: When that one was reached [ns]; None if it has not been.
+        stay: Equilibrium (n_x,) that the operator ordered instead; None on the mission.
+        left_ns: When the mission was left for that [ns]; None on the mission.
+        paused_ns: Time that a trajectory has stood still for orders [ns]; fences move on all the same.
     """
 
     start_ns: int
     waypoint: int = 0
     arrived_ns: int | None = None
+    stay: Vector | None = None
+    left_ns: int | None = None
+    paused_ns: int = 0
 
 
 def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:
@@ -114,7 +162,7 @@ def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_n
         at_ns: The boundary [ns].
     """
     state = state or MissionState(start_ns=at_ns)
-    if mission.trajectory is not None:
+    if mission.trajectory is not None or state.stay is not None:
         return state
     waypoint = mission.waypoints[state.waypoint]
     index = list(mission.position_index)
@@ -128,8 +176,34 @@ def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_n
     return state
 
 
+def stay(state: MissionState, place: Vector, at_ns: int) -> MissionState:
+    """Leave the mission at a boundary for a place (n_x,), to stay there; the waypoint flown to will be reached anew."""
+    left_ns = at_ns if state.left_ns is None else state.left_ns
+    return replace(state, stay=place, left_ns=left_ns, arrived_ns=None)
+
+
+def resume(state: MissionState, at_ns: int) -> MissionState:
+    """Go on with the mission at a boundary where it was left; its own state if it was not."""
+    if state.left_ns is None:
+        return state
+    return replace(state, stay=None, left_ns=None, paused_ns=state.paused_ns + at_ns - state.left_ns)
+
+
+def over(mission: Mission, state: MissionState, at_ns: int) -> bool:
+    """Whether all of the mission has been flown, the last waypoint's time too."""
+    if state.stay is not None:
+        return False
+    motion = mission.trajectory
+    if motion is not None:  # a horizon of rest was added at its end
+        return _row(mission, state, at_ns, motion) >= len(motion.states) - 1 - mission.horizon
+    last = state.waypoint + 1 == len(mission.waypoints)
+    return last and state.arrived_ns is not None and at_ns - state.arrived_ns >= mission.waypoints[-1].hold_ns
+
+
 def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
-    """State (n_x,) that the mission wants the vehicle to be in at a boundary."""
+    """State (n_x,) that the mission, or the operator, wants the vehicle to be in at a boundary."""
+    if state.stay is not None:
+        return state.stay
     if mission.trajectory is None:
         return tuple(mission.waypoints[state.waypoint].target.tolist())
     return tuple(mission.trajectory.states[_row(mission, state, at_ns, mission.trajectory)].tolist())
@@ -138,6 +212,8 @@ def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Outlook]:
     """Question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
     limits = _limits(mission, at_ns - state.start_ns)
+    if state.stay is not None:
+        return np.array(state.stay), Outlook(limits=limits)
     motion = mission.trajectory
     if motion is None:
         return mission.waypoints[state.waypoint].target, Outlook(limits=limits)
@@ -148,7 +224,7 @@ def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, O
 
 def _row(mission: Mission, state: MissionState, at_ns: int, motion: Trajectory) -> int:
     """Row of the trajectory at a boundary."""
-    return min((at_ns - state.start_ns) // mission.dt_ns, len(motion.states) - 1)
+    return min((at_ns - state.start_ns - state.paused_ns) // mission.dt_ns, len(motion.states) - 1)
 
 
 def _limits(mission: Mission, since_ns: int) -> Array | None:
@@ -163,7 +239,9 @@ def _limits(mission: Mission, since_ns: int) -> Array | None:
     return None if bool((limits == mission.limits).all()) else limits
 
 
-def hold(target: Array, position_index: tuple[int, ...], limits: Array, horizon: int, dt_ns: int) -> Mission:
+def hold(
+    target: Array, position_index: tuple[int, ...], limits: Array, horizon: int, dt_ns: int, room: Room | None
+) -> Mission:
     """The mission to stay at one equilibrium (n_x,)."""
     return Mission(
         waypoints=(Waypoint(target=target, hold_ns=0),),
@@ -172,4 +250,5 @@ def hold(target: Array, position_index: tuple[int, ...], limits: Array, horizon:
         limits=limits,
         horizon=horizon,
         dt_ns=dt_ns,
+        room=room,
     )

@@ -53,7 +53,9 @@ def ask(
         return Asked(answer.status, None, f"the solve ended as {answer.status.value}")
     if not _complete(answer, shape, len(base.mean)):
         return Asked(SolveStatus.FAILED, None, "the answer is not finite, or has the wrong shape")
-    return Asked(SolveStatus.OPTIMAL, _plan(answer, base, design_id), "")
+    # The solver plans what acts on the plant in all: the part of it that is there without us is not asked for again.
+    inputs = answer.inputs - np.array(base.bias) if base.bias else answer.inputs
+    return Asked(SolveStatus.OPTIMAL, _plan(answer, inputs, base, design_id), "")
 
 
 def _complete(answer: Answer, shape: tuple[int, int], n_x: int) -> bool:
@@ -64,14 +66,14 @@ def _complete(answer: Answer, shape: tuple[int, int], n_x: int) -> bool:
     )
 
 
-def _plan(answer: Answer, base: Estimate, design_id: str) -> Plan:
+def _plan(answer: Answer, inputs: Array, base: Estimate, design_id: str) -> Plan:
     return Plan(
         seq=answer.seq,
         base_ns=base.at_ns,
         captured_ns=base.captured_ns,
         status=answer.status,
         method=answer.method,
-        inputs=_rows(answer.inputs),
+        inputs=_rows(inputs),
         states=_rows(answer.states),
         backoff_x=_rows(answer.backoff_x),
         backoff_u=_rows(answer.backoff_u),
@@ -85,6 +87,7 @@ def _plan(answer: Answer, base: Estimate, design_id: str) -> Plan:
         iterations=int(answer.iterations),
         design_id=design_id,
         gave_way=answer.gave_way,
+        bias=base.bias,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 # exp(G Δt s) is entire in s: this many Chebyshev terms on [0, 1] reach rounding for any plant whose
 # fastest time constant is above a twentieth of Δt.
 _TERMS = 32
+_MOST_PARTS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,19 +26,30 @@ class Propagation:
         dt_ns: Δt [ns].
         whole: F and G side by side over Δt (n_x + n_w, n_x + n_w + n_u).
         series: Chebyshev coefficients of the same in 2 dt/Δt - 1 (terms, its entries).
+        parts: F and G of the first spans that were asked for: the ticks' own, which come again and again.
     """
 
     dt_ns: int
     whole: Array
     series: Array
+    parts: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, dt_ns: int) -> tuple[Array, Array]:
         """(F, G) over `dt_ns`, 0 < dt_ns <= Δt."""
+        known = self.parts.get(dt_ns)
+        if known is None:
+            known = self._part(dt_ns)
+            if len(self.parts) < _MOST_PARTS:
+                self.parts[dt_ns] = known
+        return known
+
+    def _part(self, dt_ns: int) -> tuple[Array, Array]:
         if dt_ns == self.dt_ns:
             joint = self.whole
         else:
             angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
             joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
+            joint.flags.writeable = False
         n_z = joint.shape[0]
         return joint[:, :n_z], joint[:, n_z:]
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
-from uavctl.data import PositionSample, StepInput
-from uavctl.flight.estimator import History, absorb
-from uavctl.flight.kalman import EstimatorParameters, Kalman, captured_ns
+import numpy as np
+
+from uavctl.data import PositionSample, StepInput, VehicleStatus
+from uavctl.flight.estimator import History, absorb, begin, belief_at
+from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, captured_ns, shown_by
+from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
+from uavctl.flight.stuck import FROZEN, Watches, observe, stuck
 
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
@@ -21,23 +26,44 @@ _FRESH_PART = 3
 
 
 @dataclass(frozen=True, eq=False)
+class Trust:
+    """What is known of the sources.
+
+    Attributes:
+        suspect: Samples that the vehicle cannot have come to and that agree; None without any.
+        doubt_mps: How wrong the velocity may be, each axis of the plant [m/s]; None before it was held against one.
+        watches: What each source has said.
+    """
+
+    suspect: Suspect | None = None
+    doubt_mps: Array | None = None
+    watches: Watches = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class Intake:
     """What came of a tick's samples.
 
     Attributes:
         history: The estimator with them.
+        trust: What is known of the sources.
+        moved: A source has moved: positions are not to be believed any more.
         accepted: Number of samples taken.
         refused: Reason (an event's code) for each one that was not.
         fresh: Fresh samples in a row, up to now.
     """
 
     history: History
+    trust: Trust
+    moved: bool
     accepted: int
     refused: tuple[str, ...]
     fresh: int
 
 
-def take(kalman: Kalman, history: History, inp: StepInput, horizon: int, fresh: int) -> Intake:
+def take(
+    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput, horizon: int, fresh: int
+) -> Intake:
     """Check a tick's samples and give them to the estimator.
 
     A sample is fresh if it is newer than all before and at most H/3 steps (at least one) old when a tick takes it:
@@ -47,7 +73,9 @@ def take(kalman: Kalman, history: History, inp: StepInput, horizon: int, fresh: 
 
     Args:
         kalman: The filter.
+        reach: Where the vehicle can be.
         history: The estimator before.
+        trust: What is known of the sources, before.
         inp: The tick's input.
         horizon: H, the steps that a plan bridges.
         fresh: Fresh samples in a row, before.
@@ -55,7 +83,7 @@ def take(kalman: Kalman, history: History, inp: StepInput, horizon: int, fresh: 
     reasons = [refusal(sample, inp.at_ns, kalman.parameters) for sample in inp.samples]
     valid = [sample for sample, reason in zip(inp.samples, reasons, strict=True) if reason is None]
     newest_ns = history.captured_ns
-    history, taken, refused = absorb(kalman, history, inp.at_ns, valid)
+    history, trust, taken, refused = _believe(kalman, reach, history, trust, inp, valid)
     dt_ns = kalman.propagation.dt_ns
     late_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
     for at_ns in sorted(map(captured_ns, taken)):
@@ -66,10 +94,68 @@ def take(kalman: Kalman, history: History, inp: StepInput, horizon: int, fresh: 
             newest_ns = at_ns
     return Intake(
         history=history,
+        trust=trust,
+        moved=trust.suspect is not None and trust.suspect.moved(reach.parameters),
         accepted=len(taken),
         refused=(*(reason for reason in reasons if reason is not None), *refused),
         fresh=fresh,
     )
+
+
+def forget(kalman: Kalman, intake: Intake, at_ns: int) -> Intake:
+    """Forget all positions: estimator and trust as they begin, at `at_ns`."""
+    history = begin(kalman, intake.history.origin_ns, at_ns)
+    return replace(intake, history=history, trust=Trust(), moved=False, fresh=0)
+
+
+def _believe(
+    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput, valid: Sequence[PositionSample]
+) -> tuple[History, Trust, list[PositionSample], list[str]]:
+    """Give samples to the estimator in the order of their capture, each after it is held against what is known."""
+    taken: list[PositionSample] = []
+    refused: list[str] = []
+    history, _, _ = absorb(kalman, history, inp.at_ns, ())
+    for sample in sorted(valid, key=captured_ns):
+        trust, reason = _distrust(kalman, reach, history, trust, inp, sample)
+        if reason is not None:
+            refused.append(reason)
+            continue
+        history, one, why = absorb(kalman, history, inp.at_ns, (sample,))
+        taken.extend(one)
+        refused.extend(why)
+    return history, trust, taken, refused
+
+
+def _distrust(
+    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput, sample: PositionSample
+) -> tuple[Trust, str | None]:
+    """What is known of the sources with one more sample, and why it is not believed (None if it is)."""
+    at_ns = captured_ns(sample)
+    belief = belief_at(kalman, history, at_ns) if at_ns > history.horizon_ns else None
+    if belief is None:
+        return trust, None  # the first one, or too old
+    values, variances = shown_by(kalman, sample)
+    off = values - belief.mean[kalman.shown[: len(values)]]
+    n_axes = len(kalman.axes)
+    watches = observe(trust.watches, kalman, history, sample, off[:n_axes])
+    trust = replace(trust, watches=watches)
+    watch = watches[sample.source]
+    newest = watch.at_ns == at_ns
+    if newest and _flies(inp.vehicle) and stuck(watch, kalman, sample, reach.parameters):
+        return replace(trust, watches={**watches, sample.source: replace(watch, found=True)}), FROZEN
+    doubted = np.zeros(n_axes) if trust.doubt_mps is None else trust.doubt_mps
+    width = radius(reach, kalman, belief, variances, doubted)
+    believed, suspect = judge(trust.suspect, at_ns, off, width, n_axes)
+    if believed and at_ns > (history.captured_ns or at_ns):
+        trust = replace(trust, doubt_mps=doubt(reach, belief, off[:n_axes]))
+    if not believed and newest and watch.repeats:
+        return trust, FROZEN  # a value that came before did not jump
+    return replace(trust, suspect=suspect), None if believed else JUMP
+
+
+def _flies(vehicle: VehicleStatus | None) -> bool:
+    """Whether the vehicle moves on its own, as far as it is known; one that is on the ground may stand still."""
+    return vehicle is None or (vehicle.armed and not vehicle.landed)
 
 
 def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:

@@ -23,17 +23,22 @@ from uavctl.data import (
     SetpointSource,
     Severity,
     StepInput,
+    Vec3,
+    Vector,
 )
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decide import Choice, Tick, choose, place, unready, velocity
+from uavctl.flight.decide import Choice, Tick, choose, place, velocity
 from uavctl.flight.estimator import begin, set_input
+from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
-from uavctl.flight.samples import take
+from uavctl.flight.orders import take_orders, unready
+from uavctl.flight.samples import forget, take
 from uavctl.naming import Names, tell_all
+from uavctl.smpc.plant import Plant
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
@@ -43,6 +48,9 @@ _SOURCES = {
     ControlMode.BRAKE: SetpointSource.BRAKE,
     ControlMode.HOLD: SetpointSource.HOLD,
 }
+
+
+_NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
 @dataclass(frozen=True)
@@ -86,24 +94,36 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     """
     origin_ns = inp.at_ns - inp.tick * controller.tick_ns
     history = state.history or begin(controller.kalman, origin_ns, inp.at_ns)
-    intake = take(controller.kalman, history, inp, controller.horizon, state.fresh)
+    intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
+    lost = intake.moved and state.mode in _NOT_FLOWN
+    if lost:
+        intake = forget(controller.kalman, intake, inp.at_ns)
     tick = place(state, inp, intake.history, controller)
     stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
-    begun = replace(state, history=intake.history, decided_step=tick.number, fresh=0 if stale else intake.fresh)
+    ordered, answers = take_orders(state, inp, controller)
+    if intake.moved:
+        ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
+    begun = replace(
+        ordered,
+        history=intake.history,
+        trust=intake.trust,
+        decided_step=tick.number,
+        fresh=0 if stale else intake.fresh,
+    )
     choice = choose(begun, tick, inp, controller)
-    setpoint, applied = _setpoint(choice.state, tick, inp.at_ns, controller)
-    acting = np.zeros(controller.plant.n_u) if applied is None or unready(inp.vehicle) else applied
+    setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, tick, inp.at_ns, controller)
+    acting = None if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
     alarms = state.link_alarms if link is None else _alarms(link, state.link_alarms)
     after = replace(
         choice.state,
         link=belief,
         link_alarms=alarms,
-        history=set_input(controller.kalman, intake.history, inp.at_ns, acting),
+        history=set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief),
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
     plan, mission = choice.state.plan, choice.state.mission
-    on_waypoints = mission is not None and controller.mission.trajectory is None
+    on_waypoints = mission is not None and mission.stay is None and controller.mission.trajectory is None
     decision = Decision(
         tick=inp.tick,
         at_ns=inp.at_ns,
@@ -130,6 +150,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         decision=decision,
         setpoint=setpoint,
         events=(
+            *answers,
+            *((_restarted(inp.at_ns),) if lost else ()),
             *_events(state.mode, choice, inp, intake.refused, controller.names),
             *_link_events(alarms, state.link_alarms, link),
         ),
@@ -184,11 +206,26 @@ def _setpoint(
     want = ZERO
     if state.fallback is not None:
         want = fb.acceleration(state.fallback, velocity(tick.estimate, controller.plant), controller.fallback)
+        if not (state.fallback.final and state.mode is ControlMode.HOLD):  # what is kept after the end is zero itself
+            want = _beside(tick.estimate.bias, want, controller.plant)
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
     accel, limited = gate(want, state.accel_mps2, controller.tick_ns * 1e-9, controller.limits)
     setpoint = Setpoint(at_ns=at_ns, accel_mps2=accel, source=source, limited=limited)
     return setpoint, controller.plant.to_input(accel)
+
+
+def _beside(bias: Vector, wanted_mps2: Vec3, plant: Plant) -> Vec3:
+    """What to ask for beside a bias (n_u,) of the input, so that both together are the acceleration wanted."""
+    if not bias:
+        return wanted_mps2
+    there = plant.to_accel(np.array(bias))
+    return wanted_mps2[0] - there[0], wanted_mps2[1] - there[1], wanted_mps2[2] - there[2]
+
+
+def _restarted(at_ns: int) -> Event:
+    text = "positions jumped while nobody flew on them; the estimate begins anew"
+    return Event(at_ns=at_ns, severity=Severity.WARNING, code="position-restart", text=text)
 
 
 _ENTERED = {
@@ -222,5 +259,7 @@ def _events(
     mode = choice.state.mode
     if mode is not before:
         severity, code = _ENTERED[mode]
+        if choice.state.fallback is not None and choice.state.fallback.end >= End.STOP:
+            severity = Severity.INFO  # somebody wanted it
         events.append(Event(at_ns=inp.at_ns, severity=severity, code=code, text=choice.reason))
     return tuple(events)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from uavctl.flight.mission import Trajectory
+from uavctl.flight.mission import Room, Trajectory
 from uavctl.smpc.plant import AXES, Plant
 
 Array = NDArray[np.float64]
@@ -105,6 +105,31 @@ def along(plant: Plant, motion: Motion, horizon: int, rest: int, lower: Array, u
         path_states[:, t] = states[:, t] + change @ reach[t].T - anchors
         path_inputs[:, t] = inputs[:, t] + change[:, t * n_u : (t + 1) * n_u] - anchor_inputs
     return Trajectory(states=motion.states, anchors=anchors, path_states=path_states, path_inputs=path_inputs)
+
+
+def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
+    """Where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
+
+    Args:
+        plant: The plant.
+        rest: Steps in which it brakes.
+        lower: Least place to rest at of each axis (n_axes,) [m].
+        upper: Largest.
+
+    Raises:
+        DesignError: The plant cannot rest everywhere.
+    """
+    rest_x, _ = _equilibria(plant)
+    moving, effect = _complement(rest_x), _reach(plant, rest)[rest]
+    brakes = effect @ _least(np.eye(rest * plant.n_u), moving @ effect) @ moving
+    stopped = (np.eye(plant.n_x) - brakes) @ np.linalg.matrix_power(plant.a, rest)
+    return Room(
+        axes=tuple(AXES.index(axis) for axis in plant.axes),
+        lower=lower,
+        upper=upper,
+        rest=rest_x,
+        stop=stopped[list(plant.position_index)],
+    )
 
 
 def _reach(plant: Plant, steps: int) -> Array:

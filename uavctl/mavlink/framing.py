@@ -7,13 +7,14 @@ counted by reason, and the search goes on at the next byte that could begin one.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-_HEADER_V1, _HEADER_V2, _CHECKSUM = 6, 10, 2
+_HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
 MAX_FAILED = 64  # tries in one datagram; a hostile one must not cost the loop its tick
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
@@ -27,6 +28,11 @@ class BadBytes(StrEnum):
     GARBAGE = "garbage"  # a run of bytes that no frame begins in
     OVERSIZE = "oversize"  # a datagram longer than any that peers send
     UNKNOWN = "unknown-message"  # an id that the dialect has not: passed over by its length
+
+
+UNSIGNED = "unsigned"  # a frame without the signature that is asked for
+Verify = Callable[[bytes], str | None]
+"""Takes a whole frame that has a signature; gives the reason not to take it, or None."""
 
 
 class RawFrame(NamedTuple):
@@ -66,12 +72,12 @@ def _shape(data: bytes, at: int) -> _Shape | None:
     if data[at] == mavlink.PROTOCOL_MARKER_V1:
         if len(data) - at < _HEADER_V1:
             return None
-        return _Shape(_HEADER_V1 + data[at + 1] + _CHECKSUM, data[at + 5], 0)
-    if len(data) - at < _HEADER_V2:
+        return _Shape(_HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
+    if len(data) - at < HEADER_V2:
         return None
     signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
     message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-    return _Shape(_HEADER_V2 + data[at + 1] + _CHECKSUM + signature, message_id, signature)
+    return _Shape(HEADER_V2 + data[at + 1] + CHECKSUM + signature, message_id, signature)
 
 
 def _is_foreign(data: bytes, at: int) -> bool:
@@ -79,21 +85,38 @@ def _is_foreign(data: bytes, at: int) -> bool:
     return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
 
 
+def _checksum(head: bytes, message_id: int) -> int:
+    """Checksum of a frame's first bytes, up to its payload's end."""
+    crc = mavlink.x25crc(head[1:])
+    crc.accumulate(bytes((mavlink.mavlink_map[message_id].crc_extra,)))
+    return int(crc.crc)
+
+
 def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
     """Whether the checksum of a frame of a known id is right."""
-    end = shape.length - shape.signature - _CHECKSUM
-    crc = mavlink.x25crc(frame[1:end])
-    crc.accumulate(bytes((mavlink.mavlink_map[shape.message_id].crc_extra,)))
-    return crc.crc == int.from_bytes(frame[end : end + _CHECKSUM], "little")
+    end = shape.length - shape.signature - CHECKSUM
+    return _checksum(frame[:end], shape.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
-def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
+def with_checksum(head: bytes) -> bytes:
+    """Header and payload of a frame of MAVLink 2, with its checksum.
+
+    Raises:
+        KeyError: the message id is unknown to the dialect.
+    """
+    message_id = int.from_bytes(head[7:HEADER_V2], "little")
+    return head + _checksum(head, message_id).to_bytes(CHECKSUM, "little")
+
+
+def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | None = None) -> Scan:
     """Find the frames in some bytes.
 
     Args:
         data: a datagram, or what has come of a stream.
         final: whether the data ends here. If not, a frame that it ends in is left for later.
         in_step: whether the first byte should begin a frame (see `Scan`).
+        verify: takes only frames whose signature it likes, in place of the checksum; frames of ids that the dialect
+            has not are verified too, and then counted and dropped.
 
     Returns:
         What was found. One broken frame, or one run of garbage, counts once. A datagram in which
@@ -102,7 +125,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
     result = Scan(in_step=in_step)
     failed = 0
     while result.consumed < len(data):
-        end, reason = _try_frame(data, result, final=final)
+        end, reason = _try_frame(data, result, verify, final=final)
         if reason is _WAIT:
             break
         if end is None:
@@ -119,7 +142,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True) -> Scan:
 _TAKEN, _WAIT = "taken", "wait"
 
 
-def _try_frame(data: bytes, result: Scan, *, final: bool) -> tuple[int | None, str]:
+def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool) -> tuple[int | None, str]:
     """Try for a frame at `result.consumed`: (its end, `_TAKEN`), or (None, why not)."""
     at = result.consumed
     if data[at] not in _MAGIC or _is_foreign(data, at):
@@ -128,9 +151,11 @@ def _try_frame(data: bytes, result: Scan, *, final: bool) -> tuple[int | None, s
     if shape is None or at + shape.length > len(data):
         return None, BadBytes.TRUNCATED if final else _WAIT
     end = at + shape.length
+    if verify is not None:
+        return _try_signed(data, result, shape, verify)
     if shape.message_id not in mavlink.mavlink_map:
-        # Nothing but the length can be checked: believe it only between frames.
-        if not result.in_step or (end < len(data) and data[end] not in _MAGIC):
+        # Nothing but the length can be checked.
+        if not _between_frames(data, result, end):
             return None, BadBytes.GARBAGE
         result.bad[BadBytes.UNKNOWN] += 1
         return end, _TAKEN
@@ -139,6 +164,28 @@ def _try_frame(data: bytes, result: Scan, *, final: bool) -> tuple[int | None, s
         return None, BadBytes.CRC
     result.frames.append(RawFrame(frame, shape.message_id))
     return end, _TAKEN
+
+
+def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tuple[int | None, str]:
+    """The same where signatures are asked for: no frame without one is believed in anything but its length."""
+    at = result.consumed
+    end = at + shape.length
+    frame = data[at:end]
+    refusal = verify(frame) if shape.signature else UNSIGNED
+    if refusal is not None:
+        if not _between_frames(data, result, end):
+            return None, refusal
+        result.bad[refusal] += 1
+    elif shape.message_id not in mavlink.mavlink_map:
+        result.bad[BadBytes.UNKNOWN] += 1
+    else:
+        result.frames.append(RawFrame(frame, shape.message_id))
+    return end, _TAKEN
+
+
+def _between_frames(data: bytes, result: Scan, end: int) -> bool:
+    """Whether an unchecked length can be believed: what is before it was a frame, and another seems to follow."""
+    return result.in_step and (end >= len(data) or data[end] in _MAGIC)
 
 
 def _next_magic(data: bytes, start: int) -> int:

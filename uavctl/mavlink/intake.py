@@ -10,7 +10,7 @@ from typing import get_args
 from uavctl.config.peers import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.data import PositionSample, Vec3
-from uavctl.frames import Convention, Frame
+from uavctl.frames import Convention, Frame, Quaternion
 from uavctl.mavlink.clocksync import ClockSource, ClockSync, Refusal, RoundTrips
 from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
@@ -53,7 +53,9 @@ class PositionIntake:
         self._clocks: dict[tuple[Address, bool], ClockSync] = {}
         self._round_trips: dict[Address, RoundTrips] = {}
         self._latest: ClockSync | None = None
+        self._latest_address: Address | None = None
         self.samples = 0
+        self.attitude: Quaternion | None = None  # of the newest sample: body axes forward, right, down to NED
 
     @property
     def clock_offset_ns(self) -> int | None:
@@ -69,6 +71,11 @@ class PositionIntake:
     def resyncs(self) -> int:
         """How often a source turned out to have a new clock."""
         return sum(clock.resyncs for clock in self._clocks.values())
+
+    def trips(self, address: Address | None = None) -> RoundTrips | None:
+        """Round trips to a peer that answers; without an address, to the newest sample's source."""
+        wanted = self._latest_address if address is None else address
+        return None if wanted is None else self._round_trips.get(wanted)
 
     def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to a TIMESYNC request."""
@@ -101,6 +108,7 @@ class PositionIntake:
             self._bad(captured)
             return None
         self.samples += 1
+        self.attitude = message.attitude and frame.attitude_to_ned(message.attitude, euler=message.euler)
         return PositionSample(
             captured_ns=captured,
             received_ns=received_ns,
@@ -133,7 +141,7 @@ class PositionIntake:
         trips = self._round_trips.get(address)
         captured = clock.captured_ns(stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns))
         if not isinstance(captured, str):
-            self._latest = clock
+            self._latest, self._latest_address = clock, address
         return captured
 
 

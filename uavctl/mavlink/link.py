@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from statistics import median
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, VehicleStatus
+from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, Vec3, VehicleStatus
+from uavctl.frames import Quaternion
+from uavctl.mavlink.clocksync import RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.intake import PositionIntake
-from uavctl.mavlink.messages import Message, Position, TimeSync
+from uavctl.mavlink.messages import Ack, Message, Position, Text, TimeSync
+from uavctl.mavlink.modes import HABITS
+from uavctl.mavlink.relay import Relay
+from uavctl.mavlink.request import COMMANDS, Ask
+from uavctl.mavlink.streams import GPS_GLOBAL_ORIGIN, SOURCE_PARAMETER, Globe, Streams
 from uavctl.mavlink.vehicle import SECOND_VEHICLE, VehicleWatch
 
 VEHICLE, MOCAP = "vehicle", "mocap"
@@ -22,11 +32,13 @@ TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
 FIRST_REQUESTS = 10  # sent faster, until the first answer
 OPEN_REQUESTS = 8  # requests whose answers are still taken
-MAX_ANSWERS = 8  # answers to others' requests that wait for the next tick
+# Others' requests that are answered within a time: a flood of them makes none of answers, and takes no tick its time.
+MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
+UNANSWERED = "timesync-flood"
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
-Item = PositionSample | VehicleStatus | Event
+Item = PositionSample | VehicleStatus | Event | Ack | Text
 
 
 class Link:
@@ -40,6 +52,8 @@ class Link:
         clock: the sources' clocks.
         source: which messages and which system count as positions.
         estimator: standard deviation of a position, and what is absurd.
+        listen: hears every message of others that is understood, with its time of arrival; for who wants to know more
+            than the items tell.
     """
 
     def __init__(
@@ -52,6 +66,7 @@ class Link:
         clock: ClockConfig,
         source: SourceConfig,
         estimator: EstimatorConfig,
+        listen: Callable[[Message, int], None] | None = None,
     ) -> None:
         self._name, self._roles = name, roles
         self._own = (daemon.system_id, daemon.component_id)
@@ -59,7 +74,8 @@ class Link:
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
         self._encoder = Encoder(*self._own)
         self._intake = PositionIntake(frame, clock, source, estimator, self._count)
-        self._vehicle = VehicleWatch(self._count)
+        self._vehicle = VehicleWatch(self._count, self._own)
+        self._streams, self._globe = Streams(), Globe()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
@@ -70,10 +86,37 @@ class Link:
         self._requests = 0
         self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._answered = False
-        self._answers: deque[tuple[int, int]] = deque(maxlen=MAX_ANSWERS)  # (tc1, ts1)
+        self._listen = listen
+        self._askers: set[int] = set()  # systems that ask for our time
+        self._answers: list[bytes] = []  # to requests of the last datagram
+        self._answers_left, self._answers_from_ns = MAX_ANSWERS, 0
+
+    @property
+    def vehicle(self) -> tuple[int, int] | None:
+        """System and component of the vehicle; None before its first heartbeat."""
+        return self._vehicle.address
+
+    @property
+    def attitude(self) -> Quaternion | None:
+        """How the body of the newest sample was turned: body axes forward, right, down to NED (w, x, y, z)."""
+        return self._intake.attitude
+
+    def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
+        """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
+        return self._intake.trips(address)
+
+    @property
+    def vehicle_asks_time(self) -> bool:
+        """Whether the vehicle has asked for our time."""
+        return self.vehicle is not None and self.vehicle[0] in self._askers
+
+    def vehicle_up_s(self, at_ns: int) -> float | None:
+        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        return self._vehicle.up_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> tuple[Item, ...]:
         """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
+        self._answers.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
         self._datagrams += 1
         self._messages += decoded.total
@@ -82,8 +125,18 @@ class Link:
         items = [item for message in decoded.messages for item in self._take(message, at_ns)]
         return (*items, *self._tell(at_ns))
 
+    def answers(self) -> tuple[bytes, ...]:
+        """What the last datagram has to be answered with, at once: a TIMESYNC that waits measures the wait."""
+        return tuple(self._answers)
+
+    def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
+        for reason, count in counts.items():
+            self._count(reason, count)
+        return self._tell(at_ns)
+
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """What is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC requests and answers."""
+        """What is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
         out = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
@@ -95,8 +148,8 @@ class Link:
             self._requests += 1
             self._open.append(at_ns)
             out.append(self._encoder.timesync(0, at_ns))
-        while self._answers:
-            out.append(self._encoder.timesync(*self._answers.popleft()))
+        if VEHICLE in self._roles and self.vehicle is not None:
+            out.extend(self.request_stream(number, rate_hz) for number, rate_hz in self._streams.due(at_ns))
         return tuple(out)
 
     def setpoint(self, setpoint: Setpoint) -> bytes:
@@ -107,20 +160,92 @@ class Link:
         """
         return self._encoder.setpoint(setpoint, *self._target())
 
-    def land(self, at_ns: int) -> bytes:
-        """The request to land where it is, addressed to the vehicle.
+    def ask(self, ask: Ask, height_m: float) -> bytes:
+        """A request to the vehicle.
 
         Args:
-            at_ns: time of sending; the message carries none.
+            ask: what for.
+            height_m: of the climb above the ground [m], for a take-off.
+
+        Raises:
+            UnsendableError: no vehicle has been heard, or it is of a kind that cannot be asked for this.
+        """
+        parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
+        match ask:
+            case Ask.TAKE_OFF_MODE | Ask.EXTERNAL_MODE:
+                parameters = self._mode(ask)
+            case Ask.ARM:
+                parameters = (1.0,)
+            case Ask.TAKE_OFF:
+                parameters = (*(0.0,) * 6, height_m)
+        return self._encoder.command(COMMANDS[ask], parameters, *self._target())
+
+    def _mode(self, ask: Ask) -> tuple[float, ...]:
+        """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
+        habits = HABITS.get(self._vehicle.autopilot)
+        if habits is None:
+            raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
+        name = habits.external if ask is Ask.EXTERNAL_MODE else habits.take_off
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, habits.modes[name]))
+
+    def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
+        """What an ArduPilot without GPS has to be told before it arms; to be called while it is to be armed.
+
+        Args:
+            at_ns: time of sending.
+            place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
+        """
+        if self._vehicle.autopilot != "ardupilot":
+            return ()
+        asks, tells = self._globe.due(at_ns)
+        if not asks:
+            return ()
+        system, component = self._target()
+        out = (
+            self._encoder.request_parameter(SOURCE_PARAMETER, system, component),
+            self._encoder.request_message(GPS_GLOBAL_ORIGIN, system, component),
+        )
+        return (self._encoder.origin(place_deg_m, system), *out) if tells else out
+
+    def request_parameter(self, name: str) -> bytes:
+        """The request for one parameter, addressed to the vehicle.
 
         Raises:
             UnsendableError: no vehicle has been heard.
         """
-        del at_ns
-        return self._encoder.land(*self._target())
+        return self._encoder.request_parameter(name, *self._target())
+
+    def request_stream(self, message_id: int, rate_hz: float) -> bytes:
+        """The request to send a message so often, or once with rate 0, addressed to the vehicle.
+
+        Raises:
+            UnsendableError: no vehicle has been heard.
+        """
+        if rate_hz == 0.0:
+            return self._encoder.request_message(message_id, *self._target())
+        return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
+
+    def relay(self, relay: Relay, at_ns: int, autopilot: str, *, refused: int) -> tuple[bytes, ...]:
+        """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
+
+        Args:
+            relay: what waits to be passed on.
+            at_ns: now.
+            autopilot: the vehicle's kind; only PX4 moves stamps by what it has asked.
+            refused: samples that the tick refused.
+        """
+        if not relay.enabled or self.vehicle is None:
+            return ()
+        trips = self.trips(self.vehicle)
+        offset_ns = None if trips is None else trips.offset_ns(at_ns)
+        asks = autopilot == "px4" and self.vehicle_asks_time
+        poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
+        return tuple(self._encoder.external_position(pose) for pose in poses)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
+        trips = self.trips() or (None if self.vehicle is None else self.trips(self.vehicle))
+        round_trips_ns = () if trips is None else trips.round_trips_ns
         return LinkStats(
             at_ns=at_ns,
             link=self._name,
@@ -130,6 +255,9 @@ class Link:
             bad={str(reason): count for reason, count in self._bad.items()},
             clock_offset_ns=self._intake.clock_offset_ns,
             clock_source=str(self._intake.clock_source),
+            clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
+            clock_drift_ppm=None if trips is None else trips.drift_ppm,
+            clock_rejected=0 if trips is None else trips.rejected,
         )
 
     def _target(self) -> tuple[int, int]:
@@ -140,18 +268,41 @@ class Link:
     def _take(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         if (message.system, message.component) == self._own:  # our own words, sent back by a router
             return ()
-        item: Item | None = None
+        if self._listen is not None:
+            self._listen(message, at_ns)
         if isinstance(message, TimeSync):
             self._timesync(message, at_ns)
-        elif isinstance(message, Position):
-            item = self._intake.take(message, at_ns) if MOCAP in self._roles else None
-        elif VEHICLE in self._roles:
-            item = self._vehicle.take(message, at_ns)
-        return () if item is None else (item,)
+            return ()
+        items: tuple[Item, ...] = self._follow(message, at_ns) if VEHICLE in self._roles else ()
+        if isinstance(message, Position) and MOCAP in self._roles:
+            sample = self._intake.take(message, at_ns)
+            return items if sample is None else (*items, sample)
+        return items
+
+    def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        """What the vehicle tells of itself."""
+        boots = self._vehicle.boots
+        items = self._vehicle.take(message, at_ns)
+        if self._vehicle.boots != boots:
+            self._streams.restart()
+            self._globe = Globe()
+            text = f"link {self._name}: the vehicle has started anew"
+            return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
+        if self.vehicle is not None and message.system == self.vehicle[0]:
+            self._streams.saw(message)
+            self._globe.saw(message)
+        return items
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            self._answers.append((at_ns, message.ts1_ns))
+            self._askers.add(message.system)
+            if at_ns - self._answers_from_ns >= ANSWERS_NS:
+                self._answers_left, self._answers_from_ns = MAX_ANSWERS, at_ns
+            if not self._answers_left:
+                self._count(UNANSWERED)
+                return
+            self._answers_left -= 1
+            self._answers.append(self._encoder.timesync(at_ns, message.ts1_ns))
         elif message.ts1_ns in self._open:  # else it answers somebody else
             self._answered = True
             self._intake.answer((message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uavctl.data import Vec3
-from uavctl.frames import Convention
+from uavctl.frames import Convention, Quaternion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +28,10 @@ class Position(Message):
         velocity_mps: velocity in the same axes [m/s], or None.
         convention: axes that the message declares; None if it leaves them to the configuration.
         local_ned: the message is in the vehicle's local NED already.
+        attitude: how the body is turned (w, x, y, z), body axes to those of the position; None if not given, or no
+            rotation.
+        euler: the attitude came as Euler angles: its body axes are forward, right, down in a frame that points down
+            and forward, left, up in one that points up. Otherwise they are forward, right, down.
     """
 
     name: str
@@ -37,6 +41,8 @@ class Position(Message):
     velocity_mps: Vec3 | None = None
     convention: Convention | None = None
     local_ned: bool = False
+    attitude: Quaternion | None = None
+    euler: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +53,7 @@ class Heartbeat(Message):
     autopilot: int
     base_mode: int
     custom_mode: int
+    system_status: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +88,60 @@ class Text(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ack(Message):
-    """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted."""
+    """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted; target 0 is for everybody."""
 
     command: int
     result: int
+    target_system: int
+    target_component: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin(Message):
+    """GPS_GLOBAL_ORIGIN: the vehicle knows its place on the globe."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attitude(Message):
+    """ATTITUDE: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
+
+    angles_rad: Vec3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParamValue(Message):
+    """PARAM_VALUE; `cast` and `bytewise` are the two readings of the same four bytes.
+
+    Attributes:
+        name: of the parameter.
+        cast: the value as a number, as ArduPilot means it.
+        bytewise: the value as PX4 means it: the bytes of an integer, if the type is one.
+    """
+
+    name: str
+    cast: float
+    bytewise: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatorFlags(Message):
+    """ESTIMATOR_STATUS or EKF_STATUS_REPORT: what the vehicle's own estimator trusts.
+
+    Attributes:
+        flags: ESTIMATOR_STATUS_FLAGS, which are EKF_STATUS_FLAGS.
+    """
+
+    flags: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotVersion(Message):
+    """AUTOPILOT_VERSION.
+
+    Attributes:
+        capabilities: MAV_PROTOCOL_CAPABILITY.
+        version: of the software: major, minor, patch.
+    """
+
+    capabilities: int
+    version: tuple[int, int, int]

@@ -1,178 +1,197 @@
-"""Flight modes by name, and the hand-over between pilot and controller as a table.
+"""The hand-over between pilot and controller, as a table of transitions.
 
-The controller never asks for a mode: it streams neutral setpoints so that the pilot may switch, flies
-while the vehicle is armed in its external mode, and is out for good once the pilot has taken over.
+Without an order the controller never asks for a mode but landing: it streams neutral setpoints so that the pilot may
+switch, flies while the vehicle is armed in its external mode, and is out once the pilot has taken over. Ordered to, it
+asks for the mode, arms, lets the vehicle climb and asks for the external mode: `uavctl.mavlink.hand_over` walks the
+table. A vehicle that a daemon before has left in the air is not taken up again without an order.
 """
 
 from __future__ import annotations
 
 from enum import Enum, StrEnum
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from uavctl.data import Event, Severity, VehicleStatus
-
-HEARTBEAT_TIMEOUT_NS = 3_000_000_000
-
-# PX4: custom_mode is reserved (16 bits), main mode (8), sub mode (8); src/modules/commander/px4_custom_mode.h
-_PX4_MAIN = {
-    1: "MANUAL",
-    2: "ALTCTL",
-    3: "POSCTL",
-    4: "AUTO",
-    5: "ACRO",
-    6: "OFFBOARD",
-    7: "STABILIZED",
-    8: "RATTITUDE",
-    9: "SIMPLE",
-    10: "TERMINATION",
-}
-_PX4_AUTO = {
-    1: "READY",
-    2: "TAKEOFF",
-    3: "LOITER",
-    4: "MISSION",
-    5: "RTL",
-    6: "LAND",
-    8: "FOLLOW_TARGET",
-    9: "PRECLAND",
-}
-_COPTER_TYPES = frozenset(
-    {
-        mavlink.MAV_TYPE_QUADROTOR,
-        mavlink.MAV_TYPE_COAXIAL,
-        mavlink.MAV_TYPE_HELICOPTER,
-        mavlink.MAV_TYPE_HEXAROTOR,
-        mavlink.MAV_TYPE_OCTOROTOR,
-        mavlink.MAV_TYPE_TRICOPTER,
-        mavlink.MAV_TYPE_DODECAROTOR,
-        mavlink.MAV_TYPE_DECAROTOR,
-    }
-)
-# ArduCopter: enum COPTER_MODE
-_COPTER = {
-    int(getattr(mavlink, name)): name.removeprefix("COPTER_MODE_")
-    for name in dir(mavlink)
-    if name.startswith("COPTER_MODE_") and name != "COPTER_MODE_ENUM_END"
-}
-
-
-def autopilot_name(autopilot: int) -> str:
-    """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
-    names = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
-    return names.get(autopilot, "unknown")
-
-
-def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
-    """A mode by the autopilot's own name, and whether it takes our setpoints.
-
-    Numbers mean something else on every autopilot, and on ArduPilot on every kind of vehicle; what is
-    not known here never counts as external.
-    """
-    if autopilot == "px4":
-        main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
-        name = _PX4_MAIN.get(main, f"MODE_{main}")
-        return (f"AUTO.{_PX4_AUTO.get(sub, sub)}" if name == "AUTO" else name), name == "OFFBOARD"
-    if autopilot == "ardupilot" and vehicle_type in _COPTER_TYPES:
-        name = _COPTER.get(custom_mode, f"MODE_{custom_mode}")
-        return name, name == "GUIDED"
-    return f"MODE_{custom_mode}", False
-
 
 class State(StrEnum):
-    """Who flies."""
+    """Who flies, or what is under way."""
 
     WAITING = "waiting"  # no vehicle is heard
     READY = "ready"  # heard; neutral setpoints warm the stream up
+    MODE = "asking for the mode"  # on the ground, ordered to take off
+    ARMING = "arming"
+    CLIMBING = "climbing"  # the vehicle climbs by itself
+    ENGAGING = "engaging"  # at height: the external mode is asked for
+    RETURNING = "returning"  # the same from `released`, ordered to
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
-    RELEASED = "released"  # the pilot has taken over: nothing is sent, for good
-    LANDING = "landing"  # landing was asked for: nothing is sent, for good
+    RELEASED = "released"  # the pilot has taken over: nothing is sent unless ordered to
+    LANDING = "landing"  # landing was asked for: no setpoints any more, for good
+    SETTLING = "settling"  # the vehicle lands by itself
+    DONE = "done"  # disarmed after all: nothing is sent, for good
+    FAILED = "failed"  # the vehicle does not do what was asked: nothing is sent, for good
 
 
 class Seen(StrEnum):
-    """What a tick sees."""
+    """What a tick sees; of several things the first in this order."""
 
+    REBOOT = "reboot"  # the vehicle has started anew
+    LAND = "land"  # the controller, or the operator, asks for landing
+    GRANTED = "granted"  # what was asked for is there
+    REFUSED = "refused"  # what was asked for will not come
     SILENCE = "silence"  # no heartbeat, or the last one is too old
-    PILOT = "pilot"  # heard; disarmed or in another mode
-    EXTERNAL = "external"  # heard, armed, in the external mode
-    LAND = "land"  # whatever is heard: the controller asks for landing
+    TAKE_OFF = "take-off"  # ordered, and nothing speaks against it
+    ENGAGE = "engage"  # ordered, and the vehicle is in the air
+    LEFT = "left"  # found armed, and a daemon before this one ended while it had it
+    DISARMED = "disarmed"
+    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's or a failsafe's
+    EXTERNAL = "external"  # armed, in the external mode
+    PENDING = "pending"  # what was asked for is not there yet
 
 
 class Sending(Enum):
-    """What a tick may send to the vehicle."""
+    """What a tick may stream to the vehicle."""
 
     NOTHING = "nothing"
     NEUTRAL = "neutral"
     SETPOINTS = "setpoints"
-    LAND = "land"
 
 
-# A landing is asked for only by who flies; before that there is nothing to hand over.
-TRANSITIONS: dict[tuple[State, Seen], tuple[State, Sending]] = {
-    (State.WAITING, Seen.SILENCE): (State.WAITING, Sending.NOTHING),
-    (State.WAITING, Seen.PILOT): (State.READY, Sending.NEUTRAL),
-    (State.WAITING, Seen.EXTERNAL): (State.ENGAGED, Sending.SETPOINTS),
-    (State.WAITING, Seen.LAND): (State.WAITING, Sending.NOTHING),
-    (State.READY, Seen.SILENCE): (State.WAITING, Sending.NOTHING),
-    (State.READY, Seen.PILOT): (State.READY, Sending.NEUTRAL),
-    (State.READY, Seen.EXTERNAL): (State.ENGAGED, Sending.SETPOINTS),
-    (State.READY, Seen.LAND): (State.READY, Sending.NOTHING),
-    (State.ENGAGED, Seen.SILENCE): (State.ENGAGED, Sending.NOTHING),
-    (State.ENGAGED, Seen.PILOT): (State.RELEASED, Sending.NOTHING),
-    (State.ENGAGED, Seen.EXTERNAL): (State.ENGAGED, Sending.SETPOINTS),
-    (State.ENGAGED, Seen.LAND): (State.LANDING, Sending.LAND),
-    **{(State.RELEASED, seen): (State.RELEASED, Sending.NOTHING) for seen in Seen},
-    **{(State.LANDING, seen): (State.LANDING, Sending.NOTHING) for seen in Seen},
+Target = tuple[State, Sending]
+_W, _R, _M, _A, _C = State.WAITING, State.READY, State.MODE, State.ARMING, State.CLIMBING
+_G, _B, _E, _X, _L = State.ENGAGING, State.RETURNING, State.ENGAGED, State.RELEASED, State.LANDING
+_S, _D, _F = State.SETTLING, State.DONE, State.FAILED
+_NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+
+# What is not here changes nothing, and nothing is sent.
+_CHANGES: dict[State, dict[Seen, Target]] = {
+    _W: {
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe, and so take over
+        Seen.DISARMED: (_R, _NEUTRAL),
+        Seen.OTHER: (_R, _NEUTRAL),
+        Seen.EXTERNAL: (_E, _FLY),
+    },
+    _R: {
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.SILENCE: (_W, _NOTHING),
+        Seen.TAKE_OFF: (_M, _NEUTRAL),
+        Seen.ENGAGE: (_B, _NEUTRAL),
+        Seen.DISARMED: (_R, _NEUTRAL),
+        Seen.OTHER: (_R, _NEUTRAL),
+        Seen.EXTERNAL: (_E, _FLY),
+    },
+    _M: {
+        Seen.REBOOT: (_F, _NOTHING),
+        Seen.LAND: (_D, _NOTHING),  # it stands on the ground, disarmed
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_A, _NEUTRAL),
+        Seen.PENDING: (_M, _NEUTRAL),
+    },
+    _A: {
+        Seen.REBOOT: (_F, _NOTHING),
+        Seen.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_C, _NEUTRAL),
+        Seen.PENDING: (_A, _NEUTRAL),
+    },
+    _C: {
+        Seen.REBOOT: (_F, _NOTHING),
+        Seen.LAND: (_L, _NOTHING),
+        Seen.REFUSED: (_L, _NOTHING),
+        Seen.DISARMED: (_F, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_G, _NEUTRAL),
+        Seen.PENDING: (_C, _NEUTRAL),
+    },
+    _G: {
+        Seen.REBOOT: (_F, _NOTHING),
+        Seen.LAND: (_L, _NOTHING),
+        Seen.REFUSED: (_L, _NOTHING),
+        Seen.DISARMED: (_F, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_E, _FLY),
+        Seen.PENDING: (_G, _NEUTRAL),
+    },
+    _B: {
+        Seen.REBOOT: (_X, _NOTHING),
+        Seen.LAND: (_X, _NOTHING),  # the pilot flies still
+        Seen.REFUSED: (_X, _NOTHING),
+        Seen.DISARMED: (_D, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_E, _FLY),
+        Seen.PENDING: (_B, _NEUTRAL),
+    },
+    _E: {
+        Seen.REBOOT: (_X, _NOTHING),
+        Seen.LAND: (_L, _NOTHING),
+        Seen.SILENCE: (_E, _FLY),  # the controller brakes and holds, for a while: the vehicle may hear us still
+        Seen.DISARMED: (_D, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.EXTERNAL: (_E, _FLY),
+    },
+    _X: {
+        Seen.ENGAGE: (_B, _NEUTRAL),
+        Seen.DISARMED: (_D, _NOTHING),
+    },
+    _L: {
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.DISARMED: (_D, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+        Seen.GRANTED: (_S, _NOTHING),
+    },
+    _S: {
+        Seen.REFUSED: (_F, _NOTHING),
+        Seen.DISARMED: (_D, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
+    },
+    _D: {},
+    _F: {},
+}
+# Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
+LEAVES_NONE = frozenset({State.READY, State.SETTLING, State.DONE})
+TRANSITIONS: dict[tuple[State, Seen], Target] = {
+    (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in State for seen in Seen
 }
 
 
-def look(at_ns: int, vehicle: VehicleStatus | None, *, land: bool) -> Seen:
-    """What a tick at `at_ns` sees of the vehicle."""
-    if land:
-        return Seen.LAND
-    if vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS:
-        return Seen.SILENCE
-    return Seen.EXTERNAL if vehicle.armed and vehicle.external else Seen.PILOT
+def page() -> str:
+    """The page of the documentation that shows the table."""
+    return f"""# Who flies: the hand-over
+
+Written from the table in `uavctl/mavlink/mode.py` (`make docs`). A word on an arrow is what a tick sees; of several
+things the first in this list counts:
+{", ".join(f"`{seen}`" for seen in Seen)}.
+What is not drawn changes nothing. Setpoints are sent in `ENGAGED` only; neutral ones (zero acceleration) where PX4
+wants a stream before it gives OFFBOARD: in `READY`, on the way up (not to ArduPilot, whose climb they would end), and
+in `RETURNING`.
+
+```mermaid
+{drawing()}```
+
+* `take-off` is `--arm --takeoff HEIGHT`; `engage` is `uavctl ctl engage`. Nothing else leads towards arming or back
+  from the pilot. `land` comes from the controller, or from the operator on the way up.
+* `left`: the daemon before this one ended while it had the vehicle, and nobody had asked it to (it was killed, or
+  failed); and the vehicle, which has not started anew since, is armed when it is heard first. Nothing is sent, as
+  setpoints would end PX4's failsafe; `uavctl ctl engage` takes it up again. Whoever ends so leaves word in the file
+  of its lock ([operation.md](operation.md#how-it-ends)).
+* `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
+  (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
+* PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
+  (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
+* What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
+  still says otherwise 0.3 s later is the pilot's word.
+* While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
+"""
 
 
-class HandOver:
-    """The table's state from tick to tick."""
-
-    def __init__(self) -> None:
-        self.state = State.WAITING
-        self._silent = False
-
-    def update(
-        self, at_ns: int, vehicle: VehicleStatus | None, *, ready: bool, land: bool
-    ) -> tuple[Sending, tuple[Event, ...]]:
-        """Decide what one tick may send.
-
-        Args:
-            at_ns: time of the tick.
-            vehicle: its latest status, or None.
-            ready: whether the controller has a setpoint; without one no neutral stream invites the pilot.
-            land: whether the controller asks for landing.
-
-        Returns:
-            What may be sent, and what there is to tell.
-        """
-        seen = look(at_ns, vehicle, land=land)
-        before = self.state
-        self.state, sending = TRANSITIONS[before, seen]
-        if sending is Sending.NEUTRAL and not ready:
-            sending = Sending.NOTHING
-        return sending, self._tell(at_ns, before, seen, vehicle)
-
-    def _tell(self, at_ns: int, before: State, seen: Seen, vehicle: VehicleStatus | None) -> tuple[Event, ...]:
-        events = []
-        silent = self.state is State.ENGAGED and seen is Seen.SILENCE
-        if silent != self._silent:
-            self._silent = silent
-            word = "lost: no setpoints are sent" if silent else "is back"
-            events.append(Event(at_ns=at_ns, severity=Severity.ERROR, code="heartbeat", text=f"heartbeat {word}"))
-        if self.state is not before:
-            mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
-            severity = Severity.WARNING if self.state in (State.RELEASED, State.LANDING) else Severity.INFO
-            text = f"{before} -> {self.state}{mode}"
-            events.append(Event(at_ns=at_ns, severity=severity, code="hand-over", text=text))
-        return tuple(events)
+def drawing() -> str:
+    """The table as a Mermaid state diagram: every way from one state to another, by what is seen."""
+    lines = ["stateDiagram-v2", "    [*] --> WAITING"]
+    for before in State:
+        ways: dict[State, list[str]] = {}
+        for seen in Seen:
+            after = TRANSITIONS[before, seen][0]
+            if after is not before:
+                ways.setdefault(after, []).append(seen.value)
+        lines += [f"    {before.name} --> {after.name}: {', '.join(seen)}" for after, seen in ways.items()]
+    return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Event, Severity, VehicleStatus
-from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Text
-from uavctl.mavlink.mode import autopilot_name, describe_mode
+from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text
+from uavctl.mavlink.modes import autopilot_name, describe_mode
 
 SECOND_VEHICLE = "second-vehicle"
+ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
+BACK_MS = 1000  # its clock goes back by more than this: it has started anew
+_WRAP_MS = 2**32
+_ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
+_STARTING = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
 _GROUND_STATION = int(mavlink.MAV_TYPE_GCS)
 
@@ -25,42 +31,88 @@ class VehicleWatch:
 
     Args:
         bad: counter that heartbeats of other vehicles are added to.
+        own: our system and component id; answers to others' commands are not ours.
     """
 
-    def __init__(self, bad: Callable[[str], None]) -> None:
+    def __init__(self, bad: Callable[[str], None], own: tuple[int, int]) -> None:
         self._bad = bad
+        self._own = own
         self._landed: bool | None = None
         self._battery_v: float | None = None
+        self._boot_ms: int | None = None
+        self._boot_read_ns = 0
+        self._started = False  # past its start-up
+        self._another_ns: int | None = None  # when another vehicle was heard last
+        self._status: VehicleStatus | None = None
+        self.boots = 0
         self.address: tuple[int, int] | None = None  # system, component
 
-    def take(self, message: Message, at_ns: int) -> VehicleStatus | Event | None:
+    @property
+    def autopilot(self) -> str:
+        """Which autopilot it is; empty before its first heartbeat."""
+        return "" if self._status is None else self._status.autopilot
+
+    def take(self, message: Message, at_ns: int) -> tuple[VehicleStatus | Event | Ack | Text, ...]:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._heartbeat(message, at_ns)
         if self.address is None or message.system != self.address[0]:
-            return None
+            return ()
         match message:
             case Landed(landed=landed):
                 self._landed = landed
             case Battery(voltage_v=voltage_v):
                 self._battery_v = voltage_v
+            case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
+                return self._clock(stamp_us // 1000, at_ns)
             case Text(severity=severity, text=text):
-                return Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
-            case Ack():
-                return _ack_event(message, at_ns)
-        return None
+                return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
+            case Ack() if self._is_ours(message):
+                return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
+        return ()
 
-    def _heartbeat(self, message: Heartbeat, at_ns: int) -> VehicleStatus | None:
+    def _is_ours(self, ack: Ack) -> bool:
+        system, component = self._own
+        return ack.target_system in (0, system) and ack.target_component in (0, component)
+
+    def up_s(self, at_ns: int) -> float | None:
+        """How long ago it started, by its own clock [s]; None if it does not tell."""
+        return None if self._boot_ms is None else self._boot_ms / 1e3 + (at_ns - self._boot_read_ns) / 1e9
+
+    def _clock(self, boot_ms: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Watch its time since boot, modulo 2**32 ms; a status tells at once that it has started anew."""
+        last_ms, self._boot_ms, self._boot_read_ns = self._boot_ms, boot_ms, at_ns
+        back_ms = 0 if last_ms is None else (last_ms - boot_ms) % _WRAP_MS
+        if not BACK_MS < back_ms < _WRAP_MS // 2:
+            return ()
+        return self._reboot()
+
+    def _reboot(self) -> tuple[VehicleStatus, ...]:
+        self.boots += 1
+        self._started = False
+        self._landed = None
+        if self._status is None:
+            return ()
+        self._status = msgspec.structs.replace(self._status, boots=self.boots)
+        return (self._status,)
+
+    def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
         if self.address is None:
             self.address = address
         if address != self.address:
             if message.system != self.address[0]:
                 self._bad(SECOND_VEHICLE)
-            return None
+                self._another_ns = at_ns
+            return ()
+        starting = message.system_status in _STARTING
+        if starting and self._started:
+            self._reboot()
+            self._boot_ms = None
+        self._started = self._started or not starting
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
-        return VehicleStatus(
+        self._status = VehicleStatus(
             at_ns=at_ns,
             autopilot=autopilot,
             armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
@@ -68,7 +120,10 @@ class VehicleWatch:
             external=external,
             landed=self._landed,
             battery_v=self._battery_v,
+            boots=self.boots,
+            alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
         )
+        return (self._status,)
 
 
 def _severity(mav_severity: int) -> Severity:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
+from uavctl.smpc.bias import with_bias
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -43,7 +44,9 @@ class Innovations:
     estimate_cov: Array
 
 
-def innovations(plant: Plant, position_std_m: float, sample_age_s: float, losses: int) -> Innovations:
+def innovations(
+    plant: Plant, position_std_m: float, sample_age_s: float, losses: int, bias_drift: float = 0.0
+) -> Innovations:
     """Innovations form of a plant whose positions alone are measured, one a step.
 
     ν is that of the filter without losses; P̄ is what is left after a position that came after `losses` losses. The
@@ -55,12 +58,15 @@ def innovations(plant: Plant, position_std_m: float, sample_age_s: float, losses
         position_std_m: Standard deviation of a position, each axis [m].
         sample_age_s: Age of a step's position at the end of the step, 0 … Δt [s]; the older, the less is known.
         losses: Positions lost in a row before the one that P̄ is for.
+        bias_drift: Of a filter that estimates a bias too (`uavctl.smpc.bias`) [input units / √s]: ν and P̄ are those of
+            its x; what its d̂ moves in the course of a plan is left out.
 
     Raises:
         DesignError: The filter's covariance does not settle.
     """
-    sight = _Sight.of(plant, position_std_m, sample_age_s)
-    p = _reached(plant)
+    n_x, seen = plant.n_x, with_bias(plant, bias_drift) if bias_drift else plant
+    sight = _Sight.of(seen, position_std_m, sample_age_s)
+    p = _reached(seen)
     for _ in range(_MOST_STEPS):
         before, p = p, sight.after(p, seen=True)
         if np.abs(p - before).max() <= _SETTLED * np.abs(p).max():
@@ -76,8 +82,8 @@ def innovations(plant: Plant, position_std_m: float, sample_age_s: float, losses
         gapped = sight.after(gapped, seen=False)
     gapped = sight.after(gapped, seen=True)
     return Innovations(
-        plant=replace(plant, e=sight.effect(p), w=np.eye(len(plant.position_index))),
-        estimate_cov=_clean_covariance(gapped),
+        plant=replace(plant, e=_clean(sight.effect(p)[:n_x]), w=np.eye(len(plant.position_index))),
+        estimate_cov=_clean_covariance(gapped[:n_x, :n_x]),
     )
 
 
@@ -128,7 +134,7 @@ class _Sight:
         """E (n_x, n_y) of ν = E ω, ω ~ N(0, I), from the covariance at the step's begin: L S^½ carried to its end."""
         z = self._at_sample(p)
         root = np.linalg.cholesky(self._innovation(z))
-        return _clean((self.to_end @ self._gain(z) @ root)[: len(p)])
+        return np.asarray((self.to_end @ self._gain(z) @ root)[: len(p)])
 
     def _at_sample(self, p: Array) -> Array:
         n_x = len(p)

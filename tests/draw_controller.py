@@ -1,0 +1,131 @@
+"""Controllers drawn at random: design, schedule, solver, estimator and fallback, as far as there is a design."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from uavctl.build import build_design
+from uavctl.cli.prepare import Prepared, prepare
+from uavctl.config import Config, load_config
+from uavctl.errors import ConfigError, DesignError
+
+TRIES = 30  # draws of a design until there is one
+# Designs that have a policy library: it takes seconds to make one, so these are few, and kept in the cache.
+WITH_LIBRARY = (
+    ("room",),
+    (
+        "room",
+        "link.model=gilbert-elliott",
+        "link.loss=0.2",
+        "link.burst_enter=0.1",
+        "link.burst_leave=0.5",
+        "link.burst_loss=0.8",
+    ),
+    ("room", "solver.exact=false", "link.loss=0.2"),
+    ("paper",),
+)
+
+
+def draw_controller(rng: np.random.Generator, seed: int) -> Config:
+    """A controller for which there is a design."""
+    if seed % 3 == 0:
+        return with_library(int(rng.integers(len(WITH_LIBRARY)))).config
+    for _ in range(TRIES):
+        try:
+            config = load_config(*_controller(rng))
+            build_design(config)
+        except (ConfigError, DesignError):
+            continue
+        return config
+    raise AssertionError(f"seed {seed}: no design in {TRIES} draws")
+
+
+def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
+    """Preset and overrides of design, solver, estimator and fallback; not all of them fit together."""
+    name = str(rng.choice(["room", "paper"], p=[0.7, 0.3]))
+    horizon = int(rng.integers(7, 15))
+    said = {
+        "smpc.horizon": horizon,
+        "smpc.tau": int(rng.integers(2, 6)),
+        "smpc.delta_x": rng.uniform(0.85, 0.97),
+        "smpc.delta_u": rng.uniform(0.8, 0.95),
+        "risk.allocation": rng.choice(["ellipsoid", "halfspace"]),
+        "schedule.joint": rng.choice(["true", "false"]),
+        "link.loss": rng.uniform(0.0, 0.35),
+        "fallback.hold_s": rng.uniform(0.0, 3.0),
+        "fallback.recover_samples": int(rng.integers(1, 5)),
+        "limits.slew_mps3": rng.uniform(3.0, 50.0),
+        "source.rate_hz": rng.choice([0.0, 5.0]) if name == "room" else 0.0,
+    }
+    # The search solves many problems: of two axes and short horizons only.
+    rules = ["fixed", "list", "greedy", *(["search"] if name == "paper" and horizon < 10 else [])]
+    rule = str(rng.choice(rules))
+    if rule in ("fixed", "list"):
+        delays = rng.integers(3, 7)
+        said["schedule.delays"] = delays if rule == "fixed" else [int(delays)] * (horizon - 2) + [int(delays) + 1] * 2
+    else:
+        said["schedule.rule"] = rule
+        width = 9 if name == "room" else 4
+        said["schedule.search_states"] = [[0.0] * width, [0.5] + [0.0] * (width - 1)]
+    said |= _believed_link(rng)
+    method = str(rng.choice(["exact", "printed"], p=[0.8, 0.2]))
+    said["solver.method"] = method
+    said["risk.estimate"] = "exact" if method == "printed" else rng.choice(["exact", "innovations"])
+    if name == "room" and method == "exact" and rng.uniform() < 0.3:
+        said |= {"schedule.late": int(rng.integers(1, 3)), "link.delay_s": rng.uniform(0.0, 0.3)}
+    if name == "room" and rng.uniform() < 0.4:
+        said |= {"estimator.bias_drift": 0.0, "estimator.bias_max": 0.0}
+    if name == "room" and rng.uniform() < 0.3:
+        said |= {"plant.drag_1ps": [float(rng.uniform(0.05, 0.4))] * 3, "plant.lag_s": [0.25, 0.25, 0.3]}
+    return name, [f"{key}={value}" for key, value in said.items()]
+
+
+def _believed_link(rng: np.random.Generator) -> dict[str, object]:
+    """What the design counts on."""
+    model = str(rng.choice(["bernoulli", "known ahead", "gilbert-elliott", "empirical", "trace"]))
+    if model == "bernoulli":
+        return {}
+    if model == "known ahead":
+        return {"link.probability": [float(p) for p in rng.uniform(0.6, 1.0, 4)]}
+    more: dict[str, object] = {"link.model": model}
+    if model == "gilbert-elliott":
+        more |= {"link.burst_enter": rng.uniform(0.02, 0.1), "link.burst_leave": rng.uniform(0.4, 0.9)}
+    elif model == "empirical":
+        more["link.gaps"] = [0.7, 0.2, 0.07, 0.03]
+    else:
+        delays = np.where(rng.uniform(size=50) < 0.2, math.inf, rng.uniform(0.005, 0.03, 50))
+        more["link.trace_s"] = [float(delay) for delay in delays]
+        more["link.delay_s"] = 0.03
+    return more
+
+
+@lru_cache(maxsize=len(WITH_LIBRARY))
+def with_library(number: int) -> Prepared:
+    """One of those that fly with a policy library."""
+    name, *overrides = WITH_LIBRARY[number]
+    config = load_config(name, overrides)
+    return prepare(config, build_design(config))
+
+
+def with_libraries() -> None:
+    """Make the policy libraries that the flights ask for, where they are not in the cache yet."""
+    for number in range(len(WITH_LIBRARY)):
+        with_library(number)
+
+
+@lru_cache(maxsize=2)
+def prepared_of(config: Config) -> Prepared:
+    """What flies with a drawn configuration."""
+    return prepare(config, build_design(config))
+
+
+def fits(config: Config) -> bool:
+    """Whether the mission can be flown with this design: there is rest at its places."""
+    try:
+        prepared_of(config)
+    except DesignError:
+        return False
+    return True

@@ -1,0 +1,260 @@
+"""Flights of random configurations with everything amiss, recorded and replayed, for `tools/soak.py` and its tests."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from draw_controller import prepared_of
+from draw_flight import Drawn, drawn
+from msgspec.structs import replace
+from signing_rig import KEY, OFFSET_NS
+
+from logs.info import info
+from logs.onlookers import Onlookers
+from logs.recorder import SyncRecorder
+from logs.replay import ReplayResult
+from logs.views import Views
+from sim.peers import Peers
+from sim.world import World
+from uavctl.cli.flying import put_header
+from uavctl.cli.prepare import Prepared
+from uavctl.cli.replaying import replay_flight
+from uavctl.config import Config
+from uavctl.data import Command, Order, Outgoing, Record, Sink
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.framing import scan
+from uavctl.mavlink.gate import Gate
+from uavctl.mavlink.signing import Signing, SigningKey, Stamps
+
+SECOND_NS = 1_000_000_000
+
+
+class Doors:
+    """Signatures put on and taken off again, with what the channel has damaged left damaged."""
+
+    def __init__(self, links: tuple[str, ...]) -> None:
+        key, theirs, ours = SigningKey(KEY), Stamps(), Stamps()
+        self.peers = {name: Gate(Signing(key, 3, theirs, OFFSET_NS), stream=False) for name in links}
+        self.gates = {name: Gate(Signing(key, 7, ours, OFFSET_NS), stream=False) for name in links}
+        self.told: dict[str, Counter[str]] = {name: Counter() for name in links}
+
+    def take(self, link: str, data: bytes, at_ns: int) -> bytes:
+        """What of a datagram passes."""
+        found = scan(data, final=True)
+        if found.frames and not found.bad:
+            data = b"".join(self.peers[link].seal(frame.data, at_ns) for frame in found.frames)
+        return self.gates[link].admit(data, at_ns)
+
+    def tell(self, loop: ControlLoop, at_ns: int) -> None:
+        """What did not, since this was last told."""
+        for name, gate in self.gates.items():
+            new = gate.refused - self.told[name]
+            self.told[name] = Counter(gate.refused)
+            if new:
+                loop.refused(name, dict(new), at_ns)
+
+
+@dataclass
+class Rig:
+    """The loop as the world sees it, with all that a plan has happen to it.
+
+    Attributes:
+        plan: What happens.
+        prepared: What flies.
+        sink: Where its records go.
+        missed: Ticks missed since the last one.
+    """
+
+    plan: Drawn
+    prepared: Prepared
+    sink: Sink
+    missed: int = 0
+    stop: bool = False
+    world: World | None = None
+    _late: list[tuple[int, int]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        config = self.plan.config
+        self.loop = ControlLoop(config, self.prepared.controller, self.sink, lambda: 0)
+        self._links = ("vehicle",) if config.daemon.vehicle == config.daemon.mocap else ("vehicle", "mocap")
+        self._doors = Doors(self._links) if self.plan.signed else None
+        self._rng = np.random.default_rng((config.sim.seed, 1))
+        self._heard: list[bytes] = []
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        """Take a datagram."""
+        self._heard = [*self._heard[-20:], data]
+        if self._doors is not None:
+            data = self._doors.take(link, data, at_ns)
+            if not data:
+                return ()
+        return self.loop.receive(link, data, at_ns)
+
+    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+        """Run a tick, or miss it, or put it off."""
+        plan = self.plan
+        if tick == 0 and plan.take_off_m is not None:
+            self.loop.order(Command(order=Order.TAKE_OFF, height_m=plan.take_off_m))
+        for when, command in plan.orders:
+            if when == tick:
+                self.loop.order(command)
+        if self._rng.uniform() < plan.noise:
+            self._stranger(at_ns)
+        if tick in plan.skipped:
+            self.missed += 1
+        elif tick in plan.late:
+            self._late.append((tick, at_ns))
+        else:
+            for one, its_ns in [*self._late, (tick, at_ns)]:
+                stop = self.stop or (plan.stop_tick is not None and one >= plan.stop_tick)
+                yield from self.loop.tick(one, its_ns, self.missed, stop=stop)
+                self.missed = 0
+            self._late.clear()
+        if self._doors is not None and at_ns % SECOND_NS == 0:
+            self._doors.tell(self.loop, at_ns)
+        self._reboot(tick + 1)
+
+    def _stranger(self, at_ns: int) -> None:
+        """Bytes of nobody, or somebody's again, perhaps with a byte changed."""
+        data = bytearray(self._rng.bytes(int(self._rng.integers(1, 60))))
+        if self._heard and self._rng.uniform() < 0.7:
+            data = bytearray(self._heard[int(self._rng.integers(len(self._heard)))])
+            if data and self._rng.uniform() < 0.5:
+                data[int(self._rng.integers(len(data)))] ^= 1 << int(self._rng.integers(8))
+        link = self._links[int(self._rng.integers(len(self._links)))]
+        if self._doors is None:
+            self.loop.receive(link, bytes(data), at_ns)
+        else:
+            data = bytearray(self._doors.gates[link].admit(bytes(data), at_ns))
+            if data:
+                self.loop.receive(link, bytes(data), at_ns)
+
+    def _reboot(self, next_tick: int) -> None:
+        """The vehicle starts anew with the next tick, its cameras and its link with it."""
+        plan, world = self.plan, self.world
+        per_step = round(plan.config.plant.dt_s / plan.config.daemon.tick_s)
+        if world is None or plan.reboot_step is None or next_tick != plan.reboot_step * per_step:
+            return
+        at_ns = plan.start_ns + next_tick * round(plan.config.daemon.tick_s * 1e9)
+        world.peers = Peers(_in(plan), at_ns, airborne=False, shared_link=len(self._links) == 1)
+
+
+def _in(plan: Drawn) -> Config:
+    return replace(plan.config, link=plan.link)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A flight and its replay.
+
+    Attributes:
+        seed: Of the flight.
+        path: Its recording.
+        words: What it had; see `Drawn.words`.
+        result: What the replay found.
+        seen: Modes, solves and events that the flight had, each with a count.
+        files: Files of the recording.
+        flight_s: Virtual time flown [s].
+        apart: What `uavctl log replay` in a process of its own says otherwise; empty if nothing, or not asked.
+    """
+
+    seed: int
+    path: Path
+    words: tuple[str, ...]
+    result: ReplayResult
+    seen: Counter[str]
+    files: int
+    flight_s: float
+    apart: str = ""
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing differs."""
+        return self.result.identical and not self.apart
+
+
+class _Seen:
+    """A sink that counts what went through it."""
+
+    def __init__(self, inner: Sink) -> None:
+        self.inner, self.count = inner, Counter[str]()
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Count it and hand it on."""
+        kind = type(record).__name__
+        detail = getattr(record, "mode", "") if kind == "Decision" else getattr(record, "code", "")
+        detail = detail or (getattr(record, "status", "") if kind == "Plan" else "")
+        self.count[f"{kind} {detail}".rstrip()] += 1
+        self.inner.put(topic, at_ns, record)
+
+
+def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
+    """Fly a seed's flight into the new recording `path`."""
+    plan = drawn(seed)
+    config, prepared = plan.config, prepared_of(plan.config)
+    recorder = SyncRecorder(path, config.log, onlookers=Onlookers(Views()) if plan.viewers else None)
+    sink = _Seen(recorder)
+    try:
+        put_header(recorder, prepared, started_ns=plan.start_ns)
+        rig = Rig(plan, prepared, sink)
+        rig.world = World(
+            _in(plan),
+            rig,
+            on_truth=lambda truth: sink.put("/sim/truth", truth.at_ns, truth),
+            start_ns=plan.start_ns,
+            airborne=plan.take_off_m is None,
+        )
+        rig.world.run(config.duration_s)
+        if plan.take_off_m is not None:
+            rig.stop = True
+            rig.world.run(config.duration_s + 20.0, lambda: rig.loop.finished)
+    finally:
+        status = recorder.close()
+    assert status.ok, status
+    return plan, sink.count
+
+
+def replayed(seed: int, folder: Path) -> Replayed:
+    """Fly a seed's flight into a recording, and replay it from the recording alone."""
+    path = folder / f"{seed}" / "flight.mcap"
+    plan, seen = record(seed, path)
+    found = info(path)
+    return Replayed(seed, path, plan.words, replay_flight(path).result, seen, len(found.files), found.duration_s)
+
+
+def replayed_apart(path: Path) -> str:
+    """What a replay in a process of its own finds; empty if all is identical."""
+    command = [sys.executable, "-m", "uavctl", "log", "replay", str(path), "--json"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    return "" if ended.returncode == 0 else ended.stdout or ended.stderr
+
+
+def tally(found: Iterable[Replayed]) -> dict[str, object]:
+    """Figures of many flights."""
+    flights = sorted(found, key=lambda one: one.seed)
+    words, seen = Counter[str](), Counter[str]()
+    for one in flights:
+        words.update(one.words)
+        seen.update(one.seen)
+    return {
+        "replayed": len(flights),
+        "identical": sum(one.good for one in flights),
+        "decisions": sum(one.result.decisions for one in flights),
+        "records": sum(one.result.compared for one in flights),
+        "in_several_files": sum(one.files > 1 for one in flights),
+        "virtual_s": round(sum(one.flight_s for one in flights), 1),
+        "had": dict(sorted(words.items())),
+        "seen": dict(sorted(seen.items())),
+        "wrong": {
+            str(one.seed): one.apart or msgspec.to_builtins(one.result.first_difference)
+            for one in flights
+            if not one.good
+        },
+    }

@@ -1,0 +1,143 @@
+"""A flight of preset `room` in virtual time with a watch over every tick, for `tools/soak.py` and its tests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from logs.recorder import SyncRecorder
+from sim.world import World
+from uavctl.build import build_design
+from uavctl.cli.flying import put_header, stop_limit_s
+from uavctl.cli.prepare import Prepared, prepare
+from uavctl.config import Config, load_config
+from uavctl.data import Command, ControlMode, Decision, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
+from uavctl.loop import ControlLoop
+
+MOST_FINDINGS = 20  # of one flight: the first ones tell
+
+
+def prepared_for(*overrides: str) -> Prepared:
+    """Design, library and controller of preset `room`."""
+    config = load_config("room", overrides)
+    return prepare(config, build_design(config))
+
+
+@dataclass
+class Watch:
+    """The loop as the world sees it; holds on to what a tick decided, and what was wrong with it.
+
+    Attributes:
+        loop: The loop.
+        plan: The newest plan.
+        prepared: What it flies with.
+        sink: Where its records go.
+        after_tick: Called with the grid time after each tick.
+        take_off_m: Height of the climb that is ordered in the first tick; None for none.
+        stop: Whether the operator asks for the hand-over.
+        wrong: What no tick may do and one did.
+        ticks: Ticks so far.
+        modes: Ticks in each mode.
+    """
+
+    prepared: Prepared
+    sink: Sink
+    after_tick: Callable[[int], None]
+    take_off_m: float | None = None
+    stop: bool = False
+    wrong: list[str] = field(default_factory=list)
+    ticks: int = 0
+    modes: dict[str, int] = field(default_factory=dict)
+    plan: Plan | None = None
+    _setpoint: Setpoint | None = None
+    _before: Vec3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.loop = ControlLoop(self.prepared.config, self.prepared.controller, self, lambda: 0)
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Take a record, as a sink."""
+        if isinstance(record, Setpoint):
+            self._setpoint = record
+        elif isinstance(record, Plan):
+            self.plan = record
+        self.sink.put(topic, at_ns, record)
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        """Take a datagram."""
+        return self.loop.receive(link, data, at_ns)
+
+    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+        """Run a tick and look at it."""
+        if tick == 0 and self.take_off_m is not None:
+            self.loop.order(Command(order=Order.TAKE_OFF, height_m=self.take_off_m))
+        self._setpoint = None
+        yield from self.loop.tick(tick, at_ns, stop=self.stop)
+        self.ticks += 1
+        decision = self.loop.decision
+        if decision is not None:
+            self.modes[decision.mode.value] = self.modes.get(decision.mode.value, 0) + 1
+            self._judge(decision)
+        self.after_tick(at_ns)
+
+    def _judge(self, decision: Decision) -> None:
+        if len(self.wrong) >= MOST_FINDINGS:
+            return
+        horizon, limits = self.prepared.controller.horizon, self.prepared.controller.limits
+        when = f"at {decision.at_ns * 1e-9:.2f} s"
+        age = decision.age_steps
+        if decision.boundary and age is not None and age >= horizon and decision.mode is ControlMode.TRACK:
+            self.wrong.append(f"{when}: a plan is flown at age {age}")
+        now = (0.0, 0.0, 0.0) if self._setpoint is None else self._setpoint.accel_mps2
+        most = limits.slew_mps3 * self.prepared.controller.tick_ns * 1e-9
+        for axis, (before, after, bound) in enumerate(zip(self._before, now, limits.accel_mps2, strict=True)):
+            if not math.isfinite(after) or abs(after) > bound:
+                self.wrong.append(f"{when}: setpoint {after} m/s² of axis {axis} is beyond {bound}")
+            elif self._setpoint is not None and abs(after - before) > most + 1e-9:
+                self.wrong.append(f"{when}: setpoint of axis {axis} leaps from {before} to {after} m/s²")
+        self._before = now
+
+
+class Nowhere:
+    """A sink that keeps nothing."""
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Forget it."""
+
+
+def fly(
+    prepared: Prepared,
+    config: Config,
+    after_tick: Callable[[World, Watch, int], None] = lambda *_: None,
+    *,
+    take_off_m: float | None = None,
+    path: Path | None = None,
+) -> Watch:
+    """Fly in virtual time until it is over, on the ground where it took off.
+
+    Args:
+        prepared: What flies.
+        config: What it flies in: that of `prepared`, with another simulator or link.
+        after_tick: Called after each tick.
+        take_off_m: Begin on the ground and climb so far; None: begin in the air.
+        path: Recording; None for none.
+    """
+    recorder = None if path is None else SyncRecorder(path, config.log)
+    if recorder is not None:
+        put_header(recorder, prepared, started_ns=0)
+    sink: Sink = recorder or Nowhere()
+    watch = Watch(prepared, sink, lambda at_ns: after_tick(world, watch, at_ns), take_off_m)
+    world = World(
+        config, watch, on_truth=lambda truth: sink.put("/sim/truth", truth.at_ns, truth), airborne=take_off_m is None
+    )
+    try:
+        world.run(config.duration_s, lambda: watch.loop.finished)
+        if take_off_m is not None:
+            watch.stop = True
+            world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: watch.loop.finished)
+    finally:
+        if recorder is not None:
+            recorder.close()
+    return watch

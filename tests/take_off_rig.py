@@ -1,0 +1,90 @@
+"""Whole flights in virtual time, from the ground to the ground, against the simulated vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from loopback_rig import Memory, header, make_loop
+from sim_rig import decode
+
+from sim.peers import Peers
+from sim.personality import PERSONALITIES
+from uavctl.build import build_design
+from uavctl.config import load_config
+from uavctl.data import Command, Datagram, Event, Order, Setpoint
+from uavctl.mavlink.mode import State
+
+TICK_NS, SECOND = 50_000_000, 1_000_000_000
+GOAL = (1.5, 1.0, -1.2)
+ON_THE_FLOOR = ["sim.start_position_m=[0.0,0.0,-0.7]", f"mission.waypoints=[{list(GOAL)}]", "mission.accept_m=0.3"]
+
+
+class Flight:
+    """The loop and the peers; between them the test may change, drop or add what is said."""
+
+    def __init__(self, autopilot: str, *overrides: str) -> None:
+        self.config = load_config("room", [*ON_THE_FLOOR, f"sim.autopilot={autopilot}", *overrides])
+        self.memory = Memory()
+        design = build_design(self.config)
+        self.memory.put("/uavctl/header", 0, header(self.config, design))
+        self.loop = make_loop(self.config, self.memory, design)
+        self.peers = Peers(self.config, 0, airborne=False)
+        self.tick = 0
+        self.hears: Callable[[bytes], bool] = lambda data: True  # whether the vehicle hears a datagram of ours
+        self.told: Callable[[bytes], bool] = lambda data: True  # whether we hear one of the vehicle's
+
+    @property
+    def now_ns(self) -> int:
+        return self.tick * TICK_NS
+
+    @property
+    def state(self) -> State:
+        return self.loop.who_flies
+
+    def is_in(self, *states: State) -> bool:
+        return self.state in states
+
+    def take_off(self, height_m: float = 1.2) -> Flight:
+        self.loop.order(Command(order=Order.TAKE_OFF, height_m=height_m))
+        return self
+
+    def run(self, seconds: float, *, stop: bool = False, until: State | None = None) -> Flight:
+        for _ in range(round(seconds * SECOND) // TICK_NS):
+            if self.state is until:
+                return self
+            for arrival_ns, link, data in self.peers.advance(self.now_ns):
+                if link == "mocap" or self.told(data):
+                    self.loop.receive(link, data, arrival_ns)
+            for one in self.loop.tick(self.tick, self.now_ns, stop=stop):
+                if self.hears(one.data):
+                    self.peers.receive(one.link, one.data, self.now_ns)
+            self.tick += 1
+        assert until is None or self.state is until, (self.state, self.texts)
+        return self
+
+    def stick(self, mode: str) -> None:
+        """The pilot changes the mode."""
+        kind = PERSONALITIES[self.config.sim.autopilot]
+        self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
+
+    @property
+    def states(self) -> list[str]:
+        told = [event.text for event in self.memory.of(Event) if event.code == "hand-over"]
+        return [text.split(" -> ")[1].split(" (")[0] for text in told]
+
+    @property
+    def texts(self) -> list[str]:
+        return [event.text for event in self.memory.of(Event)]
+
+    def sent(self, kind: str) -> list[tuple[int, Any]]:
+        """(time, message) of what went to the vehicle."""
+        found = [d for d in self.memory.of(Datagram) if d.outgoing and d.link == "vehicle"]
+        return [(d.at_ns, m) for d in found for m in decode(d.data) if m.get_type() == kind]
+
+    def commands(self) -> list[int]:
+        """Numbers of the commands that were sent, but for streams."""
+        return [m.command for _, m in self.sent("COMMAND_LONG") if m.command not in (511, 512)]
+
+    def setpoints_between(self, since_ns: int, until_ns: int) -> Sequence[Setpoint]:
+        return [s for s in self.memory.of(Setpoint) if since_ns <= s.at_ns < until_ns]

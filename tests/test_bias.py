@@ -1,0 +1,208 @@
+"""An acceleration that stays and that nobody knows of: found by the filter, flown against by plans and fallback."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from flight_rig import (
+    DT_NS,
+    HORIZON,
+    MS,
+    START_NS,
+    TICKS,
+    drag_lag_generator,
+    estimator_parameters,
+    inputs_of,
+    make_controller,
+    moving,
+    run,
+    sample,
+    small_plant,
+    stub_inputs,
+    vehicle,
+)
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from uavctl.build import build_controller, build_design, build_spec
+from uavctl.config import load_config
+from uavctl.data import ControlMode, PositionSample, StepInput
+from uavctl.errors import ConfigError
+from uavctl.flight.controller import Controller
+from uavctl.flight.estimator import absorb, begin, estimate, set_input
+from uavctl.flight.kalman import make_kalman
+from uavctl.flight.step import initial_state, step
+from uavctl.smpc.bias import with_bias
+from uavctl.smpc.innovation import innovations
+
+Array = NDArray[np.float64]
+
+DRIFT, MOST = 0.03, 0.4
+
+
+def test_the_larger_plant_is_the_matrix_exponential_of_input_and_bias_together() -> None:
+    """(p, v, a, w, u, d, n): d acts beside u, and n carries it on a line through the step."""
+    small = drag_lag_generator(0.3, 0.25)
+    g = np.zeros((7, 7))
+    g[:5, :5] = small
+    g[:, 5] = g[:, 4]
+    g[5, 6] = 1.0 / 0.2
+    want = expm(0.2 * g)
+    plant = with_bias(small_plant(), DRIFT)
+    kept = [0, 1, 2, 5]
+    np.testing.assert_allclose(plant.a, want[np.ix_(kept, kept)], atol=1e-12)
+    np.testing.assert_allclose(plant.b[:, 0], want[kept, 4], atol=1e-12)
+    np.testing.assert_allclose(plant.e, want[np.ix_(kept, [3, 6])], atol=1e-12)
+    assert plant.w[1, 1] == pytest.approx(DRIFT**2 * 0.2)
+    part = expm(0.07 * g)
+    np.testing.assert_allclose(plant.transition(0.07)[0], part[np.ix_(kept, kept)], atol=1e-12)
+
+
+def pushed(bias: float, steps: int) -> Array:
+    """Positions at boundaries of the small plant at rest that nothing but a bias moves."""
+    plant, x, places = small_plant(), np.zeros(3), []
+    for _ in range(steps):
+        places.append(x[0])
+        x = plant.a @ x + plant.b[:, 0] * bias
+    return np.array(places)
+
+
+def found(bias: float, *, others_until: int = 0, order: int = 1, **changes: float) -> tuple[float, ...]:
+    """The bias that the filter has found after 60 s; others fly up to a step, and samples come in either order."""
+    kalman = make_kalman(small_plant(), estimator_parameters(bias_drift=DRIFT, bias_max=MOST, **changes), DT_NS)
+    history = begin(kalman, START_NS, START_NS)
+    places = pushed(bias, 300)
+    for k in range(0, 300, 2):
+        pair = [sample(START_NS + i * DT_NS, position_m=(float(places[i]), 0.0, 0.0)) for i in (k, k + 1)]
+        history, _, _ = absorb(kalman, history, START_NS + (k + 1) * DT_NS, pair[::order])
+        history = set_input(kalman, history, START_NS + (k + 1) * DT_NS, None if k < others_until else np.zeros(1))
+    now = estimate(kalman, history, START_NS + 299 * DT_NS)
+    assert now is not None and len(now.mean) == 3
+    return now.bias
+
+
+def test_the_filter_finds_it_and_never_counts_on_more_than_allowed() -> None:
+    assert found(0.2)[0] == pytest.approx(0.2, abs=0.005)
+    assert found(-0.2)[0] == pytest.approx(-0.2, abs=0.005)
+    assert found(0.6)[0] == MOST
+    assert found(0.2) == found(0.2, order=-1)  # the same bits in any order
+
+
+def test_what_happens_while_others_fly_is_no_bias() -> None:
+    assert abs(found(0.2, others_until=300)[0]) < 0.15  # at most what one step tells of it
+    assert found(0.2, others_until=150)[0] == pytest.approx(0.2, abs=0.01)
+
+
+def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
+    plant, parameters = small_plant(), estimator_parameters(bias_drift=DRIFT, bias_max=MOST)
+    kalman = make_kalman(plant, parameters, DT_NS)
+    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    for k in range(1, 400):
+        at_ns = START_NS + k * DT_NS
+        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns - 150 * MS, at_ns)])
+    now = estimate(kalman, history, at_ns)
+    assert now is not None
+    form = innovations(plant, parameters.position_std_m, 0.15, 0, DRIFT)
+    np.testing.assert_allclose(np.array(now.cov), form.estimate_cov, rtol=1e-6)
+    assert form.plant.e.shape == (3, 1)
+    without = innovations(plant, parameters.position_std_m, 0.15, 0)
+    assert np.linalg.eigvalsh(form.estimate_cov - without.estimate_cov)[0] > -1e-12  # to find more takes more noise
+
+
+class _Biased:
+    """The small plant under a bias, sampled at each boundary, with the controller around it."""
+
+    def __init__(self, controller: Controller, bias: Array, start: Array) -> None:
+        self.controller, self.bias, self.x = controller, bias, start
+        self.state = initial_state()
+        self.places: list[Array] = []
+        self.inputs: list[Array] = []
+
+    def fly(self, steps: int) -> None:
+        plant, ticks = self.controller.plant, self.controller.ticks_per_step
+        a, b, _ = plant.transition(self.controller.tick_ns * 1e-9)
+        for tick in range(steps * ticks):
+            at_ns = START_NS + tick * self.controller.tick_ns
+            samples: tuple[PositionSample, ...] = ()
+            if tick % ticks == 0:
+                north, east, down = self.x[list(plant.position_index)]
+                samples = (sample(at_ns, position_m=(float(north), float(east), float(down))),)
+                self.places.append(self.x[list(plant.position_index)])
+            inp = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle())
+            self.state, output = step(self.state, inp, self.controller)
+            u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
+            self.inputs.append(u)
+            self.x = a @ self.x + b @ (u + self.bias)
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None:
+    """Preset `room`, without noise; without the estimate the push shows, so the test could fail."""
+    off = ["estimator.bias_drift=0.0", "estimator.bias_max=0.0"]
+    config = load_config("room", ["solver.method=exact", *([] if estimated else off)])
+    controller = build_controller(config)
+    target = np.array(config.target.position_m)
+    world = _Biased(controller, np.array([0.2, -0.15, 0.15]), controller.plant.equilibrium(config.target.position_m))
+    world.fly(100)
+    away = np.abs(np.array(world.places[-20:]) - target).max(axis=0)
+    assert np.all(away < 0.01) if estimated else np.all(away > 0.03)
+    assert np.all(np.abs(world.inputs) <= np.array(config.sets.input_upper))
+
+
+def test_plans_leave_room_for_it_and_what_is_flown_keeps_the_input_limits() -> None:
+    config = load_config("room")
+    spec = build_spec(config)
+    low, high = spec.input_set.bounds
+    np.testing.assert_allclose(high, np.array(config.sets.input_upper) - config.estimator.bias_max)
+    np.testing.assert_allclose(low, np.array(config.sets.input_lower) + config.estimator.bias_max)
+
+
+def test_a_plan_is_shifted_by_it_and_says_so() -> None:
+    controller = make_controller(bias_drift=0.3, bias_max=MOST)
+    outputs = run(controller, inputs_of(range(8 * TICKS), moving(7)))
+    plans = [output.plan for output in outputs if output.plan is not None]
+    assert any(abs(plan.bias[0]) > 1e-3 for plan in plans)
+    for plan in plans:
+        wanted = stub_inputs(plan.seq, HORIZON, 1)
+        np.testing.assert_allclose(np.array(plan.inputs) + np.array(plan.bias), wanted, atol=1e-15)
+
+
+def test_the_fallback_brakes_and_holds_against_it() -> None:
+    controller = make_controller(bias_drift=0.3, bias_max=MOST)
+    outputs = run(controller, inputs_of(range(80), moving(3)))
+    seen = {ControlMode.BRAKE: 0, ControlMode.HOLD: 0}
+    for output in outputs:
+        mode = output.decision.mode
+        if mode not in seen or output.setpoint is None or output.estimate is None:
+            continue
+        seen[mode] += 1
+        bias, speed = output.estimate.bias[0], output.estimate.mean[1]
+        want = (-1.5 * speed if mode is ControlMode.BRAKE else 0.0) - bias
+        assert abs(bias) > 1e-3
+        if not output.setpoint.limited:
+            assert output.setpoint.accel_mps2[0] == pytest.approx(want, abs=1e-12)
+    assert min(seen.values()) > 5
+
+
+def test_without_it_nothing_is_estimated_shifted_or_left_free() -> None:
+    controller = make_controller()
+    outputs = run(controller, inputs_of(range(5 * TICKS), moving(4)))
+    assert all(output.estimate is None or output.estimate.bias == () for output in outputs)
+    assert all(output.plan is None or output.plan.bias == () for output in outputs)
+    config = load_config("paper")
+    assert (config.estimator.bias_drift, config.estimator.bias_max) == (0.0, 0.0)
+    assert build_controller(config, build_design(config)).kalman.n_bias == 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        (("estimator.bias_max=0.0",), r"estimator\.bias_max: is 0, and the other one"),
+        (("estimator.bias_drift=0.0",), r"estimator\.bias_drift: is 0, and the other one"),
+        (("estimator.bias_max=1.5",), r"leaves nothing of input 2, -1\.5 to 1\.5"),
+        (("estimator.bias_drift=-1.0",), r"bias_drift"),
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_refused(overrides: tuple[str, ...], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        load_config("room", list(overrides))

@@ -1,0 +1,350 @@
+"""Items of rates, ages, noise, place, clocks and vehicle: each is seen good, and seen to fail."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from autopilot_rig import EXTERNAL_ONLY
+from check_rig import Checked, Hand, S, look
+from hypothesis import given
+from hypothesis import strategies as st
+from mavlink_rig import MS, Peer
+from sim_rig import decode
+
+from sim.peers import Peers
+from uavctl.check.item import State, item, refusals
+from uavctl.check.parameters import wanted
+from uavctl.check.preflight import Preflight
+from uavctl.config import load_config
+from uavctl.config.preflight import CheckConfig
+from uavctl.loop import make_links
+
+BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+
+
+def state(found: Checked, name: str) -> State:
+    return found[name].state
+
+
+def test_every_item_has_a_want_and_every_one_that_is_not_good_says_what_to_do() -> None:
+    for found in (look(), look(["sim.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
+        for one in found.items.values():
+            assert one.name and one.value and one.want
+            assert bool(one.hint) == (one.state is not State.GOOD)
+            assert one.ok == (one.state is not State.BAD)
+
+
+# --- positions -------------------------------------------------------------------------------------------------------
+
+
+def test_no_positions_at_all() -> None:
+    found = look(["sim.camera.occluded=[[0.0,99.0]]"])
+    assert found.bad == ["positions"]
+    assert "none" in found["positions"].value and "is the source running" in found["positions"].hint
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_on_a_shared_link_the_vehicle_s_own_estimate_is_offered(shared: bool) -> None:
+    urls = [f'daemon.{role}="udpin://127.0.0.1:14540"' for role in ("vehicle", "mocap")]
+    config = load_config("room", urls if shared else [])
+    flight, vehicle = Preflight(config, make_links, 0), Peer(1, 1)
+    for at_ns in (MS, 2 * MS):
+        flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ns // MS), at_ns)
+    one = next(one for one in flight.items(3 * MS) if one.name == "positions")
+    assert one.state is State.BAD and ("LOCAL_POSITION_NED" in one.hint) == shared
+
+
+def test_positions_that_are_refused_are_told_by_reason() -> None:
+    found = look(["source.system_id=99"])
+    assert "system-id" in found["positions"].value
+
+
+@pytest.mark.parametrize(("rate_hz", "good"), [(20.0, True), (21.0, True), (25.0, False)])
+def test_the_rate_is_that_of_the_cameras_whatever_the_link_loses(rate_hz: float, good: bool) -> None:
+    found = look(["link.loss=0.3"], [f"source.rate_hz={rate_hz}"], seconds=10.0)
+    assert found["position rate"].value.startswith("20 Hz captured")
+    assert found["position rate"].ok == good
+
+
+def test_more_loss_than_the_design_counts_on_fails_and_chance_does_not() -> None:
+    for seed in range(8):
+        more = ["link.loss=0.3", f"sim.seed={seed}", "sim.camera.rate_hz=5.0"]
+        assert look(more, seconds=8.0)["position loss"].ok
+    assert not look(["link.loss=0.5", "sim.camera.rate_hz=5.0"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
+    # Four positions a step: the design's one of them is there far more often.
+    assert look(["link.loss=0.3"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
+    assert state(look(wrong=["link.model=gilbert-elliott"]), "position loss") is State.NOTE
+
+
+def test_an_age_beyond_the_design_is_told_and_one_beyond_a_step_fails() -> None:
+    slow = look(["link.jitter_s=0.12"], ["link.jitter_s=0.02", "link.delay_s=0.0"])
+    assert state(slow, "position age") is State.NOTE
+    late = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02"])
+    assert state(late, "position age") is State.BAD
+
+
+def test_a_gap_as_long_as_the_horizon_fails() -> None:
+    found = look(["sim.camera.occluded=[[2.0,4.6]]"])
+    assert not found["longest gap"].ok
+    stopped = look(["sim.camera.occluded=[[3.0,99.0]]"])
+    assert not stopped["longest gap"].ok  # also a gap that has not ended
+
+
+def test_noise_beyond_the_filter_s_belief_fails() -> None:
+    assert look()["position noise"].ok
+    assert not look(["sim.camera.noise_std_m=0.03"])["position noise"].ok
+
+
+@pytest.mark.fault(14)
+def test_a_frozen_pose_is_told() -> None:
+    found = look(["sim.camera.frozen=[[1.0,99.0]]"])
+    assert state(found, "position stuck") is State.UNDETERMINED and "Move the body" in found["position stuck"].hint
+
+
+@pytest.mark.fault(15)
+@pytest.mark.parametrize(
+    ("scale", "told"), [((1000.0, 1000.0, 1000.0), "millimetres"), ((1.0, 1.0, -1.0), "is up negative")]
+)
+def test_a_vehicle_outside_the_room_is_told_why(scale: tuple[float, float, float], told: str) -> None:
+    hand = Hand("estimator.max_position_m=1e5")
+    hand.place = [1.2, 0.4, -1.0]
+    hand.matrix = [[scale[0], 0, 0], [0, scale[1], 0], [0, 0, scale[2]]]
+    hand.rest(4.0)
+    place = hand.done()["position in the room"]
+    assert not place.ok and told in place.hint
+
+
+# --- clocks ----------------------------------------------------------------------------------------------------------
+
+
+def test_clocks_that_are_answered_show_round_trip_and_drift() -> None:
+    found = look(seconds=8.0)
+    assert state(found, "vehicle clock") is State.GOOD and "drift +0 ppm" in found["vehicle clock"].value
+    assert state(found, "source clock") is State.NOTE  # the simulated cameras answer nothing
+
+
+class Answering(Hand):
+    """A vehicle that answers TIMESYNC late, or by a clock that drifts."""
+
+    delay_ns, drift = 0, 0.0
+
+    def rest(self, seconds: float, *, armed: bool = False) -> None:
+        for _ in range(round(seconds * 20)):
+            super().rest(0.05, armed=armed)
+
+    def answer(self) -> None:
+        for one in self.flight.tick(0, self.at_ns):
+            for message in decode(one.data):
+                if message.get_type() == "TIMESYNC" and one.link == "vehicle":
+                    theirs = 10**12 + round(self.at_ns * (1.0 - self.drift))
+                    data = self.vehicle.send("timesync", theirs, message.ts1)
+                    self.flight.receive("vehicle", data, self.at_ns + self.delay_ns)
+
+
+@pytest.mark.fault(19)
+@pytest.mark.parametrize(
+    ("delay_ms", "drift", "told"), [(0, 0.02, "drift +20"), (25, 0.0, "rejected"), (0, 0.0, "0 rejected")]
+)
+def test_clock_trouble_is_told(delay_ms: int, drift: float, told: str) -> None:
+    hand = Answering()
+    hand.delay_ns, hand.drift = delay_ms * MS, drift
+    for _ in range(12):
+        hand.at_ns += 950 * MS
+        hand.flight.receive("vehicle", hand.vehicle.heartbeat(), hand.at_ns)
+        hand.answer()
+    clock = hand.done()["vehicle clock"]
+    assert told in clock.value
+    assert clock.state is (State.GOOD if told == "0 rejected" else State.NOTE)
+
+
+def test_the_relay_cannot_do_without_the_vehicle_s_clock() -> None:
+    hand = Hand("relay.enabled=true")
+    hand.rest(4.0)
+    assert not hand.done()["vehicle clock"].ok
+
+
+def test_two_sources_of_one_id_are_found_by_their_stamps() -> None:
+    hand = Hand()
+    hand.rest(2.0)
+    for n in range(40):
+        hand.at_ns += 50 * MS
+        for _ in range(2):
+            hand.flight.receive("mocap", hand.cameras.vision(10**9 + n * 50_000, 0.3, 0.2, 0.0), hand.at_ns)
+    assert not hand.done()["source clock"].ok
+
+
+# --- vehicle ---------------------------------------------------------------------------------------------------------
+
+
+def test_no_vehicle() -> None:
+    config = load_config("room")
+    flight = Preflight(config, make_links, 0)
+    found = Checked(flight, S)
+    assert {"vehicle", "positions"} <= set(found.bad)
+
+
+def test_an_autopilot_that_is_not_known_fails() -> None:
+    hand = Hand()
+    hand.flight.receive("vehicle", hand.vehicle.heartbeat(autopilot=8), 0)
+    assert not Checked(hand.flight, S)["vehicle"].ok
+
+
+def test_a_vehicle_that_fell_silent_fails() -> None:
+    hand = Hand()
+    hand.rest(2.0)
+    assert not Checked(hand.flight, hand.at_ns + 4 * S)["vehicle"].ok
+
+
+@pytest.mark.fault(16)
+def test_a_second_vehicle_on_the_link_fails() -> None:
+    hand = Hand()
+    hand.rest(2.0)
+    hand.flight.receive("vehicle", Peer(2, 1).heartbeat(), hand.at_ns)
+    assert not hand.done()["other vehicles"].ok
+
+
+def test_the_battery_is_judged_only_if_a_limit_is_given() -> None:
+    assert state(look(), "battery") is State.GOOD
+    assert state(look(wrong=["check.battery_v=14.0"]), "battery") is State.BAD
+
+
+def test_armed_and_in_the_air_are_told() -> None:
+    found = look(airborne=True)
+    assert (state(found, "armed"), state(found, "landed")) == (State.NOTE, State.NOTE)
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
+    config = load_config("room")
+    flight = Preflight(config, make_links, 0, take_off_m=1.0)
+    flight.receive("vehicle", Peer(1, 1).heartbeat(base_mode=129 if armed else 1), 1)
+    one = next(one for one in flight.items(1) if one.name == "armed")
+    assert one.state is (State.BAD if armed else State.GOOD)
+    assert ("without --arm" in one.hint) == armed
+
+
+@BOTH
+def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
+    """Every message to the vehicle is one of these, and every command asks for a message."""
+    config = load_config("room", [f"sim.autopilot={autopilot}", "relay.enabled=true"])
+    peers, flight = Peers(config, 0, airborne=False), Preflight(config, make_links, 0)
+    kinds, commands = set(), set()
+    for tick in range(300):
+        at_ns = tick * 50 * MS
+        for arrival_ns, link, data in peers.advance(at_ns):
+            flight.receive(link, data, arrival_ns)
+        for one in flight.tick(tick, at_ns):
+            peers.receive(one.link, one.data, at_ns)
+            for message in decode(one.data):
+                kinds.add(message.get_type())
+                if message.get_type() == "COMMAND_LONG":
+                    commands.add(message.command)
+    quiet = {"HEARTBEAT", "TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG", "VISION_POSITION_ESTIMATE"}
+    assert kinds <= quiet | {"SET_GPS_GLOBAL_ORIGIN"}
+    assert commands <= {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, MAV_CMD_REQUEST_MESSAGE
+    assert not peers.autopilot.pilot.armed
+
+
+# --- a camera system without a bridge --------------------------------------------------------------------------------
+
+MOTIVE = "daemon.mocap=natnet://10.0.0.5/drone"
+
+
+def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
+    bridge = Preflight(load_config("room"), make_links, 0).items(3 * S)
+    motive = Preflight(load_config("room", [MOTIVE]), make_links, 0).items(3 * S)
+    hints = [next(one.hint for one in items if one.name == "positions") for items in (bridge, motive)]
+    assert "VISION_POSITION_ESTIMATE" in hints[0] and "Motive" not in hints[0]
+    assert "Motive track the body" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
+
+
+def told_by_motive(*place: float) -> Preflight:
+    """Motive's metres, sent with the axes of another up."""
+    flight, peer = Preflight(load_config("room", [MOTIVE]), make_links, 0), Peer(246, 197)
+    level = (
+        20,
+        12,
+        *place,
+        [1.0, 0.0, 0.0, 0.0],
+        *(math.nan,) * 3,
+        *(0.0,) * 3,
+        [math.nan] * 21,
+        [math.nan] * 21,
+        0,
+        5,
+    )
+    for n in range(60):
+        flight.receive("mocap", peer.send("odometry", 10**9 + 50_000 * n, *level), n * 50 * MS)
+        list(flight.tick(n, n * 50 * MS))
+    return flight
+
+
+def test_a_body_of_motive_s_out_of_the_room_is_a_matter_of_its_up_axis_not_of_units() -> None:
+    place = {one.name: one for one in told_by_motive(0.1, 0.2, 1.2).items(3 * S)}["position in the room"]
+    assert place.state is State.BAD and "?up=z" in place.hint and "frame.convention" not in place.hint
+    place = {one.name: one for one in told_by_motive(50.0, 20.0, -90.0).items(3 * S)}["position in the room"]
+    assert place.state is State.BAD and "metres" not in place.hint
+
+
+# --- what forbids arming ---------------------------------------------------------------------------------------------
+
+
+def test_only_bad_items_forbid_arming_and_accepted_ones_do_not() -> None:
+    items = [item(f"one {each}", each, "x", "y", "z") for each in State]
+    assert [one.name for one in refusals(items, CheckConfig())] == ["one bad"]
+    assert refusals(items, CheckConfig(accept=("one bad",))) == ()
+
+
+def test_the_heading_of_a_turned_body_is_a_mean_of_directions() -> None:
+    """Angles near 180 degrees must not average to 0."""
+    hand = Hand(heading_rad=math.pi)
+    hand.rest(3.0)
+    assert state(hand.done(), "heading") is State.UNDETERMINED  # the hand's cameras tell no attitude
+    found = look(["frame.yaw_deg=10.0"], ["frame.yaw_deg=-170.0"])
+    assert state(found, "heading") is State.BAD and "180" in found["heading"].value
+
+
+@BOTH
+def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilot: str) -> None:
+    def prepare(peers: Peers) -> None:
+        for name, value in EXTERNAL_ONLY[autopilot].items():
+            assert peers.autopilot.parameters.set(name, value), name
+
+    more = ["relay.enabled=true", "frame.yaw_deg=20", "sim.camera.rate_hz=30.0", "sim.plant=quadrotor"]
+    found = look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
+    assert not found.bad
+    assert state(found, "relay") is State.GOOD and state(found, "own position") is State.GOOD
+    # What the vehicle believes because we told it shows nothing of our axes.
+    assert state(found, "axes") is State.UNDETERMINED and "ENU" in found["axes"].value
+
+
+@pytest.mark.fault(12)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-45])
+@pytest.mark.parametrize("autopilot", [3, 12])
+def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) -> None:
+    hand = Hand(own=True)
+    hand.rest(2.0)
+    hand.tell(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
+    for name in wanted(autopilot):
+        for kind in (2, 6, 9):
+            hand.tell(hand.vehicle.send("param_value", name.encode(), value, kind, 9, 3))
+    for n in range(20):
+        hand.at_ns += 50 * MS
+        boot_ms = hand.at_ns // MS + 20_000
+        hand.tell(hand.vehicle.local_position(boot_ms, value, value, value))
+        hand.tell(hand.vehicle.send("attitude", boot_ms, value, value, value, 0.0, 0.0, 0.0))
+        where = (value if math.isfinite(value) else 0.0, 0.0, 0.0)
+        attitude = [value, 0.0, 0.0, 1.0]
+        data = hand.cameras.send("att_pos_mocap", 10**10 + n * 50_000, attitude, *where, [math.nan] * 21)
+        hand.flight.receive("mocap", data, hand.at_ns)
+    assert hand.done().items
+
+
+@given(st.lists(st.binary(max_size=64), max_size=30))
+def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
+    flight = Preflight(load_config("room"), make_links, 0)
+    for n, data in enumerate(chunks):
+        flight.receive("vehicle" if n % 2 else "mocap", data, n * MS)
+        list(flight.tick(n, n * MS))
+    assert flight.items(S)

@@ -1,0 +1,317 @@
+"""The control socket: who may ask, what is answered when, and that nobody can make the loop wait."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from uavctl.clock import Due
+from uavctl.config import load_config
+from uavctl.control_messages import MAX_LINE, Request, control_folder, daemon_name, socket_path
+from uavctl.control_socket import MAX_CLIENTS, ControlServer, listening
+from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity
+from uavctl.errors import UsageError, VehicleTakenError
+from uavctl.health import Health, RecorderHealth
+
+SECOND = 1_000_000_000
+CONFIG = load_config("room")
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as path:  # short: a socket's path has 107 bytes
+        yield Path(path)
+
+
+def health() -> Health:
+    return Health(
+        name="one", url="udpin://x:1", pid=7, running_s=1.0, mode=None, reason="", age_s=None, age_steps=None,
+        position_m=None, velocity_mps=None, target_m=None, waypoint=None, loss=None, lateness_us=0.0, missed_ticks=0,
+        vehicle=None, recorder=RecorderHealth(ok=True, dropped=0, reason="", path="f.mcap"),
+    )  # fmt: skip
+
+
+class Flight:
+    """Takes orders and decides on them in the next tick: north of 1 m is refused."""
+
+    def __init__(self, room: int = 16) -> None:
+        self.answers: tuple[tuple[Command, Event], ...] = ()
+        self.orders: list[Command] = []
+        self.taken: list[Command] = []
+        self._room = room
+
+    def order(self, command: Command) -> bool:
+        if len(self.orders) >= self._room:
+            return False
+        self.orders.append(command)
+        return True
+
+    def tick(self, at_ns: int) -> None:
+        self.answers = tuple((one, self._decide(one, at_ns)) for one in reversed(self.orders))  # in any order
+        self.taken += self.orders
+        self.orders.clear()
+
+    def _decide(self, command: Command, at_ns: int) -> Event:
+        good = command.position_m is None or command.position_m[0] <= 1.0
+        code, severity = (ORDER_ACCEPTED, Severity.INFO) if good else (ORDER_REFUSED, Severity.WARNING)
+        return Event(at_ns=at_ns, severity=severity, code=code, text=f"{command.order} {'yes' if good else 'no'}")
+
+
+class Rig:
+    def __init__(self, folder: Path, listener: socket.socket, room: int = 16) -> None:
+        self.path = folder / "one.sock"
+        self.flight = Flight(room)
+        self.server = ControlServer(listener, CONFIG, self.flight, health)
+        self.now_ns = 0
+        self._clients: list[socket.socket] = []
+
+    def close(self) -> None:
+        self.server.close()
+        for client in self._clients:
+            client.close()
+
+    def ticks(self, count: int = 1, step_ns: int = 50_000_000) -> None:
+        for _ in range(count):
+            self.now_ns += step_ns
+            self.flight.tick(self.now_ns)
+            self.server.after_tick(Due(0, self.now_ns, 0), 0)
+
+    def client(self) -> socket.socket:
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        client.settimeout(5.0)
+        client.connect(str(self.path))
+        self._clients.append(client)
+        return client
+
+    def say(self, *lines: bytes) -> list[socket.socket]:
+        clients = []
+        for line in lines:
+            client = self.client()
+            client.sendall(line)
+            clients.append(client)
+        return clients
+
+
+@pytest.fixture
+def rig(folder: Path) -> Iterator[Rig]:
+    with listening(folder, "one") as listener:
+        rig = Rig(folder, listener)
+        yield rig
+        rig.close()
+
+
+def heard(client: socket.socket) -> Any:
+    """The reply that is there now; None if there is none, "" after a hang-up."""
+    client.setblocking(False)
+    try:
+        data = client.recv(65_536)
+    except BlockingIOError:
+        return None
+    except ConnectionResetError:
+        return ""
+    return json.loads(data) if data else ""
+
+
+def ask(**fields: object) -> bytes:
+    return json.dumps(fields).encode() + b"\n"
+
+
+def test_an_order_is_answered_with_what_the_next_tick_decided(rig: Rig) -> None:
+    good, bad = rig.say(ask(ask="goto", position_m=[1, 0.5, -1]), ask(ask="goto", position_m=[2, 0.5, -1]))
+    rig.ticks()
+    assert heard(good) is None and heard(bad) is None  # queued is no answer
+    rig.ticks()
+    assert heard(good) == {"ok": True, "text": "goto yes", "status": None}
+    assert heard(bad) == {"ok": False, "text": "goto no", "status": None}
+    assert rig.flight.taken[0] == Command(order=Order.GOTO, position_m=(1.0, 0.5, -1.0))
+
+
+@pytest.mark.parametrize("order", [Order.HOLD, Order.RESUME, Order.LAND, Order.ENGAGE])
+def test_every_order_reaches_the_flight(rig: Rig, order: Order) -> None:
+    (client,) = rig.say(ask(ask=order))
+    rig.ticks(2)
+    assert rig.flight.taken == [Command(order=order)] and heard(client)["ok"]
+
+
+def test_status_is_answered_at_once(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="status"))
+    rig.ticks()
+    assert msgspec.convert(heard(client)["status"], Health) == health()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (b"{}\n", "ask"),
+        (b"nonsense\n", "not understood"),
+        (b"\xff\xfe\n", "not understood"),
+        (ask(ask="fly"), "not understood"),
+        (ask(ask="hold", now=True), "now"),
+        (ask(ask="goto"), "needs a position"),
+        (ask(ask="hold", position_m=[0, 0, -1]), "takes no position"),
+        (ask(ask="goto", position_m=[0, 0]), "not understood"),
+        (b'{"ask": "goto", "position_m": [NaN, 0, -1]}\n', "not understood"),
+        (b'{"ask": "goto", "position_m": [1e999, 0, -1]}\n', "not understood"),
+        (ask(ask="goto", position_m=[3.5, 0, 0.5]), "north 3.5 m is outside the admissible box [-3, 3]; down 0.5 m"),
+    ],
+)
+def test_bad_requests_are_told_and_never_reach_the_flight(rig: Rig, line: bytes, words: str) -> None:
+    (client,) = rig.say(line)
+    rig.ticks()
+    reply = heard(client)
+    assert not reply["ok"] and words in reply["text"]
+    client.sendall(ask(ask="status"))  # it may ask again
+    rig.ticks()
+    assert heard(client)["ok"] and not rig.flight.taken
+
+
+def test_requests_in_pieces_and_several_at_once_are_taken_one_a_tick(rig: Rig) -> None:
+    (client,) = rig.say(b'{"ask": "ho')
+    rig.ticks(3)
+    client.sendall(b'ld"}\n' + ask(ask="status"))
+    rig.ticks()
+    assert heard(client) is None  # the second one waits until the first one is answered
+    rig.ticks()
+    client.setblocking(False)
+    first, second = client.recv(65_536).splitlines()
+    assert json.loads(first)["text"] == "hold yes"
+    assert json.loads(second)["status"]["name"] == "one"
+
+
+def test_endless_and_idle_clients_are_dropped(rig: Rig) -> None:
+    endless, idle = rig.say(b"x" * (MAX_LINE + 1), b"")
+    rig.ticks(2)
+    assert "bytes at most" in heard(endless)["text"]
+    assert heard(endless) == "" and heard(idle) is None
+    rig.ticks(1, 11 * SECOND)
+    assert heard(idle) == ""
+
+
+def test_more_clients_than_there_are_places_wait_their_turn(rig: Rig) -> None:
+    clients = rig.say(*[b""] * MAX_CLIENTS, ask(ask="status"))
+    rig.ticks()
+    assert heard(clients[-1]) is None
+    clients[0].close()
+    rig.ticks(2)
+    assert heard(clients[-1])["ok"]
+
+
+def test_a_client_that_reads_nothing_is_dropped_without_waiting(rig: Rig) -> None:
+    client = rig.client()
+    client.setblocking(False)
+    for _ in range(5000):
+        try:
+            client.sendall(ask(ask="status"))
+        except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+            break
+        rig.ticks(1, 1000)
+    else:
+        pytest.fail("it was served for ever")
+
+
+def test_a_client_that_goes_before_its_answer_disturbs_nobody(rig: Rig) -> None:
+    gone, stays = rig.say(ask(ask="hold"), ask(ask="land"))
+    rig.ticks()
+    gone.close()
+    rig.ticks()
+    assert heard(stays)["text"] == "land yes"
+
+
+def test_too_many_orders_for_one_tick_are_refused(folder: Path) -> None:
+    with listening(folder, "one") as listener:
+        rig = Rig(folder, listener, room=1)
+        first, second = rig.say(ask(ask="hold"), ask(ask="land"))
+        rig.ticks(2)
+        assert heard(first)["ok"] and "too many orders" in heard(second)["text"]
+        rig.close()
+
+
+def test_who_waits_at_the_end_is_told_so(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="land"))
+    rig.ticks()
+    rig.server.close()
+    assert "ended before" in heard(client)["text"]
+
+
+def test_an_order_that_the_flight_left_unanswered_is_told_as_refused(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="engage"))
+    rig.ticks()
+    rig.flight.orders.clear()
+    rig.ticks()
+    assert heard(client) == {"ok": False, "text": "the flight gave no answer to this", "status": None}
+
+
+@pytest.mark.parametrize(("uid", "served"), [("same", True), ("root", True), ("other", False)])
+def test_the_kernel_says_who_asks(rig: Rig, monkeypatch: pytest.MonkeyPatch, uid: str, served: bool) -> None:
+    own = os.geteuid()
+    (client,) = rig.say(ask(ask="status"))
+    if uid == "root":
+        # the daemon's user is another one, the client is root: only where the tests run as root
+        monkeypatch.setattr(os, "geteuid", lambda: own if own else 12345)
+    elif uid == "other":
+        monkeypatch.setattr("uavctl.control_socket._CREDENTIALS", Stranger())
+    rig.ticks()
+    assert bool(heard(client)) is served
+
+
+class Stranger:
+    """Credentials of another user's process."""
+
+    size = 12
+
+    def unpack(self, data: bytes) -> tuple[int, int, int]:
+        return 1, os.geteuid() + 4711, 1
+
+
+def test_folder_and_socket_are_for_one_user(folder: Path) -> None:
+    inner = folder / "uavctl"
+    with listening(inner, "one"):
+        assert stat.S_IMODE(inner.stat().st_mode) == 0o700
+        assert stat.S_IMODE((inner / "one.sock").stat().st_mode) == 0o600
+    assert not (inner / "one.sock").exists()
+    inner.chmod(0o750)
+    with pytest.raises(UsageError, match="chmod 700"), listening(inner, "one"):
+        pytest.fail("others may enter")
+
+
+def test_a_dead_daemon_s_socket_is_taken_over_and_a_live_one_s_is_not(folder: Path) -> None:
+    dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    dead.bind(str(folder / "one.sock"))
+    dead.listen()
+    dead.close()  # the file stays, as after SIGKILL
+    with listening(folder, "one"):
+        with pytest.raises(VehicleTakenError, match="a daemon named one is running"), listening(folder, "one"):
+            pytest.fail("two of one name")
+        with listening(folder, "two"):
+            pass
+
+
+def test_what_is_no_socket_stays(folder: Path) -> None:
+    (folder / "one.sock").write_text("notes")
+    with pytest.raises(UsageError, match="another folder"), listening(folder, "one"):
+        pytest.fail("bound over a file")
+    assert (folder / "one.sock").read_text() == "notes"
+    with pytest.raises(UsageError, match="shorter folder"):
+        socket_path(folder / ("x" * 120), "one")
+    with pytest.raises(UsageError, match="choose another"), listening(folder / "one.sock" / "below", "one"):
+        pytest.fail("a folder below a file")
+
+
+def test_names_and_folders() -> None:
+    assert daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
+    odd = load_config("room", ['name="a/../b c"', 'daemon.vehicle="serial:///dev/ttyACM0:57600"'])
+    assert daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
+    assert control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
+    assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
+    assert control_folder(None, {"XDG_RUNTIME_DIR": "/z"}) == Path("/z/uavctl")
+    assert control_folder(None, {}) == Path(tempfile.gettempdir()) / f"uavctl-{os.getuid()}"
+    assert Request(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"

@@ -1,0 +1,88 @@
+"""`--arm`, `--takeoff`, `--goto` as people type them: what is refused before anything is sent, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from logs.reader import records
+from uavctl.cli.app import run
+from uavctl.data import Event
+
+pytestmark = pytest.mark.usefixtures("no_page")
+FLOOR = ["--set", "sim.start_position_m=[0.0,0.0,-0.7]"]
+
+
+def typed(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    code = run(list(words))
+    out, err = capsys.readouterr()
+    return code, out, " ".join(err.split())
+
+
+@pytest.mark.fault(33)
+@pytest.mark.parametrize("command", ["fly", "loopback"])
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--arm"], "--arm needs --takeoff"),
+        (["--takeoff", "1.2"], "--takeoff needs --arm"),
+        (["--arm", "--takeoff", "-1"], "takeoff"),
+        (["--goto", "1,2"], "--goto 1,2: give north, east and down"),
+        (["--goto", "1,2,up"], "give north, east and down"),
+        (["--goto", "1,2,nan"], "give north, east and down"),
+        (["--goto", "9,0,-1"], "north 9 m is outside"),
+        (["--goto", "0,0,-2.49"], "--goto: down -2.49 m is outside"),  # in the room, but there its set does not fit
+        (["--arm", "--takeoff", "2.45"], "may not rest"),
+        (["--config", "paper", "--arm", "--takeoff", "1"], "no vertical axis"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    command: str,
+    words: list[str],
+    told: str,
+) -> None:
+    monkeypatch.delattr("uavctl.cli.prepare.library_for")
+    code, out, err = typed(capsys, command, *words, "--out", str(tmp_path / "flight"))
+    assert code == 2 and told in err and not out
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["--arm", "--takeoff", "1.2", "--goto", "1.5,1,-1.2", "--duration", "12", "--json", "--out", str(tmp_path)]
+    code, out, err = typed(capsys, "loopback", *words, *FLOOR)
+    assert code == 0, err
+    assert json.loads(out)["steps"] > 30
+    told = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    assert told[-1].startswith("settling -> done")
+    code, out, _ = typed(capsys, "log", "replay", str(tmp_path / "flight.mcap"), "--json")
+    assert code == 0 and json.loads(out)["identical"]
+
+
+def test_a_place_that_is_not_reached_is_told_in_the_exit_code(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, _, err = typed(capsys, "loopback", "--goto=-1,-1,-1", "--duration", "1", "--out", str(tmp_path))
+    assert code == 1 and "--goto -1,-1,-1 was not reached" in err
+
+
+@pytest.mark.fault(26)
+def test_a_refused_take_off_is_told_with_the_vehicle_s_reason(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    poor = ["--set", "sim.plant=quadrotor", "--set", "sim.quadrotor.charge=0.1", "--set", "hand_over.ground_s=4"]
+    words = ["--arm", "--takeoff", "1.2", "--duration", "20", "--out", str(tmp_path), *poor, *FLOOR]
+    code, _, err = typed(capsys, "loopback", *words)
+    assert code == 1 and "low battery" in err and "TEMPORARILY_REJECTED" in err
+
+
+def test_the_same_way_over_real_sockets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
+    code, _, err = typed(capsys, "loopback", *words, *FLOOR)
+    assert code == 0, err
+    told = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    assert told[-1].startswith("settling -> done")

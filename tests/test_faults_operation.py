@@ -1,0 +1,103 @@
+"""Rows of the table of faults that need the vehicle's own reaction: what it does without us, and what we do then."""
+
+from __future__ import annotations
+
+import pytest
+from loopback_rig import Memory, make_loop
+from sim_rig import decode
+
+from sim.peers import Peers
+from uavctl.config import load_config
+from uavctl.data import ControlMode, Datagram, Event, Setpoint, Truth
+
+TICK_NS = 50_000_000
+SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
+
+
+class Flight:
+    """A flight in virtual time, either direction of which can be cut."""
+
+    def __init__(self, *overrides: str) -> None:
+        config = load_config("room", ['solver.method="exact"', "link.loss=0.0", *overrides])
+        self.memory = Memory()
+        self.loop = make_loop(config, self.memory)
+        self.truths: list[Truth] = []
+        self.peers = Peers(config, 0, on_truth=self.truths.append)
+        self.modes: list[ControlMode] = []
+        self._tick = 0
+
+    def run(self, seconds: float, *, uplink: bool = True, heartbeats: bool = True) -> list[str]:
+        """Names of the messages sent to the vehicle, which get there only with `uplink`."""
+        sent: list[str] = []
+        for _ in range(round(seconds * 1e9) // TICK_NS):
+            at_ns = self._tick * TICK_NS
+            for arrival_ns, link, data in self.peers.advance(at_ns):
+                if heartbeats or link != "vehicle":
+                    self.loop.receive(link, data, arrival_ns)
+            for one in self.loop.tick(self._tick, at_ns):
+                if one.link == "vehicle":
+                    sent += [message.get_type() for message in decode(one.data)]
+                if uplink or one.link != "vehicle":
+                    self.peers.receive(one.link, one.data, at_ns)
+            assert self.loop.decision is not None
+            self.modes.append(self.loop.decision.mode)
+            self._tick += 1
+        return sent
+
+    def outgoing(self) -> list[Datagram]:
+        return [one for one in self.memory.of(Datagram) if one.outgoing]
+
+    @property
+    def speed_mps(self) -> float:
+        return float(max(map(abs, self.truths[-1].velocity_mps)))
+
+
+@pytest.mark.fault(8)
+def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> None:
+    flight = Flight()
+    assert flight.run(3.0).count(SETPOINT) > 50
+    assert flight.truths[-1].mode == "OFFBOARD"
+    flight.run(3.0, uplink=False)  # COM_OF_LOSS_T is 1 s, a heartbeat comes each second
+    assert flight.truths[-1].mode != "OFFBOARD"
+    assert flight.loop.vehicle is not None and not flight.loop.vehicle.external  # seen in its heartbeats
+    # Nothing is streamed any more, and no mode is asked for: not even once the way is free again.
+    assert set(flight.run(5.0)) <= {"HEARTBEAT", "TIMESYNC"}
+    assert flight.modes[-1] is ControlMode.WAIT
+    assert any(event.code == "hand-over" and "released" in event.text for event in flight.memory.of(Event))
+
+
+@pytest.mark.fault(8)
+def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
+    flight = Flight('sim.autopilot="ardupilot"')
+    flight.run(1.5)
+    assert flight.speed_mps > 0.3
+    flight.run(8.0, uplink=False)  # the last acceleration for GUID_TIMEOUT = 3 s, then the brakes
+    assert flight.speed_mps < 0.2 and flight.truths[-1].mode == "GUIDED"
+
+
+@pytest.mark.fault(27)
+def test_a_vehicle_that_falls_silent_is_braked_then_held_then_left_to_its_own_failsafe() -> None:
+    flight = Flight()
+    flight.run(3.0)
+    flight.run(20.0, heartbeats=False)
+    modes = list(dict.fromkeys(flight.modes))
+    assert modes[modes.index(ControlMode.TRACK) :][1:3] == [ControlMode.BRAKE, ControlMode.HOLD]
+    assert flight.speed_mps < 0.2
+    assert SETPOINT not in flight.run(5.0, heartbeats=False)
+    assert flight.truths[-1].mode not in ("OFFBOARD", "AUTO.LAND")
+    assert SETPOINT not in flight.run(5.0)  # heard again, but no longer ours
+
+
+@pytest.mark.fault(27)
+def test_setpoints_die_with_the_control_loop() -> None:
+    flight = Flight()
+    flight.run(3.0)
+    before = len(flight.memory.of(Setpoint))
+    for at_ns in range(60 * TICK_NS, 260 * TICK_NS, TICK_NS):  # the loop hangs: it hears, and does not tick
+        for arrival_ns, link, data in flight.peers.advance(at_ns):
+            flight.loop.receive(link, data, arrival_ns)
+    assert len(flight.memory.of(Setpoint)) == before
+    # Who asks for the time is answered as long as anybody listens, and that is all.
+    late = [message for one in flight.outgoing() if one.at_ns > 60 * TICK_NS for message in decode(one.data)]
+    assert {message.get_type() for message in late} == {"TIMESYNC"}
+    assert flight.truths[-1].mode != "OFFBOARD"

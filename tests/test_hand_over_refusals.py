@@ -1,0 +1,265 @@
+"""The hand-over tick by tick: refusals, the pilot on the way, stopping, a vehicle that starts anew."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hand_over_rig import (
+    ACCEPTED,
+    DENIED,
+    FAILED,
+    FLY,
+    IN_PROGRESS,
+    LAND,
+    NOTHING,
+    REJECTED,
+    SECOND,
+    TAKE_OFF,
+    Rig,
+    ack,
+)
+
+from uavctl.config.hand_over import HandOverConfig
+from uavctl.data import ORDER_REFUSED, Command, Order
+from uavctl.mavlink.messages import Text
+from uavctl.mavlink.mode import State
+from uavctl.mavlink.request import Ask
+from uavctl.mavlink.sight import GRACE_NS
+
+# Refusals
+
+
+@pytest.mark.fault(26)
+def test_a_temporary_refusal_is_asked_again_in_bounds_then_told_with_the_vehicle_s_words() -> None:
+    rig = Rig("ardupilot", HandOverConfig(ground_s=30.0, tries=4)).to(State.ARMING)
+    for _ in range(4):
+        rig.run(2.0) if len(rig.asked) > 2 else None
+        rig.answer(FAILED, Ask.ARM, text="PreArm: VisOdom: not healthy")
+        rig.run(2.0)
+    times = [at_ns for at_ns, ask in rig.asked if ask is Ask.ARM]
+    assert len(times) == 4
+    rig.run(5.0)
+    assert rig.is_in(State.FAILED)
+    assert rig.hand_over.failure.startswith(
+        'arming: the vehicle answered FAILED, "PreArm: VisOdom: not healthy" (asked 4'
+    )
+    assert rig.asked_last(Ask.DISARM)  # it may have been granted after all
+
+
+@pytest.mark.fault(26)
+@pytest.mark.parametrize(("result", "why"), [(DENIED, "DENIED"), (3, "UNSUPPORTED")], ids=["denied", "unsupported"])
+def test_a_final_refusal_is_not_asked_again(result: int, why: str) -> None:
+    rig = Rig().to(State.MODE)
+    rig.answer(result)
+    assert rig.is_in(State.FAILED) and why in rig.hand_over.failure and len(rig.asked) == 1
+
+
+@pytest.mark.fault(26)
+def test_no_answer_is_told_as_that() -> None:
+    rig = Rig(config=HandOverConfig(tries=3, answer_s=1.0)).to(State.MODE)
+    rig.run(3.2)
+    assert rig.is_in(State.FAILED) and "did not answer" in rig.hand_over.failure
+    times = [at_ns for at_ns, _ in rig.asked]
+    assert [b - a for a, b in pairwise(times)] == [SECOND, SECOND]
+
+
+def test_accepted_but_never_done_is_told_as_that() -> None:
+    rig = Rig(config=HandOverConfig(ground_s=10.0)).to(State.MODE)
+    rig.answer(ACCEPTED)
+    rig.run(2.9)
+    assert len(rig.asked) == 1  # heartbeats come once a second: no hurry
+    rig.run(8.0)
+    assert rig.is_in(State.FAILED) and "ACCEPTED, but does not do it" in rig.hand_over.failure
+
+
+def test_an_unknown_result_is_told_by_number() -> None:
+    rig = Rig(config=HandOverConfig(tries=1)).to(State.MODE)
+    rig.answer(77)
+    rig.run(3.0)
+    assert "answered 77" in rig.hand_over.failure
+
+
+def test_in_progress_is_waited_for() -> None:
+    rig = Rig().to(State.MODE)
+    for _ in range(5):
+        rig.answer(IN_PROGRESS)
+        rig.run(1.5)
+    assert len(rig.asked) == 1 and rig.is_in(State.MODE)
+
+
+def test_answers_to_others_and_chatter_change_nothing() -> None:
+    rig = Rig().to(State.MODE)
+    rig.tick(ack(DENIED, Ask.LAND), Text(system=1, component=1, severity=6, text="chatter"))
+    assert rig.is_in(State.MODE)
+    rig = Rig().to(State.READY)
+    rig.tick(ack(DENIED, Ask.ARM), commands=(TAKE_OFF,))
+    assert rig.is_in(State.MODE)
+
+
+@pytest.mark.fault(26)
+def test_a_climb_that_does_not_come_ends_in_a_landing_and_a_failure() -> None:
+    rig = Rig("ardupilot", HandOverConfig(climb_s=5.0)).to(State.CLIMBING)
+    rig.answer(ACCEPTED)
+    rig.run(5.2)
+    assert rig.is_in(State.LANDING) and rig.asked_last(Ask.LAND)
+    assert [ask for _, ask in rig.asked].count(Ask.TAKE_OFF) == 1  # asked again, it would begin again
+    rig.be(mode="LAND")
+    rig.tick()
+    rig.be(armed=False)
+    rig.tick()
+    assert rig.is_in(State.DONE) and "take-off" in rig.hand_over.failure
+
+
+def test_height_counts_by_fresh_positions_only() -> None:
+    rig = Rig("px4").to(State.CLIMBING)
+    rig.tick(up_m=3.0, unfit="the newest position is 2.0 s old")
+    assert rig.is_in(State.CLIMBING)
+    rig.tick(up_m=None, unfit="")
+    assert rig.is_in(State.CLIMBING)
+    rig.tick(up_m=3.0)
+    assert rig.is_in(State.ENGAGING)
+
+
+@pytest.mark.fault(26)
+def test_offboard_that_is_refused_in_the_climb_ends_in_a_landing() -> None:
+    rig = Rig("px4").to(State.ENGAGING)
+    for _ in range(20):
+        rig.answer(REJECTED, Ask.EXTERNAL_MODE)
+        rig.run(0.25)
+    rig.tick()
+    assert rig.is_in(State.LANDING) and "TEMPORARILY_REJECTED" in rig.hand_over.failure
+    assert 5 <= [ask for _, ask in rig.asked].count(Ask.EXTERNAL_MODE) <= 11
+
+
+@pytest.mark.fault(26)
+@pytest.mark.parametrize("state", [State.CLIMBING, State.ENGAGING])
+def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: State) -> None:
+    rig = Rig("ardupilot" if state is State.CLIMBING else "px4").to(state)
+    rig.be(armed=False)
+    rig.tick()
+    assert rig.is_in(State.FAILED) and "disarmed itself" in rig.hand_over.failure
+
+
+@pytest.mark.parametrize(
+    ("state", "mode", "armed"),
+    [
+        (State.MODE, "AUTO.LOITER", True),
+        (State.ARMING, "MANUAL", False),
+        (State.CLIMBING, "POSCTL", True),
+        (State.ENGAGING, "POSCTL", True),
+        (State.LANDING, "POSCTL", True),
+        (State.SETTLING, "POSCTL", True),
+    ],
+)
+@pytest.mark.fault(25)
+def test_the_pilot_may_take_over_at_any_time(state: State, mode: str, armed: bool) -> None:
+    rig = Rig("px4").to(state)
+    rig.be(mode=mode, armed=armed)
+    told = rig.tick()
+    assert (rig.state, told.sending, told.ask) == (State.RELEASED, NOTHING, None)
+
+
+@pytest.mark.fault(25)
+def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> None:
+    rig = Rig("px4").to(State.ENGAGING)
+    rig.answer(ACCEPTED)
+    granted_ns = rig.view.at_ns
+    while rig.view.at_ns < granted_ns + GRACE_NS:
+        assert rig.vehicle is not None and not rig.hand_over.has_left(rig.vehicle)
+        assert rig.tick().sending is FLY
+    assert rig.tick().sending is NOTHING
+    assert rig.is_in(State.RELEASED) and rig.vehicle is not None and rig.hand_over.has_left(rig.vehicle)
+
+
+# Stopping
+
+
+@pytest.mark.fault(34)
+@pytest.mark.parametrize(
+    ("state", "after", "ask"),
+    [
+        (State.MODE, State.DONE, None),
+        (State.ARMING, State.LANDING, Ask.LAND),
+        (State.CLIMBING, State.LANDING, Ask.LAND),
+        (State.ENGAGING, State.LANDING, Ask.LAND),
+        (State.RETURNING, State.RELEASED, None),
+    ],
+)
+@pytest.mark.parametrize("how", ["stop", "order"])
+def test_the_operator_stops_on_the_way(state: State, after: State, ask: Ask | None, how: str) -> None:
+    rig = Rig().to(state)
+    told = rig.tick(stop=True) if how == "stop" else rig.tick(commands=(LAND,))
+    assert (rig.state, told.ask, told.sending) == (after, ask, NOTHING)
+
+
+def test_an_arming_that_is_stopped_is_over_when_a_later_heartbeat_says_disarmed() -> None:
+    rig = Rig().to(State.ARMING)
+    rig.mute = True
+    rig.tick(stop=True)
+    rig.tick()
+    assert rig.is_in(State.LANDING)  # the heartbeat is from before
+    rig.mute = False
+    rig.tick()
+    assert rig.is_in(State.DONE)
+
+
+@pytest.mark.fault(34)
+def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
+    rig = Rig().to(State.LANDING)
+    rig.run(10.0)
+    times = [at_ns for at_ns, ask in rig.asked if ask is Ask.LAND]
+    assert [b - a for a, b in pairwise(times)] == [SECOND] * 4
+    assert rig.is_in(State.FAILED) and "landing" in rig.hand_over.failure
+
+
+# A vehicle that starts anew
+
+
+@pytest.mark.fault(20)
+@pytest.mark.parametrize(
+    ("state", "after"),
+    [
+        (State.READY, State.READY),
+        (State.MODE, State.FAILED),
+        (State.ARMING, State.FAILED),
+        (State.CLIMBING, State.FAILED),
+        (State.ENGAGING, State.FAILED),
+        (State.RETURNING, State.RELEASED),
+        (State.ENGAGED, State.RELEASED),
+    ],
+)
+def test_a_reboot_disengages(state: State, after: State) -> None:
+    rig = Rig().to(state)
+    rig.be(boots=1)
+    told = rig.tick()
+    assert (rig.state, told.sending) == (after, NOTHING)
+    if after is not state:
+        assert "started anew" in rig.codes("refused")[-1]
+    rig.tick()
+    assert rig.is_in(after)  # told once
+
+
+def test_a_reboot_before_we_listened_is_none() -> None:
+    rig = Rig()
+    rig.be(boots=3)
+    rig.tick()
+    assert rig.is_in(State.READY) and not rig.codes("refused")
+
+
+@pytest.mark.parametrize("state", [State.MODE, State.CLIMBING, State.ENGAGING, State.SETTLING])
+def test_silence_on_the_way_changes_nothing_until_time_is_up(state: State) -> None:
+    rig = Rig(config=HandOverConfig(ground_s=8.0, climb_s=8.0, engage_s=8.0, land_s=8.0)).to(state)
+    rig.mute = True
+    rig.run(5.0)
+    assert rig.is_in(state)
+    rig.run(5.0)
+    assert rig.state is not state
+
+
+@pytest.mark.parametrize("height_m", [None, 0.0, -1.0, float("nan")])
+def test_a_climb_to_nowhere_is_refused(height_m: float | None) -> None:
+    rig = Rig().to(State.READY)
+    told = rig.tick(commands=(Command(order=Order.TAKE_OFF, height_m=height_m),))
+    assert [event.code for event in told.events] == [ORDER_REFUSED] and rig.hand_over.height_m == 0.0
+    assert rig.is_in(State.READY) and not rig.hand_over.ours

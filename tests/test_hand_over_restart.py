@@ -1,0 +1,197 @@
+"""A daemon that follows one which was killed in flight: the vehicle is left alone until somebody asks for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hand_over_rig import ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, STAND_BY, TAKE_OFF, Rig
+from hand_over_rig import TICK_NS as RIG_TICK_NS
+from loopback_rig import Memory, make_loop
+
+from logs.replay import replay
+from sim.peers import Peers
+from uavctl.config import load_config
+from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Setpoint
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.mode import State
+from uavctl.mavlink.request import Ask
+from uavctl.mavlink.sight import CLOCK_NS
+
+TICK_NS = 50_000_000
+
+
+def restarted(autopilot: str = "px4", **fields: object) -> Rig:
+    """A hand-over that stands by before the vehicle is heard, which then says this of itself."""
+    rig = Rig(autopilot)
+    vehicle, rig.vehicle = rig.vehicle, None
+    told = rig.tick(commands=(STAND_BY,))
+    assert [event.code for event in told.events] == [ORDER_ACCEPTED] and rig.is_in(State.WAITING)
+    rig.vehicle = vehicle
+    rig.be(**fields)
+    return rig
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize(
+    ("autopilot", "mode"),
+    [("px4", "OFFBOARD"), ("px4", "AUTO.LOITER"), ("px4", "AUTO.LAND"), ("px4", "POSCTL"), ("ardupilot", "GUIDED")],
+)
+def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot: str, mode: str) -> None:
+    rig = restarted(autopilot, armed=True, landed=False, mode=mode)
+    seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    assert seen is not None and not seen.external  # not for the controller, either
+    for _ in range(200):
+        assert rig.tick().sending is NOTHING
+    assert rig.is_in(State.RELEASED) and not rig.asked
+    assert "uavctl ctl engage" in rig.codes("refused")[0] and len(rig.codes("refused")) == 1
+    told = rig.tick(commands=(ENGAGE,))
+    external = mode in ("OFFBOARD", "GUIDED")
+    assert told.sending is NEUTRAL and [ask for _, ask in rig.asked] == ([] if external else [Ask.EXTERNAL_MODE])
+    rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+    assert rig.tick().sending is FLY
+
+
+@pytest.mark.fault(31)
+def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other() -> None:
+    rig = restarted(armed=False)
+    assert rig.tick().sending is NEUTRAL and rig.is_in(State.READY)
+    rig.be(armed=True, landed=False, mode="OFFBOARD")  # the pilot took off, and switched
+    assert rig.tick().sending is FLY
+
+
+@pytest.mark.fault(31)
+def test_an_ordered_take_off_does_not_follow_a_flight_that_was_left() -> None:
+    rig = restarted(armed=True, landed=False, mode="OFFBOARD")
+    rig.tick(commands=(TAKE_OFF,))
+    assert rig.is_in(State.FAILED) and "armed already" in rig.hand_over.failure and not rig.asked
+    assert "without --arm" in rig.hand_over.failure and "uavctl ctl engage" in rig.hand_over.failure
+
+
+def test_once_the_vehicle_is_heard_it_is_too_late_to_stand_by() -> None:
+    rig = Rig().to(State.READY)
+    told = rig.tick(commands=(STAND_BY,))
+    assert [event.code for event in told.events] == [ORDER_REFUSED]
+    rig.be(armed=True, landed=False, mode="OFFBOARD")
+    assert rig.tick().sending is FLY
+
+
+FLOWN_NS = 100 * SECOND
+SINCE = Command(order=Order.STAND_BY, flown_ns=FLOWN_NS)
+
+
+def found_armed(up_s: float | None, at_ns: int) -> Rig:
+    """A hand-over that stands by, with a vehicle that is found armed and may tell since when it has been up."""
+    rig = Rig()
+    vehicle, rig.vehicle = rig.vehicle, None
+    rig.view = replace(rig.view, at_ns=at_ns - 2 * RIG_TICK_NS)
+    rig.tick(commands=(SINCE,))
+    rig.vehicle = vehicle
+    rig.be(armed=True, landed=False, mode="OFFBOARD")
+    rig.tick(up_s=up_s)
+    return rig
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize(
+    ("since_s", "up_s", "state"),
+    [
+        (20.0, 25.0, State.RELEASED),  # it was up before that flight began
+        (20.0, 15.0, State.ENGAGED),  # and has started since
+        (20.0, 15.3, State.RELEASED),  # or may only have a slow clock
+        (3000.0, 2600.0, State.RELEASED),
+        (20.0, 0.5, State.ENGAGED),
+    ],
+)
+def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: float, state: State) -> None:
+    rig = found_armed(up_s, FLOWN_NS + round(since_s * SECOND))
+    assert rig.is_in(state)
+
+
+@pytest.mark.fault(31)
+def test_its_clock_is_waited_for_with_nothing_sent() -> None:
+    rig = found_armed(None, FLOWN_NS + 60 * SECOND)
+    for _ in range(CLOCK_NS // RIG_TICK_NS - 1):
+        assert rig.is_in(State.WAITING) and rig.tick().sending is NOTHING
+        seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+        assert seen is not None and not seen.external
+    rig.tick()
+    assert rig.is_in(State.RELEASED) and not rig.asked
+    rig = found_armed(None, FLOWN_NS + 60 * SECOND)
+    rig.tick(up_s=10.0)
+    assert rig.is_in(State.ENGAGED)
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_the_next_vehicle_on_the_connection_of_a_killed_flight_is_flown(autopilot: str) -> None:
+    air = Air(autopilot)
+    loop, _ = air.begin()
+    air.run(loop, 2.0)
+    air.run(None, 30.0)
+    another = Air(autopilot, begins_s=32.0)
+    loop, memory = another.begin(Command(order=Order.STAND_BY, flown_ns=0))
+    another.run(loop, 5.0)
+    assert loop.who_flies is State.ENGAGED and memory.of(Setpoint)
+    result = replay(iter(memory.entries), lambda sink: make_loop(another.config, sink))
+    assert result.identical, result.first_difference
+
+
+class Air:
+    """The simulated vehicle, and one control loop after another beside it, in virtual time."""
+
+    def __init__(self, autopilot: str, begins_s: float = 0.0) -> None:
+        self.config = load_config("room", ['solver.method="exact"', "link.loss=0.0", f'sim.autopilot="{autopilot}"'])
+        self._tick = round(begins_s * 1e9) // TICK_NS
+        self.peers = Peers(self.config, self._tick * TICK_NS)
+
+    def begin(self, *orders: Command) -> tuple[ControlLoop, Memory]:
+        memory = Memory()
+        loop = make_loop(self.config, memory)
+        for order in orders:
+            loop.order(order)
+        return loop, memory
+
+    def run(self, loop: ControlLoop | None, seconds: float) -> None:
+        for _ in range(round(seconds * 1e9) // TICK_NS):
+            at_ns = self._tick * TICK_NS
+            for arrival_ns, link, data in self.peers.advance(at_ns):
+                if loop is not None:
+                    loop.receive(link, data, arrival_ns)
+            for one in () if loop is None else loop.tick(self._tick, at_ns):
+                self.peers.receive(one.link, one.data, at_ns)
+            self._tick += 1
+
+
+@pytest.mark.fault(31)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("dead_s", [0.3, 4.0], ids=["before its failsafe", "after"])
+def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(autopilot: str, dead_s: float) -> None:
+    air = Air(autopilot)
+    loop, _ = air.begin()
+    air.run(loop, 2.0)
+    assert loop.leaves_vehicle
+    air.run(None, dead_s)
+    loop, memory = air.begin(Command(order=Order.STAND_BY, flown_ns=0))
+    air.run(loop, 5.0)
+    assert not memory.of(Setpoint) and loop.who_flies is State.RELEASED
+    if autopilot == "px4":
+        assert air.peers.autopilot.mode_name != "OFFBOARD"  # its failsafe has it
+    loop.order(Command(order=Order.ENGAGE))
+    air.run(loop, 3.0)
+    assert loop.decision is not None and loop.decision.mode is ControlMode.TRACK and memory.of(Setpoint)
+    result = replay(iter(memory.entries), lambda sink: make_loop(air.config, sink))
+    assert result.identical, result.first_difference
+
+
+@pytest.mark.fault(31)
+def test_without_standing_by_px4_would_be_back_in_offboard_at_once() -> None:
+    air = Air("px4")
+    loop, _ = air.begin()
+    air.run(loop, 2.0)
+    air.run(None, 4.0)
+    assert air.peers.autopilot.mode_name != "OFFBOARD"
+    loop, _ = air.begin()
+    assert loop.leaves_vehicle is None
+    air.run(loop, 5.0)
+    assert air.peers.autopilot.mode_name == "OFFBOARD"

@@ -1,0 +1,103 @@
+"""The health of a flight: what is known, what is not, once a second."""
+
+from __future__ import annotations
+
+import msgspec
+from loopback_rig import Memory, make_loop
+
+from sim.peers import Peers
+from uavctl.clock import Due
+from uavctl.config import load_config
+from uavctl.data import ControlMode
+from uavctl.health import Health, HealthWatch, RecorderHealth, line
+
+TICK_NS = 50_000_000
+
+
+class Flight:
+    """A flight in virtual time with somebody who watches."""
+
+    def __init__(self, name: str = "room", *overrides: str) -> None:
+        config = load_config(name, ['solver.method="exact"', *overrides])  # no library has to be made
+        self.loop = make_loop(config, Memory())
+        self.peers = Peers(config, 0)
+        self.lines: list[str] = []
+        self.dropped = 0
+        self.warning = ""
+        self.watch = HealthWatch(self.loop, config, ("one", "udpin://x:1", 7), self._recorder, self.lines.append)
+        self.tick = 0
+
+    def _recorder(self) -> RecorderHealth:
+        ok = not self.dropped
+        return RecorderHealth(ok=ok, dropped=self.dropped, reason=self.warning if ok else "disk full", path="f.mcap")
+
+    def run(self, ticks: int, *, lateness_ns: int = 0, missed: int = 0) -> Health:
+        for _ in range(ticks):
+            at_ns = self.tick * TICK_NS
+            for arrival_ns, link, data in self.peers.advance(at_ns):
+                self.loop.receive(link, data, arrival_ns)
+            for one in self.loop.tick(self.tick, at_ns, missed):
+                self.peers.receive(one.link, one.data, at_ns)
+            self.watch.after_tick(Due(self.tick, at_ns, missed), lateness_ns)
+            self.tick += 1
+        return self.watch.look()
+
+
+def test_before_the_first_tick_nothing_is_known_and_nothing_fails() -> None:
+    health = Flight().watch.look()
+    assert (health.mode, health.age_s, health.position_m, health.vehicle) == (None, None, None, None)
+    assert line(health).startswith("-  age - s  loss - %")
+
+
+def test_a_flight_in_figures() -> None:
+    flight = Flight("room", "link.loss=0.0")
+    health = flight.run(200, lateness_ns=700_000)
+    assert health.mode is ControlMode.TRACK and health.running_s == 199 * TICK_NS * 1e-9
+    estimate, decision = flight.loop.estimate, flight.loop.decision
+    assert estimate is not None and decision is not None and decision.target is not None
+    # x = (position, velocity, acceleration) of north, east and down
+    assert health.position_m == dict(zip(("north", "east", "down"), estimate.mean[0::3], strict=True))
+    assert health.velocity_mps == dict(zip(("north", "east", "down"), estimate.mean[1::3], strict=True))
+    assert health.target_m == dict(zip(("north", "east", "down"), decision.target[0::3], strict=True))
+    assert health.age_s is not None and 0.0 < health.age_s < 0.5
+    assert health.loss is not None and health.loss < 0.2
+    assert health.vehicle is not None and health.vehicle.mode == "OFFBOARD" and health.vehicle.heard_s <= 1.0
+    assert health.lateness_us == 700.0 and health.missed_ticks == 0
+    assert msgspec.json.decode(msgspec.json.encode(health), type=Health) == health
+
+
+def test_a_plant_of_two_axes_leaves_the_third_out() -> None:
+    health = Flight("paper").run(60)
+    assert health.position_m is not None and set(health.position_m) == {"north", "east"}
+
+
+def test_one_line_a_second_with_the_worst_of_it() -> None:
+    flight = Flight()
+    flight.run(10)
+    flight.run(1, lateness_ns=2_500_000, missed=3)
+    flight.run(10)
+    assert len(flight.lines) == 1 and "late 2.50 ms  missed 3" in flight.lines[0]
+    flight.run(20)
+    assert len(flight.lines) == 2 and "late 0.00 ms  missed 3" in flight.lines[1]
+    flight.dropped = 12
+    flight.run(20)
+    assert flight.lines[-1].endswith("dropped 12 (disk full)")
+
+
+def test_a_disk_that_gets_low_is_told_once_in_a_line_of_its_own() -> None:
+    flight = Flight()
+    flight.run(25)
+    flight.warning = "900 bytes free"
+    flight.run(20)
+    flight.warning = "800 bytes free"
+    flight.run(20)
+    flight.dropped = 3
+    flight.run(20)
+    flight.dropped, flight.warning = 0, ""
+    flight.run(20)
+    assert [one for one in flight.lines if "recording" in one] == [
+        "warning: recording may not go on for long: 900 bytes free",
+        "warning: recording in trouble: disk full",
+        "recording is well again",
+    ]
+    assert any(one.endswith("dropped 0 (800 bytes free)") for one in flight.lines)

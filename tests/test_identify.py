@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from mavlink_rig import DATA
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from logs.tlog import read_tlog
+from uavctl.cli.app import run
+from uavctl.config import load_config
+from uavctl.errors import RecordingError
+from uavctl.identify.fit import fit_axis, scan_dead_time, standard_errors
+from uavctl.identify.history import Asked, Seen, Stretch, seen_from, stretches, thinned
+from uavctl.identify.link_fit import fit_link
+from uavctl.identify.prediction import predict
+from uavctl.identify.recorded import History, Numbers, from_tlog
+from uavctl.identify.response import disturbance, transition
+from uavctl.identify.result import identify
+from uavctl.smpc.plant import drag_lag
+
+TICK_S, NOISE_M, WIND_MPS2, DT_S = 0.05, 0.003, 0.15, 0.2
+
+
+def fly(
+    lag_s: float, drag_1ps: float, gain: float, *, seed: int, seconds: float = 60.0, dead_ticks: int = 0
+) -> Stretch:
+    """One axis of the plant (1), flown with random setpoints, wind held over a tick, 30 % of positions lost."""
+    rng = np.random.default_rng(seed)
+    plant = drag_lag([drag_1ps], [lag_s], [gain], [1.0], TICK_S, ("north",))
+    count = round(seconds / TICK_S)
+    asked = np.repeat(rng.uniform(-1.5, 1.5, count // 16 + 1), 16)[:count]
+    acting = np.concatenate([np.zeros(dead_ticks), asked])[:count]
+    wind = WIND_MPS2 * np.sqrt(DT_S / TICK_S) * rng.standard_normal(count)
+    state, times, places = np.zeros(3), [], []
+    for tick in range(count):
+        if tick % 4 == 2 and rng.random() > 0.3:
+            times.append(tick * TICK_S)
+            places.append((state[0] + NOISE_M * rng.standard_normal(), 0.0, 0.0))
+        state = plant.a @ state + plant.b[:, 0] * acting[tick] + plant.e[:, 0] * wind[tick]
+    inputs = np.column_stack([asked, np.zeros(count), np.zeros(count)])
+    return Stretch(np.linspace(0.0, (count - 1) * TICK_S, count), inputs, np.array(times), np.array(places))
+
+
+def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> None:
+    misses = []
+    for seed, (lag_s, drag_1ps, gain) in enumerate([(0.25, 0.3, 1.0), (0.4, 0.8, 1.1)]):
+        flown = (fly(lag_s, drag_1ps, gain, seed=seed),)
+        fit = fit_axis(flown, 0, 0.0)
+        errors = standard_errors(flown, 0, fit)
+        found = (fit.lag_s, fit.drag_1ps, fit.gain)
+        misses += [(a - b) / e for a, b, e in zip(found, (lag_s, drag_1ps, gain), errors, strict=True)]
+        assert max(errors) < 0.1
+        assert fit.wind_mps2_rts / np.sqrt(DT_S) == pytest.approx(WIND_MPS2, rel=0.15)
+        assert fit.noise_m == pytest.approx(NOISE_M, rel=0.5)
+    assert np.max(np.abs(misses)) < 3.5
+    assert np.std(misses) == pytest.approx(1.0, abs=0.7)
+
+
+def test_a_dead_time_is_told_from_a_lag() -> None:
+    flown = (fly(0.1, 0.1, 1.0, seed=5, dead_ticks=3, seconds=40.0),)
+    without = fit_axis(flown, 0, 0.0)
+    fits: list[int] = []
+    best = scan_dead_time(flown, 0, without, lambda: fits.append(1))
+    assert best.dead_time_s + best.lag_s == pytest.approx(0.25, abs=0.03)
+    assert best.dead_time_s == pytest.approx(0.15, abs=0.05)
+    assert best.deviance < without.deviance - 5.0
+    assert len(fits) == 10
+
+
+def test_a_right_model_leaves_white_innovations_and_a_wrong_one_does_not() -> None:
+    flown = (fly(0.25, 0.3, 1.0, seed=7),)
+    fit = fit_axis(flown, 0, 0.0)
+    right = predict(flown, 0, fit)
+    inside = np.mean(np.abs(right.innovations_m) <= 2.0 * right.stds_m)
+    assert 0.92 <= inside <= 0.98
+    assert np.count_nonzero(np.abs(right.correlation) > 1.96 / np.sqrt(len(right.innovations_m))) <= 4
+    assert right.r2 > 0.9
+    lazy = replace(fit, parameters=(np.log(1.5), *fit.parameters[1:]))
+    wrong = predict(flown, 0, lazy)
+    assert wrong.r2 < right.r2 - 0.05
+    assert wrong.residual_std_m > 1.5 * right.residual_std_m
+
+
+@pytest.mark.parametrize(("lag_s", "drag_1ps"), [(0.25, 0.3), (0.02, 0.0), (0.5, 2.0)])
+def test_transition_and_disturbance_are_those_of_the_plant(lag_s: float, drag_1ps: float) -> None:
+    parameters = np.array([[np.log(lag_s), drag_1ps, 0.9, np.log(0.7), 0.0]])
+    move, push = transition(np.array([0.0, 0.13]), parameters)
+    plant = drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13, ("north",))
+    np.testing.assert_allclose(move[1, 0, :3, :3], plant.a, atol=1e-12)
+    np.testing.assert_allclose(push[1, 0, :3], plant.b[:, 0], atol=1e-12)
+    np.testing.assert_allclose(move[1, 0, :3, 3], plant.e[:, 0], atol=1e-12)  # the bias acts as a held wind does
+    np.testing.assert_array_equal(move[0, 0], np.eye(4))
+    # White noise as the limit of noise that is held over ever shorter parts.
+    part = drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13 / 4000, ("north",))
+    cov = np.zeros((3, 3))
+    for _ in range(4000):
+        cov = part.a @ cov @ part.a.T + part.e @ part.e.T * 0.7**2 / (0.13 / 4000)
+    np.testing.assert_allclose(disturbance(np.array([0.13]), parameters)[0, 0], cov[:2, :2], rtol=1e-3)
+
+
+def test_an_outlier_does_not_spoil_the_fit() -> None:
+    clean = fly(0.25, 0.3, 1.0, seed=3, seconds=60.0)
+    bad = clean.positions_m.copy()
+    bad[::25, 0] += 2.0
+    rows = zip(clean.times_s, bad[:, 0], strict=True)
+    seen = seen_from([(float(t), float(t), (float(x), 0.0, 0.0)) for t, x in rows])
+    gone = ~np.isin(clean.times_s, seen.times_s)
+    assert gone[::25][1:].all()
+    assert np.count_nonzero(gone) <= len(bad[::25]) + 3
+    few = clean.positions_m.copy()
+    few[::25, 0] += 0.1  # too small to be told beforehand
+    fit = fit_axis((replace(clean, positions_m=few),), 0, 0.0)
+    assert fit.lag_s == pytest.approx(0.25, abs=0.1)
+
+
+def asked_for(times_s: list[float], flown: list[bool]) -> Asked:
+    accel = np.column_stack([np.sin(times_s), np.cos(times_s), np.zeros(len(times_s))])
+    return Asked(np.array(times_s), accel, np.array(flown))
+
+
+def test_a_pause_and_a_pilot_end_a_stretch() -> None:
+    ticks = [0.05 * i for i in range(600)]
+    times = [t for t in ticks if not 10.0 < t < 11.0]
+    seen = seen_from([(0.1 * i, 0.1 * i + 0.02, (0.0, 0.0, -1.0)) for i in range(300)])
+    found = stretches(asked_for(times, [t < 20.0 for t in times]), seen)
+    assert [(round(s.times_s[0], 3), round(s.times_s[-1], 3)) for s in found] == [(0.1, 10.0), (11.1, 19.9)]
+
+
+def test_too_little_is_refused_with_what_is_missing() -> None:
+    seen = seen_from([(0.1 * i, 0.1 * i, (0.0, 0.0, 0.0)) for i in range(30)])
+    with pytest.raises(RecordingError, match=r"flown for 3\.0 s, and 30 positions .* at least 5 s"):
+        stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), seen)
+
+
+def sent(lost: NDArray[np.bool_]) -> tuple[Seen, NDArray[np.int64]]:
+    """What a receiver sees of cameras at 25 Hz whose messages are lost as told, 20 to 120 ms on their way."""
+    rng = np.random.default_rng(0)
+    at_s = [float(t) for t in np.arange(len(lost))[~lost] / 25.0]
+    came = [(t, t + 0.02 + 0.1 * rng.random(), (0.0, 0.0, 0.0)) for t in at_s]
+    return seen_from(came), np.diff(np.flatnonzero(~lost)) - 1
+
+
+def test_independent_losses_and_delays_are_measured() -> None:
+    link = fit_link(*sent(np.random.default_rng(1).random(4000) < 0.3))
+    assert link.rate_hz == pytest.approx(25.0, rel=0.01)
+    assert link.loss == pytest.approx(0.3, abs=0.02)
+    assert not link.bursts
+    assert link.delay_s == pytest.approx(0.02, abs=0.002)
+    assert link.jitter_s == pytest.approx(0.099, abs=0.004)
+
+
+def test_bursts_are_told_from_independent_losses() -> None:
+    rng = np.random.default_rng(2)
+    lost, bad = np.zeros(4000, dtype=bool), False
+    for i in range(4000):
+        bad = rng.random() < (0.7 if bad else 0.1)
+        lost[i] = bad
+    link = fit_link(*sent(lost))
+    assert link.bursts
+    assert link.loss == pytest.approx(0.25, abs=0.04)
+    assert sum(link.runs) == pytest.approx(1.0)
+    assert sum(link.runs[4:]) > 2.0 * link.loss**4
+
+
+def test_numbers_of_messages_wrap_and_overtake() -> None:
+    encoder = mavlink.MAVLink(None, srcSystem=17, srcComponent=18)
+    numbers = Numbers(["VISION_POSITION_ESTIMATE"])
+    order = [*range(200), 203, 202, 204, *range(210, 500)]  # 200, 201, 205 ... 209 are lost, 202 is overtaken
+    for number in order:
+        message = mavlink.MAVLink_vision_position_estimate_message(number, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        encoder.seq = number % 256
+        numbers.take(message.pack(encoder))
+        if number == 100:  # an id that the dialect has not, of the same sender, has a number of its own
+            numbers.take(bytes((0xFD, 1, 0, 0, 205, 17, 18, 0x9A, 0x01, 0x00, 7, 0, 0)))
+    gaps = numbers.gaps()
+    assert gaps.sum() == 6
+    assert sorted(gaps[gaps > 0]) == [2, 4]
+
+
+def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
+    """Its truth was fitted with gain 0.95 and dead time + lag 0.14 to 0.16 s, and no drag.
+
+    Seen through positions the shortest delay of 25 ms comes on top, and the ramp of a limited jerk counts as lag.
+    """
+    config = load_config("room", ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
+    history = from_tlog(read_tlog(DATA / "arducopter-vicon-loop.tlog").packets, config)
+    flown = [thinned(one, 0.2) for one in stretches(history.asked, history.seen)]
+    fit = fit_axis(flown, 0, 0.0)
+    assert 0.9 < fit.gain < 1.2
+    assert 0.16 < fit.lag_s < 0.32
+    assert fit.drag_1ps < 0.15
+    assert predict(flown, 0, fit).r2 > 0.97
+    link = fit_link(history.seen, history.gaps)
+    assert link.rate_hz == pytest.approx(24.7, rel=0.03)
+    assert link.loss < 0.01
+    assert link.delay_quantiles_s[2] == pytest.approx(0.055, abs=0.02)  # 80 ms less the shortest
+
+
+def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
+    flown = fly(0.25, 0.3, 1.0, seed=1, seconds=20.0)
+    asked = Asked(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
+    seen = Seen(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
+    with pytest.raises(RecordingError, match="hardly changed in east"):
+        identify(History(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room"), lambda: None)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    waypoints = "[[1.5,1.0,-1.2],[-1.5,-1.0,-1.0],[1.5,-1.0,-1.6],[1.5,1.0,-1.2]]"
+    flying = [
+        "loopback",
+        "--set",
+        f"mission.waypoints={waypoints}",
+        "--duration",
+        "30",
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
+    assert run(flying) == 0
+    capsys.readouterr()
+    assert run(["identify", str(tmp_path / "flight.mcap"), "--json"]) == 0
+    told = msgspec.json.decode(capsys.readouterr().out)
+    assert {"plant", "residual_std", "r2"} <= told.keys()
+    config = load_config(told["config"])
+    assert config.plant.lag_s == tuple(told["plant"]["lag_s"])
+    for one in told["response"]:  # 0.25, and the shortest delay, which the receiver cannot see
+        assert abs(one["lag_s"] - 0.28) < 4.0 * one["lag_std_s"]
+    page = Path(told["report"]).read_text(encoding="utf-8")
+    assert page.count("<svg") == 11
+    assert run(["identify", str(tmp_path / "flight.mcap"), "--config", "paper"]) == 2
+    assert run(["identify", str(tmp_path / "nothing.mcap")]) == 1

@@ -1,0 +1,203 @@
+"""The daemon in operation: orders, a second daemon, the service manager, and both of its ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from importlib.resources import files
+
+import pytest
+from operation_rig import LIMIT_S, Scene, ended, scene, until
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_rig import decode
+
+from logs.reader import records
+from uavctl.build import build_design
+from uavctl.config import load_config
+from uavctl.data import ControlMode, Datagram, Decision, Order, StepInput
+from uavctl.library_store import library_for
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _library() -> None:
+    """The daemons find the policy library in the cache, so that their time limits are for flying."""
+    library_for(build_design(load_config("room")))
+
+
+@pytest.fixture
+def air() -> Iterator[Scene]:
+    with scene() as found:
+        yield found
+
+
+def wait_for_flight(air: Scene) -> None:
+    """Until the daemon tracks."""
+    until(lambda: air.ctl("status")[0] == 0 and air.status()["mode"] == "track", "the daemon tracks")
+
+
+def decisions(air: Scene, out: str = "f") -> list[Decision]:
+    return list(records(air.folder / out / "flight.mcap", Decision))
+
+
+@pytest.mark.fault(35)
+def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(air: Scene) -> None:
+    assert air.ctl("status")[0] == 1 and "start one with `uavctl fly`" in air.ctl("status")[2]
+    with ended(air.fly("f")) as process:
+        wait_for_flight(air)
+
+        with ended(air.fly("second")) as second:
+            _, told = second.communicate(timeout=LIMIT_S)
+        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in told
+        assert not list((air.folder / "second").glob("*"))
+
+        code, _, told = air.ctl("goto", "-1,0.5,-1.4")
+        assert code == 0 and told.startswith("goto accepted")
+        code, told, _ = air.ctl("goto", "9,0,-1", "--json")
+        assert code == 1 and "north 9 m is outside" in json.loads(told)["text"]
+        assert air.ctl("goto", "1,2")[0] == 2 and air.ctl("goto", "nan,0,-1")[0] == 2
+        code, _, told = air.ctl("hold", "--vehicle", "another")
+        assert code == 1 and "no daemon named like 'another'" in told
+        name = air.status()["name"]
+        # obeyed at the next boundary that has news: which one, the lossy link decides
+        until(lambda: air.status()["target_m"] == {"north": -1.0, "east": 0.5, "down": -1.4}, "the order is obeyed")
+        assert air.status()["recorder"]["ok"] and air.status()["vehicle"]["armed"]
+        assert air.ctl("land", "--vehicle", name)[0] == 0
+        until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
+        process.communicate(timeout=LIMIT_S)
+    ordered = [c.order for i in records(air.folder / "f" / "flight.mcap", StepInput) for c in i.commands]
+    assert ordered == [Order.GOTO, Order.LAND]  # what was refused at the socket never reached a tick
+    assert not list(air.control.iterdir())
+
+
+@pytest.mark.fault(31)
+def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
+    with ended(air.fly("f")) as process:
+        wait_for_flight(air)
+        tracks_s = time.monotonic()
+        until(lambda: time.monotonic() - tracks_s > 2.0, "more than the second that may be lost")
+        assert air.mode == "OFFBOARD"
+        process.send_signal(signal.SIGKILL)
+        process.wait(LIMIT_S)
+        killed_s = time.monotonic()
+        until(lambda: air.mode != "OFFBOARD", "the failsafe")
+        until(lambda: time.monotonic() - killed_s > 3.0, "three seconds")
+    # What was in the socket's queue when the process died is read within the tap's next turns.
+    assert [s for s in air.tap.spoken_s if s > killed_s + 0.2] == []
+    until(lambda: max(map(abs, air.truths[-1].velocity_mps)) < 0.3, "the failsafe brings it to rest")
+    assert decisions(air)[-1].mode is ControlMode.TRACK  # whole up to the last second
+    with ended(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
+        until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
+        until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
+        heard_s = time.monotonic()
+        until(lambda: time.monotonic() - heard_s > 1.0, "a second")
+        assert air.mode != "OFFBOARD"  # to which PX4 would return by itself if setpoints came again
+        assert air.ctl("engage")[0] == 0
+        wait_for_flight(air)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=LIMIT_S)
+    assert "left the vehicle in flight" in told and "uavctl ctl engage" in told
+    orders = [c.order for i in records(air.folder / "again" / "flight.mcap", StepInput) for c in i.commands]
+    assert orders == [Order.STAND_BY, Order.ENGAGE]
+    sent = [
+        message.get_type()
+        for one in records(air.folder / "again" / "flight.mcap", Datagram)
+        if one.outgoing
+        for message in decode(one.data)
+        if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
+        or getattr(message, "command", 0) == mavlink.MAV_CMD_DO_SET_MODE
+    ]
+    assert sent.index("COMMAND_LONG") == 1  # the mode is asked for with the first setpoint, and no setpoint is before
+
+
+@pytest.mark.fault(34)
+def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
+    with ended(air.fly("f")) as process:
+        wait_for_flight(air)
+        until(lambda: max(map(abs, air.truths[-1].velocity_mps)) > 0.3, "it moves, so that there is something to brake")
+        process.send_signal(signal.SIGTERM)
+        summary, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0 and json.loads(summary)["recording"].endswith("flight.mcap")
+    modes = list(dict.fromkeys(decision.mode for decision in decisions(air)))
+    assert modes[modes.index(ControlMode.TRACK) :][:4] == [
+        ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND,
+    ]  # fmt: skip
+    assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+    until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
+    over_s = air.tap.spoken_s[-1]
+    until(lambda: time.monotonic() - over_s > 1.0, "a second")
+    assert air.tap.spoken_s[-1] == over_s
+
+
+def test_the_service_manager_hears_of_the_flight_from_its_ticks(air: Scene) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(air.folder / "notify"))
+        manager.settimeout(LIMIT_S)
+        environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
+        with ended(air.fly("f", "--duration", "2.5", environ=environ)) as process:
+            heard = [manager.recv(4096).decode()]
+            while heard[-1] != "STOPPING=1":
+                heard.append(manager.recv(4096).decode())
+            _, told = process.communicate(timeout=LIMIT_S)
+    assert heard[0] == "READY=1"
+    assert heard.count("WATCHDOG=1") > 10
+    lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
+    assert len(lines) >= 2 and "OFFBOARD armed" in lines[-1]
+    assert lines[0] in told  # the health line of a daemon without a terminal
+
+
+def test_a_hanging_loop_gives_no_sign_of_life(air: Scene) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(air.folder / "notify"))
+        manager.settimeout(LIMIT_S)
+        environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
+        with ended(air.fly("f", environ=environ)) as process:
+            while manager.recv(4096) != b"WATCHDOG=1":
+                pass
+            process.send_signal(signal.SIGSTOP)
+            manager.settimeout(1.0)
+            with pytest.raises(TimeoutError):
+                for _ in range(100):  # what was on its way
+                    manager.recv(4096)
+            code, _, told = air.ctl("hold")
+            assert code == 1 and "the control loop may hang" in told
+
+
+def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
+    with scene("sim.seed=3") as other:
+        other.control = air.control
+        with ended(air.fly("f")) as one, ended(other.fly("f")) as two:
+            until(lambda: len([*air.control.iterdir()] if air.control.exists() else []) == 2, "both listen")
+            until(lambda: "several daemons run" in air.ctl("status")[2], "both answer")
+            names = [path.stem for path in air.control.iterdir()]
+            pids = set()
+            for name in names:
+                until(lambda name=name: air.ctl("status", "--vehicle", name)[0] == 0, name)  # type: ignore[misc]
+                pids.add(json.loads(air.ctl("status", "--vehicle", name, "--json")[1])["pid"])
+            assert pids == {one.pid, two.pid}
+
+
+def test_a_unit_of_systemd_s_comes_with_the_package() -> None:
+    unit = files("uavctl").joinpath("systemd", "uavctl@.service").read_text(encoding="utf-8")
+    lines = dict(line.split("=", 1) for line in unit.splitlines() if "=" in line and not line.startswith("#"))
+    assert lines["Type"] == "notify" and float(lines["WatchdogSec"]) <= 1.0
+    assert lines["WatchdogSignal"] == "SIGKILL" and lines["Restart"] == "no"  # the vehicle's own failsafe has it
+    assert "--realtime" in lines["ExecStart"]
+    config = load_config("room")
+    assert float(lines["TimeoutStopSec"]) > config.fallback.brake_s + config.fallback.hold_s + 10.0
+
+
+def test_options_of_ctl_are_checked() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "uavctl", "ctl", "fly-away"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT_S,
+    )
+    assert done.returncode == 2

@@ -1,0 +1,72 @@
+"""`--realtime`: what is permitted is done and undone, what is not is told with what to do."""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import weakref
+from collections.abc import Iterator
+
+import pytest
+
+from uavctl import realtime as module
+from uavctl.clock import Due
+from uavctl.realtime import Collector, Outcome, realtime
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(autouse=True)
+def _as_before() -> Iterator[None]:
+    before = os.sched_getscheduler(0)
+    yield
+    assert os.sched_getscheduler(0) == before
+    assert gc.isenabled() and gc.get_freeze_count() == 0
+
+
+def outcomes(found: tuple[Outcome, ...]) -> dict[str, Outcome]:
+    return {outcome.part: outcome for outcome in found}
+
+
+def test_what_it_says_is_what_holds() -> None:
+    with realtime() as found:
+        told = outcomes(found)
+        assert told["scheduling"].ok == (os.sched_getscheduler(0) == os.SCHED_FIFO)
+        assert told["garbage"].ok and not gc.isenabled() and gc.get_freeze_count() > 0
+
+
+def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(module, "_may_lock", lambda: False)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (65536, 65536))
+    with realtime() as found:
+        told = outcomes(found)
+        assert not told["scheduling"].ok and "LimitRTPRIO=20" in told["scheduling"].text
+        # A limit that the memory fits in today would make an allocation fail in flight.
+        assert not told["memory"].ok and "LimitMEMLOCK=infinity" in told["memory"].text
+        assert told["garbage"].ok
+
+
+class _Ring:
+    """Garbage that only a collection finds."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def test_garbage_goes_once_a_second_and_only_after_a_tick() -> None:
+    collector = Collector()
+    gc.disable()
+    try:
+        collector.after_tick(Due(0, 0, 0), 0)
+        seen = weakref.ref(_Ring())
+        collector.after_tick(Due(19, SECOND - 1, 0), 0)
+        assert seen() is not None
+        collector.after_tick(Due(20, SECOND, 0), 0)
+        assert seen() is None
+    finally:
+        gc.enable()

@@ -1,0 +1,89 @@
+"""A small part of what `tools/soak.py` flies, and proof that its judge finds what is wrong."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from soak_faults import FLIGHT_S, drawn, fly_faults
+from soak_mission import AUTOPILOTS, MISSION, fly_mission, summary
+from soak_rig import prepared_for
+
+from logs.reader import read
+from uavctl.cli.prepare import Prepared
+from uavctl.data import Truth, Vec3
+
+TOOL = Path(__file__).parent.parent / "tools" / "soak.py"
+
+
+@pytest.fixture(scope="module")
+def faulty() -> Prepared:
+    return prepared_for()
+
+
+def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> None:
+    prepared = prepared_for(*MISSION)
+    flights = [fly_mission(prepared, autopilot, 1) for autopilot in AUTOPILOTS]
+    for flight in flights:
+        assert flight.good, flight
+        assert flight.clearance_m > 0.1
+        assert len(flight.legs) == 4
+        assert max(leg.plan_rms_m for leg in flight.legs) < 0.2
+    found = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
+    assert (found["touched"], found["landed"], found["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
+
+
+def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:
+    batch = fly_faults(faulty, 0, 0.03, warm_up=1, flight_s=60.0)
+    assert not batch.wrong
+    assert batch.flights >= 2
+    assert batch.ticks == sum(batch.modes.values()) > 2000
+    assert batch.modes["track"] > 500
+
+
+def test_the_faults_of_many_seeds_are_of_every_kind_and_the_same_each_time() -> None:
+    configs = [drawn(seed) for seed in range(60)]
+    kinds = {fault.kind for config in configs for fault in config.sim.fault}
+    assert kinds == {"blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen", "wind"}
+    assert {config.sim.autopilot for config in configs} == {"px4", "ardupilot"}
+    assert max(fault.at_s for config in configs for fault in config.sim.fault) < FLIGHT_S
+    assert drawn(7) == configs[7]
+
+
+@pytest.mark.parametrize(
+    ("planted", "text"), [((2.1, 0.0, 0.0), "beyond"), ((math.nan, 0.0, 0.0), "not finite"), ((1.9, 0.0, 0.0), "leaps")]
+)
+def test_a_planted_setpoint_is_found_and_its_flight_recorded(
+    faulty: Prepared, planted: Vec3, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("uavctl.flight.step.gate", lambda *_: (planted, ()))
+    batch = fly_faults(faulty, 3, 1e-6, warm_up=0, out=tmp_path, flight_s=2.0)
+    assert any(text in finding for finding in batch.wrong[3])
+    assert any(isinstance(record, Truth) for _, _, record in read(tmp_path / "faults-3.mcap"))
+
+
+def test_an_exception_is_a_finding(faulty: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr("uavctl.flight.step.gate", broken)
+    assert fly_faults(faulty, 3, 1e-6, warm_up=0).wrong == {3: ("ZeroDivisionError: planted",)}
+
+
+def test_the_tool_runs_from_anywhere_and_refuses_nothing_to_fly(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOL), "--seeds=0"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "at least one seed" in ended.stderr
+
+
+@pytest.mark.parametrize("wrong", ["--hours=0", "--hours=nan", "--ticks=0", "--first=-1"])
+def test_the_tool_refuses_nothing_to_fly(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(TOOL))["main"]([wrong])
+    assert "at least one seed" in capsys.readouterr().err

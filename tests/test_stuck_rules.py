@@ -1,0 +1,142 @@
+"""The stuck detector, without a flight: what is remembered of a source, and when that is called stuck."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sample, small_plant
+
+from uavctl.data import PositionSample
+from uavctl.flight.estimator import absorb, begin, set_input
+from uavctl.flight.kalman import Belief, make_kalman
+from uavctl.flight.reach import GateParameters
+from uavctl.flight.stuck import Watch, Watches, observe, stuck
+
+PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
+PLANT = small_plant()
+KALMAN = make_kalman(PLANT, estimator_parameters(), DT_NS)
+
+
+def watched(values: list[float], source: str = "camera", watches: Watches | None = None) -> Watches:
+    """What is known of a source after these values, one each 50 ms, with what was off as 1 mm."""
+    watches = watches or {}
+    history = begin(KALMAN, START_NS, START_NS)
+    for n, value in enumerate(values):
+        one = sample(START_NS + (n + 1) * TICK_NS, position_m=(value, 0.0, 0.0), source=source)
+        history, _, _ = absorb(KALMAN, history, one.received_ns, ())
+        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
+        history = set_input(KALMAN, history, one.received_ns, np.array([1.0]))
+    return watches
+
+
+def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_last_one() -> None:
+    watch = watched([0.0, 0.5, 0.25, 0.75])["camera"]
+    assert (watch.resolution_m, watch.repeats, watch.coasting) == (0.25, 0, None)
+    assert watch.news_m == pytest.approx(0.001 * (1 - 0.9**3))
+    watch = watched([0.0, 0.5, 0.5, 0.5])["camera"]
+    assert (watch.resolution_m, watch.repeats) == (0.5, 2)
+    assert watch.coasting is not None
+    assert watch.coasting.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
+    watch = watched([0.0, 0.5, 0.5, 0.25])["camera"]
+    assert (watch.repeats, watch.coasting) == (0, None)
+    assert watched([0.0])["camera"].resolution_m == 0.0
+    assert watched([0.0, 3.0])["camera"].resolution_m == 3.0
+
+
+def test_a_position_that_is_no_triple_is_an_error_and_not_compared_in_part() -> None:
+    short = sample(START_NS + 9 * TICK_NS, position_m=(0.0, 0.5))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="zip"):
+        observe(watched([0.0]), KALMAN, begin(KALMAN, START_NS, START_NS), short, np.zeros(1))
+
+
+def test_what_is_known_of_a_source_is_one_object_that_nobody_changes() -> None:
+    watch = watched([0.0, 0.5, 0.5])["camera"]
+    with pytest.raises(FrozenInstanceError):
+        watch.found = True  # type: ignore[misc]
+    assert watch != replace(watch)  # and not compared by its arrays, which have no one truth
+
+
+def test_coasting_goes_by_the_inputs_alone() -> None:
+    two, three = watched([0.0, 0.5, 0.5])["camera"], watched([0.0, 0.5, 0.5, 0.5])["camera"]
+    assert two.coasting is not None
+    assert three.coasting is not None
+    a, b, e = PLANT.transition(TICK_NS * 1e-9)
+    mean = two.coasting.mean[:3]
+    # The step's disturbance is expected to be what it was so far, until the next boundary.
+    want = a @ mean + b @ np.array([1.0]) + e @ two.coasting.mean[3:]
+    assert three.coasting.mean[:3] == pytest.approx(want, abs=1e-9)
+
+
+def test_sources_are_watched_apart() -> None:
+    watches = watched([0.0, 0.5, 0.5], "one")
+    watches = watched([0.0, 0.5, 0.25], "two", watches)
+    assert (watches["one"].repeats, watches["two"].repeats) == (1, 0)
+
+
+@pytest.mark.parametrize("late_ns", [0, 1, DT_NS])
+def test_late_samples_say_nothing(late_ns: int) -> None:
+    watches, history = watched([0.0, 0.5, 0.25]), begin(KALMAN, START_NS, START_NS)
+    late = sample(START_NS + 3 * TICK_NS - late_ns, position_m=(0.25, 0.0, 0.0))
+    assert observe(watches, KALMAN, history, late, np.zeros(1)) is watches
+
+
+def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> None:
+    watches: Watches = {}
+    for n in range(8):
+        watches = watched([0.0], f"s{n}", watches)
+    assert set(watches) == {f"s{n}" for n in range(8)}
+    for n in range(8, 30):
+        watches = watched([0.0], f"s{n}", watches)
+        assert len(watches) <= 8
+        assert f"s{n}" in watches
+    crowd = {f"c{n}": watches["s29"] for n in range(9)}
+    assert set(watched([0.0], "new", crowd)) == {"new"}
+
+
+@pytest.mark.parametrize(
+    ("repeats", "news_m", "resolution_m", "std_m", "far_m", "found"),
+    [
+        (3, 0.003, 1e-6, 0.01, 0.0, True),
+        (2, 0.003, 1e-6, 0.01, 0.0, False),
+        (400, 0.003, 1e-6, 0.01, 0.0, True),
+        (3, 0.0005, 0.001, 0.02, 0.0, True),
+        (3, 0.000499, 0.001, 0.02, 0.0, False),
+        (3, 0.003, 0.001, 0.01999, 0.0, False),
+        (3, 2e-5, 1e-7, 0.01, 0.0, True),
+        (3, 1.99e-5, 1e-7, 0.01, 0.0, False),
+        (9, 0.003, 0.0, 0.01, 0.0, False),
+        (1, 0.0, 0.0, 0.0, 0.1301, True),  # 6 times 5 mm, and the margin
+        (1, 0.0, 0.0, 0.0, -0.1301, True),
+        (1, 0.0, 0.0, 0.0, 0.1299, False),
+        (1, 0.0, 0.0, 0.0, -0.1299, False),
+        (1, 0.0, 0.01, 0.0, 0.1399, False),
+        (1, 0.0, 0.01, 0.0, 0.1401, True),
+    ],
+)
+def test_what_counts_as_stuck(
+    repeats: int, news_m: float, resolution_m: float, std_m: float, far_m: float, found: bool
+) -> None:
+    one: PositionSample = sample(START_NS, position_m=(2.0, 0.0, 0.0))
+    belief = Belief(
+        at_ns=START_NS,
+        captured_ns=START_NS,
+        mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
+        cov=np.diag([std_m**2, 9, 9, 9]),
+    )
+    watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats, belief)
+    assert stuck(watch, KALMAN, one, PARAMETERS) is found
+    assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
+    assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS) is True
+
+
+def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
+    parameters = GateParameters(sigma=0.0, margin_m=0.125, jump_ns=0)
+    one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
+    for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
+        belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
+        watch = Watch(START_NS, one.position_m, resolution_m=0.125, repeats=1, coasting=belief)
+        assert stuck(watch, KALMAN, one, parameters) is found

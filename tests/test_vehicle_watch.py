@@ -1,0 +1,106 @@
+"""What the vehicle's messages tell of it: whose answers count, other vehicles, its clock going back."""
+
+from __future__ import annotations
+
+import pytest
+from mavlink_rig import OFFBOARD, SECOND, Peer, events, make_link, statuses
+
+from uavctl.config.peers import DaemonConfig
+from uavctl.data import VehicleStatus
+from uavctl.mavlink.link import Link
+from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.vehicle import ALONE_NS
+
+NOW = 1000 * SECOND
+WRAP_MS = 2**32
+
+
+def heard(boot_ms: int = 60_000) -> tuple[Link, Peer]:
+    link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
+    link.receive(vehicle.heartbeat(), NOW)
+    link.receive(vehicle.local_position(boot_ms), NOW)
+    return link, vehicle
+
+
+def newest(link: Link, vehicle: Peer, at_ns: int = NOW + SECOND) -> VehicleStatus:
+    return statuses(link.receive(vehicle.heartbeat(), at_ns))[-1]
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "counts"),
+    [(245, 25, True), (0, 0, True), (245, 0, True), (255, 190, False), (245, 7, False)],
+)
+def test_answers_to_others_are_not_ours(system: int, component: int, counts: bool) -> None:
+    link, vehicle = heard()
+    items = link.receive(vehicle.send("command_ack", 400, 4, 0, 0, system, component), NOW)
+    assert bool([item for item in items if isinstance(item, Ack)]) == counts == bool(events(items))
+
+
+def test_answers_about_streams_are_not_told_of() -> None:
+    link, vehicle = heard()
+    assert not events(link.receive(vehicle.send("command_ack", 511, 0, 0, 0, 245, 25), NOW))
+
+
+def test_words_of_the_vehicle_are_told_and_handed_on() -> None:
+    link, vehicle = heard()
+    items = link.receive(vehicle.send("statustext", 2, b"PreArm: no"), NOW)
+    assert [type(item) for item in items] == [Text, type(events(items)[0])]
+    assert not link.receive(Peer(9, 1).send("statustext", 2, b"not mine"), NOW)
+
+
+@pytest.mark.fault(16)
+def test_another_vehicle_is_remembered_for_a_while() -> None:
+    link, vehicle = heard()
+    assert newest(link, vehicle).alone
+    link.receive(Peer(2, 1).heartbeat(), NOW + SECOND)
+    assert not newest(link, vehicle, NOW + SECOND + ALONE_NS).alone
+    assert newest(link, vehicle, NOW + SECOND + ALONE_NS + 1).alone
+
+
+def test_a_ground_station_and_a_camera_are_no_vehicles() -> None:
+    link, vehicle = heard()
+    link.receive(Peer(255, 190).heartbeat(autopilot=8, kind=6), NOW)
+    link.receive(Peer(1, 100).heartbeat(autopilot=8, kind=30), NOW)
+    assert newest(link, vehicle).alone
+
+
+def test_how_long_it_has_been_up_is_told_by_its_clock_and_goes_on_between_its_messages() -> None:
+    link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
+    link.receive(vehicle.heartbeat(), NOW)
+    assert link.vehicle_up_s(NOW) is None
+    link.receive(vehicle.local_position(60_000), NOW)
+    assert link.vehicle_up_s(NOW) == 60.0 and link.vehicle_up_s(NOW + 2 * SECOND) == 62.0
+
+
+@pytest.mark.fault(20)
+@pytest.mark.parametrize("young_ms", [0, 100, 58_000])
+def test_a_clock_that_goes_back_is_a_restart(young_ms: int) -> None:
+    link, vehicle = heard()
+    items = link.receive(vehicle.local_position(young_ms), NOW + SECOND)
+    assert [event.code for event in events(items)] == ["vehicle-reboot"]
+    assert [status.boots for status in statuses(items)] == [1]  # at once, not with the next heartbeat
+    assert not events(link.receive(vehicle.local_position(young_ms + 40), NOW + SECOND))
+    assert newest(link, vehicle).boots == 1
+
+
+@pytest.mark.fault(18, 20)
+@pytest.mark.parametrize(
+    ("before_ms", "after_ms"), [(60_000, 59_500), (60_000, 60_000), (WRAP_MS - 20, 20), (0, 10**9)]
+)
+def test_disorder_the_wrap_and_gaps_are_no_restarts(before_ms: int, after_ms: int) -> None:
+    link, vehicle = heard(before_ms)
+    assert not events(link.receive(vehicle.local_position(after_ms), NOW + SECOND))
+    assert newest(link, vehicle).boots == 0
+
+
+@pytest.mark.fault(20)
+def test_a_heartbeat_of_starting_up_after_one_of_being_up_is_a_restart() -> None:
+    link, vehicle = make_link(), Peer(1, 1)
+    for status, boots in ((1, 0), (2, 0), (3, 0), (4, 0), (5, 0), (0, 1), (1, 1), (3, 1), (1, 2)):
+        (told,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129, status=status), NOW))
+        assert told.boots == boots, status
+
+
+def test_another_component_s_clock_is_not_the_vehicle_s() -> None:
+    link, _ = heard()
+    assert not events(link.receive(Peer(1, 191).local_position(5), NOW + SECOND))

@@ -1,0 +1,190 @@
+"""Items of the frame: do the cameras' axes, unit and handedness agree with what the vehicle knows of itself."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+
+import numpy as np
+
+from uavctl.check.fit import Evidence, Mistake, explain, misfit, possible, yaw_deg
+from uavctl.check.item import Item, State, item
+from uavctl.check.positions import CAMERA_AXES, from_cameras, spread_m
+from uavctl.check.seen import Seen
+from uavctl.config.types import Config
+from uavctl.data import Vec3
+from uavctl.frames import Quaternion, from_euler, multiply, to_euler
+
+ENOUGH = 5  # pairs
+_OWN = ("LOCAL_POSITION_NED",)
+_TILT_DEG = 25.0  # between the two attitudes
+_MOVE_TOLERANCE_M, _MOVE_PART = 0.05, 0.15
+_ASKED_TOLERANCE_PART = 0.6  # of the way that a person was asked to move the body
+_HORIZONTAL = 8 | 16  # ESTIMATOR_STATUS_FLAGS: position relative, or absolute
+_CONSTANT = 128  # it assumes that it stands
+_WANT = "the same axes, unit and handedness as the vehicle's own"
+_MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
+
+
+def axis_items(seen: Seen, config: Config, asked: list[tuple[Vec3, Vec3]]) -> list[Item]:
+    """Items of own position, axes and heading.
+
+    Args:
+        seen: what was heard.
+        config: the configuration.
+        asked: (movement that was asked for, movement that the cameras saw), local NED [m].
+    """
+    if config.source.messages == _OWN:
+        return [item("axes", State.GOOD, "the positions are the vehicle's own", _WANT)]
+    if len(seen.samples) < ENOUGH:
+        return []
+    pairs = seen.pairs() if _has_position(seen) else []
+    heading, agrees = _heading(seen, config)
+    return [_own(seen, pairs), _axes(seen, config, pairs, asked, heading_agrees=agrees), heading]
+
+
+def compared(seen: Seen) -> bool:
+    """Whether there are positions of the vehicle's own to compare the cameras' with."""
+    return _has_position(seen) and len(seen.pairs()) >= ENOUGH
+
+
+def _has_position(seen: Seen) -> bool:
+    flags = seen.estimator
+    return flags is None or bool(flags & _HORIZONTAL and not flags & _CONSTANT)
+
+
+def _own(seen: Seen, pairs: list[tuple[Vec3, Vec3]]) -> Item:
+    name, want = "own position", "the vehicle's own position, to compare"
+    if len(pairs) >= ENOUGH:
+        away = np.linalg.norm(np.median([np.subtract(e, v) for e, v in pairs], axis=0))
+        return item(name, State.GOOD, f"{len(pairs)} pairs, {away:.2f} m from the cameras'", want)
+    flags = "not told" if seen.estimator is None else f"flags 0x{seen.estimator:x}"
+    hint = (
+        "give its estimator positions (the vehicle's parameters, [relay]); meanwhile `uavctl check --move` shows axes"
+    )
+    return item(name, State.UNDETERMINED, f"none (estimator: {flags})", want, hint)
+
+
+def evidence_of(
+    pairs: list[tuple[Vec3, Vec3]], asked: list[tuple[Vec3, Vec3]], config: Config
+) -> tuple[list[Evidence], Evidence | None]:
+    """All evidence, and that of a movement beside the vehicle's own position if the body moved."""
+    found, moved = [], None
+    if len(pairs) >= ENOUGH:
+        seen, own = np.array([e for e, _ in pairs]), np.array([v for _, v in pairs])
+        if config.check.same_origin:
+            middle = np.median(seen, axis=0, keepdims=True), np.median(own, axis=0, keepdims=True)
+            found.append(Evidence(middle[1], middle[0], config.check.offset_m))
+        if max(_extent(seen), _extent(own)) >= config.check.move_m:
+            away = own - own.mean(axis=0)
+            tolerance_m = _MOVE_TOLERANCE_M + _MOVE_PART * float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+            moved = Evidence(away, seen - seen.mean(axis=0), tolerance_m)
+            found.append(moved)
+    for wanted, got in asked:
+        tolerance_m = _ASKED_TOLERANCE_PART * math.hypot(*wanted)
+        found.append(Evidence(np.array([wanted]), np.array([got]), tolerance_m))
+    return found, moved
+
+
+def _extent(places: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
+    low, high = np.percentile(places, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _axes(
+    seen: Seen,
+    config: Config,
+    pairs: list[tuple[Vec3, Vec3]],
+    asked: list[tuple[Vec3, Vec3]],
+    *,
+    heading_agrees: bool,
+) -> Item:
+    evidence, moved = evidence_of(pairs, asked, config)
+    if misfit(evidence, np.eye(3)) > 1.0:
+        return item("axes", State.BAD, explain(evidence) + _where(evidence), _WANT, _hint(evidence, config))
+    if moved is not None and float(np.sqrt(np.mean(np.sum(moved.own[:, :2] ** 2, axis=1)))) >= config.check.move_m / 3:
+        angle = yaw_deg([moved])
+        if abs(angle) > config.check.yaw_deg:
+            hint = f"frame.yaw_deg is {angle:.0f} deg too large, if the vehicle's heading is right"
+            return item("axes", State.BAD, f"turned by {angle:.0f} deg about the vertical", _WANT, hint)
+    # What the vehicle believes because these very positions told it shows nothing.
+    shown = evidence_of([], asked, config)[0] if config.relay.enabled else evidence
+    left = _left(possible(shown), seen, config, heading_agrees=heading_agrees and not config.relay.enabled)
+    how = ", ".join(word for word, there in (("at rest", not moved and not asked), ("moved", moved or asked)) if there)
+    if left:
+        value = f"nothing contradicts ({how}), not excluded: " + "; ".join(one.name for one in left)
+        return item("axes", State.UNDETERMINED, value, _WANT, _MOVE)
+    return item("axes", State.GOOD, f"the same ({how})", _WANT)
+
+
+def _left(mistakes: list[Mistake], seen: Seen, config: Config, *, heading_agrees: bool) -> list[Mistake]:
+    """Mistakes that neither a heading nor the size of the noise excludes."""
+    believed_m, worst_m = config.estimator.position_std_m, max(spread_m(seen.samples))
+    left = [one for one in mistakes if not (heading_agrees and one.turns_only)]
+    return [one for one in left if not _noise_excludes(float(one.matrix[0, 0]), worst_m / believed_m)]
+
+
+def _noise_excludes(scale: float, noise: float) -> bool:
+    """Whether noise (in parts of what is believed of it) cannot be that of another unit."""
+    return (scale >= 100.0 and noise < 0.1 * scale) or (0.0 < scale <= 0.01 and noise > 0.1)
+
+
+def _where(evidence: list[Evidence]) -> str:
+    one = max(evidence, key=lambda each: each.misfit(np.eye(3)))
+    row = int(np.argmax(np.linalg.norm(one.own, axis=1) + np.linalg.norm(one.seen, axis=1)))
+    own, cameras = (", ".join(f"{value:.2f}" for value in each[row]) for each in (one.own, one.seen))
+    return f": ({own}) m for the vehicle, ({cameras}) m for the cameras"
+
+
+def _hint(evidence: list[Evidence], config: Config) -> str:
+    hint = "see [frame] (convention, origin_m, yaw_deg), and the unit and handedness of what the source sends"
+    if from_cameras(config):
+        hint = CAMERA_AXES
+    alone = len(evidence) == 1 and config.check.same_origin
+    return hint + ("; does the vehicle count from another origin? Then check.same_origin = false" if alone else "")
+
+
+def _heading(seen: Seen, config: Config) -> tuple[Item, bool]:
+    """The cameras' attitude beside the vehicle's own, and whether they agree."""
+    name, limit_deg = "heading", config.check.yaw_deg
+    want = f"the cameras' attitude within {limit_deg:g} deg of the vehicle's own"
+    turns = _relative(seen)
+    if not turns:
+        told = "the source tells none, or exactly level to the north"
+        hint = "let the source send the body's attitude: it shows a turned frame at rest"
+        if _told(seen):
+            told, hint = "the vehicle tells none", "let the vehicle stream ATTITUDE on this link"
+        return item(name, State.UNDETERMINED, told, want, hint), False
+    yaws = [to_euler(q)[2] for q in turns]
+    # Mean of directions: angles near 180 deg must not average to 0.
+    yaw = math.degrees(math.atan2(sum(map(math.sin, yaws)), sum(map(math.cos, yaws))))
+    tilt = float(np.median([math.degrees(math.acos(min(max(1 - 2 * (x * x + y * y), -1), 1))) for _, x, y, _ in turns]))
+    value = f"{yaw:.1f} deg apart about the vertical, {tilt:.1f} deg in tilt"
+    if tilt > _TILT_DEG:
+        hint = "the cameras' axes point up where [frame] says down, or the body was defined lying otherwise"
+        return item(name, State.BAD, value, want, hint), False
+    if abs(yaw) > limit_deg:
+        hint = (
+            f"turn the frame (frame.yaw_deg {yaw:.0f} deg too large, or frame.convention), turn the body's own axes in "
+            "the cameras' software with its nose along their first axis, or see to the vehicle's compass"
+        )
+        return item(name, State.BAD, value, want, hint), False
+    return item(name, State.GOOD, value, want), True
+
+
+def _told(seen: Seen) -> bool:
+    return seen.attitude_told or seen.fuses_attitude
+
+
+def _relative(seen: Seen) -> list[Quaternion]:
+    """Turns from the vehicle's attitude to the cameras', one for each sample that has both."""
+    if not _told(seen) or not seen.angles_rad:
+        return []
+    times = [at_ns for at_ns, _ in seen.angles_rad]
+    found = []
+    for sample in seen.samples:
+        own = from_euler(seen.angles_rad[min(bisect_left(times, sample.captured_ns), len(times) - 1)][1])
+        if sample.attitude is not None and own is not None:
+            w, x, y, z = own
+            found.append(multiply(sample.attitude, (w, -x, -y, -z)))
+    return found

@@ -1,0 +1,129 @@
+"""`uavctl identify`: plant, lag, disturbance and link model from a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.console import Group, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from logs.outputs import spare_recording
+from logs.reader import header, read
+from logs.tlog import read_tlog
+from uavctl.build import build_design
+from uavctl.cli.common import DEFAULTS, Common, messages
+from uavctl.config import Config
+from uavctl.config.load import dump_config, parse
+from uavctl.errors import DesignError, UsageError
+from uavctl.identify.fit import FITS
+from uavctl.identify.page import write_page
+from uavctl.identify.recorded import History, from_records, from_tlog
+from uavctl.identify.result import Identification, Identified, identify
+
+
+def identify_command(
+    flight: Annotated[Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog")],
+    /,
+    *,
+    common: Common = DEFAULTS,
+    out: Annotated[Path | None, Parameter(help="TOML file to write; else identified.toml beside the recording")] = None,
+) -> int:
+    """Identify the vehicle and the link of a flight, and write them as a configuration with a page of plots.
+
+    A recording of ours brings its configuration along; for a `.tlog`, --config and --set say which messages are
+    positions and in what frame. Plant, link, rate and noise of that configuration are replaced, all else is kept.
+    """
+    history, config = _history(flight, common)
+    target = out if out is not None else flight.with_name("identified.toml")
+    if target == flight:
+        raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
+    spare_recording(target)
+    with _progress(len(config.plant.axes) * FITS) as advance:
+        found = identify(history, config, advance)
+    doubts = (*found.result.warnings, *_design_doubts(found.config))
+    result = msgspec.structs.replace(found.result, warnings=doubts)
+    page = target.with_suffix(".html")
+    _write(target, dump_config(found.config))
+    _write(page, write_page(found, history.seen, str(flight)))
+    document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
+    common.show(document, lambda: _picture(result, found, target, page))
+    return 0
+
+
+def _history(flight: Path, common: Common) -> tuple[History, Config]:
+    """The flight, and the configuration that its result goes into."""
+    if flight.suffix == ".tlog":
+        config = common.load().config
+        one_link = msgspec.structs.replace(config.daemon, vehicle="tlog", mocap="tlog")
+        read_as = msgspec.structs.replace(config, daemon=one_link)
+        return from_tlog(read_tlog(flight).packets, read_as), config
+    if common.overrides or common.config != DEFAULTS.config:
+        raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
+    config = parse(header(flight).config_toml, f"{flight} (configuration)").config
+    return from_records(read(flight), config), config
+
+
+def _design_doubts(config: Config) -> tuple[str, ...]:
+    """Why the identified configuration makes no design as it stands, if it does not."""
+    try:
+        build_design(config)
+    except DesignError as error:
+        return (f"no design yet with this plant and link: {error}; for another gain: `uavctl design --synthesize`",)
+    return ()
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+
+
+@contextmanager
+def _progress(steps: int) -> Iterator[Callable[[], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        task = progress.add_task("fitting", total=steps)
+        yield lambda: progress.advance(task)
+
+
+def _picture(result: Identified, found: Identification, target: Path, page: Path) -> RenderableType:
+    plant = Table(title=f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions")
+    for column in (
+        "axis",
+        "lag [s]",
+        "drag [1/s]",
+        "gain",
+        "wind [m/s²]",
+        "dead time + lag [s]",
+        "residual [mm]",
+        "R²",
+    ):
+        plant.add_column(column, justify="left" if column == "axis" else "right")
+    for one in result.response:
+        plant.add_row(
+            one.axis,
+            f"{one.lag_s:.3f}",
+            f"{one.drag_1ps:.3f}",
+            f"{one.gain:.3f}",
+            f"{one.wind_std_mps2:.3f}",
+            f"{one.dead_time_s:.2f} + {one.dead_time_lag_s:.2f}",
+            f"{1e3 * one.residual_std_m:.1f}",
+            f"{one.r2:.3f}",
+        )
+    link = Table(title="link", show_header=False)
+    for name, value in (
+        ("rate", f"{found.link.rate_hz:.4g} Hz"),
+        ("lost", f"{found.link.loss:.1%}, {'in bursts' if found.link.bursts else 'each by itself'}"),
+        ("delay", f"{1e3 * found.link.delay_s:.0f} ms, 99 % within {1e3 * found.link.jitter_s:.0f} ms more"),
+    ):
+        link.add_row(name, value)
+    told = [f"[yellow]{escape(text)}[/]" for text in result.warnings]
+    return Group(plant, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}")

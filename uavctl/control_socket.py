@@ -1,0 +1,239 @@
+"""The operator's orders while flying: a Unix socket that the daemon looks at after each tick and never waits for.
+
+An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder 0700,
+socket 0600) and again by the kernel's word on who is at the other end.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from uavctl.clock import Due
+from uavctl.config import Config
+from uavctl.config.mission_checks import outside
+from uavctl.control_messages import MAX_LINE, Reply, Request, socket_path
+from uavctl.data import ORDER_ACCEPTED, Command, Event, Order
+from uavctl.errors import UsageError, VehicleTakenError
+from uavctl.health import Health
+
+MAX_CLIENTS = 8
+IDLE_NS = 10_000_000_000
+_CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
+_REQUEST = msgspec.json.Decoder(Request)
+
+
+class Orderly(Protocol):
+    """What takes orders: the control loop."""
+
+    answers: tuple[tuple[Command, Event], ...]  # the orders that the last tick took, each with its answer
+
+    def order(self, command: Command) -> bool:
+        """Queue an order for the next tick; False if too many wait."""
+        ...
+
+
+@dataclass(eq=False)
+class _Client:
+    socket: socket.socket
+    heard_ns: int
+    buffer: bytes = b""
+
+
+class ControlServer:
+    """Serves one listening socket; its `after_tick` is for the daemon.
+
+    Args:
+        listener: as `listening` gives it.
+        config: for the limits that a place has to keep.
+        flight: takes the orders.
+        look: the flight as it is.
+    """
+
+    def __init__(self, listener: socket.socket, config: Config, flight: Orderly, look: Callable[[], Health]) -> None:
+        self._listener, self._config, self._flight, self._look = listener, config, flight, look
+        self._clients: list[_Client] = []
+        self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
+
+    def after_tick(self, due: Due, lateness_ns: int) -> None:
+        """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
+        del lateness_ns
+        self._answer()
+        self._accept(due.at_ns)
+        waiting = [client for client, _ in self._waiting]
+        for client in [one for one in self._clients if one not in waiting]:
+            self._serve(client, due.at_ns)
+
+    def close(self) -> None:
+        """End the service; who still waits is told so."""
+        for client, _ in self._waiting:
+            self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
+        for client in self._clients:
+            client.socket.close()
+        self._clients.clear()
+        self._waiting.clear()
+
+    def _answer(self) -> None:
+        answers = list(self._flight.answers)
+        waiting, self._waiting = self._waiting, []
+        for client, command in waiting:
+            found = next((one for one in answers if one[0] == command), None)
+            if found is None:
+                self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
+            else:
+                answers.remove(found)
+                self._reply(client, Reply(ok=found[1].code == ORDER_ACCEPTED, text=found[1].text))
+
+    def _accept(self, now_ns: int) -> None:
+        while len(self._clients) < MAX_CLIENTS:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return  # nobody, or gone again
+            connection.setblocking(False)
+            _, uid, _ = _CREDENTIALS.unpack(
+                connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            )
+            if uid in (os.geteuid(), 0):
+                self._clients.append(_Client(connection, now_ns))
+            else:
+                connection.close()
+
+    def _serve(self, client: _Client, now_ns: int) -> None:
+        """Read what a client has said and act on its first whole line."""
+        try:
+            data = client.socket.recv(MAX_LINE)
+        except BlockingIOError:
+            data = None
+        except OSError:
+            data = b""
+        if data:
+            client.heard_ns = now_ns
+            client.buffer += data
+        line, whole, rest = client.buffer.partition(b"\n")
+        if whole and len(line) <= MAX_LINE:
+            client.buffer = rest
+            self._act(client, line)
+        elif len(client.buffer) > MAX_LINE:
+            self._reply(client, Reply(ok=False, text=f"a request has {MAX_LINE} bytes at most"))
+            self._drop(client)
+        elif data == b"" or now_ns - client.heard_ns > IDLE_NS:
+            self._drop(client)
+
+    def _act(self, client: _Client, line: bytes) -> None:
+        try:
+            request = _REQUEST.decode(line)
+        except msgspec.MsgspecError as error:  # of msgspec's own, a subclass of ValueError
+            self._reply(client, Reply(ok=False, text=f"not understood: {error}"))
+            return
+        if request.ask == "status":
+            self._reply(client, Reply(ok=True, text="", status=self._look()))
+            return
+        problem = request.problem() or self._misplaced(request)
+        if problem is not None:
+            self._reply(client, Reply(ok=False, text=problem))
+            return
+        command = Command(order=Order(request.ask), position_m=request.position_m)
+        if self._flight.order(command):
+            self._waiting.append((client, command))
+        else:
+            self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
+
+    def _misplaced(self, request: Request) -> str | None:
+        """In which coordinates a place is outside the limits; None if it is inside, or there is none."""
+        if request.position_m is None:
+            return None
+        config = self._config
+        found = outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        return "; ".join(problem.reason for problem in found) or None
+
+    def _reply(self, client: _Client, reply: Reply) -> None:
+        data = msgspec.json.encode(reply) + b"\n"
+        try:
+            sent = client.socket.send(data)
+        except OSError:
+            sent = 0
+        if sent < len(data):  # reads too slowly, or is gone
+            self._drop(client)
+
+    def _drop(self, client: _Client) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+            client.socket.close()
+
+
+@contextmanager
+def listening(folder: Path, name: str) -> Iterator[socket.socket]:
+    """The listening socket of a daemon, gone at the end.
+
+    Args:
+        folder: where it is; made if there is none.
+        name: of the daemon.
+
+    Raises:
+        UsageError: the folder is not ours alone, or the path too long.
+        VehicleTakenError: a daemon of this name is running.
+    """
+    _own(folder)
+    path = socket_path(folder, name)
+    listener = _listen(path, name)
+    try:
+        yield listener
+    finally:
+        listener.close()
+        path.unlink(missing_ok=True)
+
+
+def _own(folder: Path) -> None:
+    """See to a folder that only this user can enter."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; choose another folder with --control") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
+    if found.st_mode & 0o077:
+        raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
+
+
+def _listen(path: Path, name: str) -> socket.socket:
+    """Bind and listen; a socket that a dead daemon left is taken over."""
+    if path.is_socket():
+        if _alive(path):
+            raise VehicleTakenError(
+                f"{path}: a daemon named {name} is running; end it, or give this one another --set 'name=\"...\"'"
+            )
+        path.unlink(missing_ok=True)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(os.fspath(path))
+        path.chmod(0o600)
+        listener.listen(MAX_CLIENTS)
+    except OSError as error:
+        listener.close()
+        raise UsageError(f"{path}: {error.strerror}; choose another folder with --control") from error
+    listener.setblocking(False)
+    return listener
+
+
+def _alive(path: Path) -> bool:
+    """Whether somebody listens there."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(os.fspath(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except BlockingIOError:
+            return True  # its queue is full
+    return True

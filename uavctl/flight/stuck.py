@@ -1,0 +1,110 @@
+"""A source that says the same again and again with fresh stamps: is it stuck, or is the vehicle at rest?
+
+A value that comes again to the last bit proves nothing by itself: a vehicle on the ground, cameras that round, a world
+without noise. It counts as stuck where
+
+* the vehicle must have moved: from the moment at which the value first came, the inputs alone have carried the
+  prediction away by more than all that is uncertain and the source's resolution; or
+* chance must have moved it: by now disturbances spread the prediction over many times the source's resolution, and
+  what this source said was news so far. A world without noise brings no news, and is not held to that.
+
+The resolution is the smallest change that the source has shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uavctl.data import PositionSample, Vec3
+from uavctl.flight.estimator import History, belief_at, coasted
+from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, shown_by
+from uavctl.flight.reach import GateParameters
+
+FROZEN = "sample-frozen"
+
+_REPEATS = 3  # some sources send each value twice
+_MANY = 20.0  # resolutions that the prediction is spread over
+_NEWS = 0.5  # of a resolution: rounding alone makes no more
+_LEAST_NEWS_M = 2e-5  # nor do the numbers of a message, however large the room is; any camera's noise is more
+_SMOOTH = 0.1  # weight of a sample in the mean of what was news
+_SOURCES = 8  # that are watched at once
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """What a source has said.
+
+    Attributes:
+        at_ns: Capture time of its newest sample [ns].
+        position_m: What that said.
+        resolution_m: The smallest change of an axis so far [m]; 0 where there was none.
+        news_m: How far its samples are off the prediction, the older the less they count [m].
+        repeats: How often the value came again.
+        coasting: The belief that the value first gave, moved on by inputs alone; None without repeats.
+        found: Whether it was found to be stuck, which holds until it says something else.
+    """
+
+    at_ns: int
+    position_m: Vec3
+    resolution_m: float = 0.0
+    news_m: float = 0.0
+    repeats: int = 0
+    coasting: Belief | None = None
+    found: bool = False
+
+
+Watches = Mapping[str, Watch]
+
+
+def observe(watches: Watches, kalman: Kalman, history: History, sample: PositionSample, off_m: Array) -> Watches:
+    """What the sources have said, with one more sample; those that come late say nothing.
+
+    Args:
+        watches: Before.
+        kalman: The filter.
+        history: The estimator before the sample.
+        sample: The sample, valid.
+        off_m: Its positions minus those predicted.
+    """
+    at_ns, watch = captured_ns(sample), watches.get(sample.source)
+    if watch is None:
+        fewer = watches if len(watches) < _SOURCES else {}
+        return {**fewer, sample.source: Watch(at_ns=at_ns, position_m=sample.position_m)}
+    if at_ns <= watch.at_ns:
+        return watches
+    changes = [abs(new - old) for new, old in zip(sample.position_m, watch.position_m, strict=True)]
+    if not any(changes):
+        begun = watch.coasting or belief_at(kalman, history, watch.at_ns)
+        coasting = None if begun is None else coasted(kalman, history, begun, at_ns)
+        watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting)
+    else:
+        smallest = min(change for change in changes if change)
+        news_m = float(np.abs(off_m).max())
+        watch = Watch(
+            at_ns=at_ns,
+            position_m=sample.position_m,
+            resolution_m=min(smallest, watch.resolution_m) if watch.resolution_m else smallest,
+            news_m=watch.news_m + _SMOOTH * (news_m - watch.news_m),
+        )
+    return {**watches, sample.source: watch}
+
+
+def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
+    """Whether a source is stuck, as `observe` left it with its newest sample."""
+    belief = watch.coasting
+    if belief is None or watch.found:
+        return watch.found
+    n_axes = len(kalman.axes)
+    index = kalman.shown[:n_axes]
+    values, variances = shown_by(kalman, sample)
+    variance = np.diagonal(belief.cov)[index]
+    far_m = np.abs(belief.mean[index] - values[:n_axes])
+    doubt_m = parameters.sigma * np.sqrt(variance + variances[:n_axes]) + parameters.margin_m + watch.resolution_m
+    if (far_m > doubt_m).any():
+        return True
+    spread_m = float(np.sqrt(variance.max()))
+    noisy = bool(watch.resolution_m) and watch.news_m >= max(_LEAST_NEWS_M, _NEWS * watch.resolution_m)
+    return noisy and spread_m >= _MANY * watch.resolution_m and watch.repeats >= _REPEATS

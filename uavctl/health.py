@@ -1,0 +1,186 @@
+"""How a flight is doing, once a second: for a person, for `uavctl ctl status`, for the service manager."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import msgspec
+
+from uavctl.clock import Due
+from uavctl.config import Config
+from uavctl.config.mission_checks import position_index
+from uavctl.data import ControlMode, Decision, Estimate, LinkEstimate, Vector, VehicleStatus
+
+PERIOD_NS = 1_000_000_000
+
+
+class RecorderHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """Whether the recording is whole so far."""
+
+    ok: bool
+    dropped: int  # records that are not in it
+    reason: str  # why it is not, or that the disk gets low; empty if all is well
+    path: str
+
+
+class VehicleHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The vehicle, as its own messages tell."""
+
+    autopilot: str
+    mode: str
+    armed: bool
+    external: bool
+    landed: bool | None
+    battery_v: float | None
+    heard_s: float  # ago
+
+
+class Health(msgspec.Struct, frozen=True, kw_only=True):
+    """The flight at one moment; SI units, local NED, axes that the plant has not are left out."""
+
+    name: str
+    url: str
+    pid: int
+    running_s: float
+    mode: ControlMode | None  # None before the first tick
+    reason: str
+    age_s: float | None  # of the newest position
+    age_steps: int | None
+    position_m: dict[str, float] | None
+    velocity_mps: dict[str, float] | None
+    target_m: dict[str, float] | None
+    waypoint: int | None
+    loss: float | None  # share of the steps Δt without a position, as believed
+    lateness_us: float  # largest of the last second
+    missed_ticks: int  # since the start
+    vehicle: VehicleHealth | None
+    recorder: RecorderHealth
+
+
+class Flight(Protocol):
+    """What is looked at of a control loop."""
+
+    decision: Decision | None
+    estimate: Estimate | None
+    link: LinkEstimate | None
+    vehicle: VehicleStatus | None
+
+
+class HealthWatch:
+    """Watches the control loop from its own thread; looks are cheap and take no lock.
+
+    Args:
+        flight: the control loop.
+        config: its configuration.
+        name: of the daemon, url of its vehicle, pid of its process.
+        recorder: how the recording is doing.
+        tell: called with each second's line, from the control loop's thread: it must not wait.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        config: Config,
+        identity: tuple[str, str, int],
+        recorder: Callable[[], RecorderHealth],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._flight, self._identity, self._recorder, self._tell = flight, identity, recorder, tell
+        self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
+        speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
+        self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
+        self._begun_ns: int | None = None
+        self._now_ns = 0
+        self._told_ns = 0
+        self._missed = 0
+        self._worst_ns = 0  # of this second
+        self._worst_before_ns = 0  # of the last one
+        self._recording = "well"  # as last told
+
+    def after_tick(self, due: Due, lateness_ns: int) -> None:
+        """The control loop has run a tick."""
+        if self._begun_ns is None:
+            self._begun_ns = self._told_ns = due.at_ns
+        self._now_ns = due.at_ns
+        self._missed += due.missed
+        self._worst_ns = max(self._worst_ns, lateness_ns)
+        if due.at_ns - self._told_ns >= PERIOD_NS:
+            self._told_ns = due.at_ns
+            self._worst_before_ns, self._worst_ns = self._worst_ns, 0
+            health = self.look()
+            self._alarm(health.recorder)
+            self._tell(line(health))
+
+    def _alarm(self, recorder: RecorderHealth) -> None:
+        """Say once what has become of the recording, in a line of its own."""
+        now = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
+        if now == self._recording:
+            return
+        self._recording = now
+        why = recorder.reason or f"{recorder.dropped} records dropped"
+        self._tell("recording is well again" if now == "well" else f"warning: recording {now}: {why}")
+
+    def look(self) -> Health:
+        """The flight as it is now."""
+        flight, recorder = self._flight, self._recorder()
+        decision, estimate, vehicle, link = flight.decision, flight.estimate, flight.vehicle, flight.link
+        mean = None if estimate is None else estimate.mean
+        name, url, pid = self._identity
+        return Health(
+            name=name,
+            url=url,
+            pid=pid,
+            running_s=0.0 if self._begun_ns is None else (self._now_ns - self._begun_ns) * 1e-9,
+            mode=None if decision is None else decision.mode,
+            reason="waiting for the first tick" if decision is None else decision.reason,
+            age_s=None if estimate is None else max(0.0, (self._now_ns - estimate.captured_ns) * 1e-9),
+            age_steps=None if decision is None else decision.age_steps,
+            position_m=_along(self._axes, mean),
+            velocity_mps=_along(self._speed_axes, mean),
+            target_m=None if decision is None else _along(self._axes, decision.target),
+            waypoint=None if decision is None else decision.waypoint,
+            loss=None if link is None else 1.0 - link.arrival_mean,
+            lateness_us=max(self._worst_ns, self._worst_before_ns) * 1e-3,
+            missed_ticks=self._missed,
+            vehicle=None if vehicle is None else _vehicle(vehicle, self._now_ns),
+            recorder=recorder,
+        )
+
+
+def line(health: Health) -> str:
+    """One line for a log: the same fields in the same order, `-` for what is not known."""
+    vehicle = health.vehicle
+    battery = None if vehicle is None else vehicle.battery_v
+    mode = "-" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
+    fields = (
+        "-" if health.mode is None else health.mode.value,
+        f"age {_number(health.age_s, '.2f')} s",
+        f"loss {_number(None if health.loss is None else 100 * health.loss, '.0f')} %",
+        f"late {health.lateness_us / 1e3:.2f} ms",
+        f"missed {health.missed_ticks}",
+        f"vehicle {mode}",
+        f"battery {_number(battery, '.1f')} V",
+        f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
+    )
+    return "  ".join(fields)
+
+
+def _along(axes: tuple[tuple[str, int], ...], state: Vector | None) -> dict[str, float] | None:
+    return None if state is None else {axis: state[i] for axis, i in axes}
+
+
+def _vehicle(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
+    return VehicleHealth(
+        autopilot=vehicle.autopilot,
+        mode=vehicle.mode,
+        armed=vehicle.armed,
+        external=vehicle.external,
+        landed=vehicle.landed,
+        battery_v=vehicle.battery_v,
+        heard_s=max(0.0, (now_ns - vehicle.at_ns) * 1e-9),
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,1 @@
+"""What a recording tells of the vehicle and of the link: plant, lag, disturbance, losses and delays."""

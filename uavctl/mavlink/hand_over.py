@@ -1,0 +1,233 @@
+"""The hand-over from tick to tick: walks the table of `mode.py`, makes requests of the vehicle, tells what happens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+
+from uavctl.config.hand_over import HandOverConfig
+from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
+from uavctl.mavlink.mode import TRANSITIONS, Seen, Sending, State
+from uavctl.mavlink.request import Ask, Patience, Request
+from uavctl.mavlink.sight import ASKING, LEAVING, Progress, Sight, View, against_engaging, habits_of, look, silent
+
+LAND_TRIES = 5
+FOREVER_NS = 2**62
+_OVER = frozenset({State.DONE, State.FAILED})
+_ON_THE_GROUND = frozenset({State.MODE, State.ARMING})
+_PLAIN = frozenset(State) - {State.RELEASED, State.LANDING, State.FAILED}
+_PROMISES = {
+    Order.TAKE_OFF: "will take off",
+    Order.ENGAGE: "asks for the mode that takes setpoints",
+    Order.STAND_BY: "leaves a vehicle alone that is found armed",
+}
+HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a tick makes of it.
+
+    Attributes:
+        sending: What may be streamed.
+        ask: What to ask the vehicle for now, if anything.
+        events: What there is to tell.
+    """
+
+    sending: Sending
+    ask: Ask | None = None
+    events: tuple[Event, ...] = ()
+
+
+class HandOver:
+    """Who flies one vehicle.
+
+    Args:
+        config: Times and bounds.
+        sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle
+            lands by the positions that it gets from here.
+
+    Attributes:
+        failure: Why a request failed; empty while none has.
+    """
+
+    def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
+        self._config = HandOverConfig() if config is None else config
+        self._now = Progress(config=self._config, request=Request(None, 0, self._patience(State.WAITING)))
+        self._sees_it_down = sees_it_down
+        self._landed_ns: int | None = None  # since when it stands on the ground, armed
+        self._disarms = False
+        self._silent = False
+        self.failure = ""
+
+    @property
+    def state(self) -> State:
+        """Place in the table."""
+        return self._now.state
+
+    @property
+    def ours(self) -> bool:
+        """Whether this flight was begun by an order to take off."""
+        return self._now.ordered_ns is not None
+
+    @property
+    def height_m(self) -> float:
+        """Height of the climb that was ordered [m]."""
+        return self._now.height_m
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing more will be sent, whatever comes."""
+        return self.state in _OVER
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer of the vehicle is waited for."""
+        return self.state in ASKING or (self.state is State.SETTLING and (self.ours or self._sees_it_down))
+
+    def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
+        """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
+        if vehicle is None or silent(at_ns, vehicle):
+            return None
+        if self.state in (State.WAITING, State.READY) and not self._now.stands_by:
+            return vehicle
+        if self.state is State.ENGAGED:
+            past = self._now.shows_the_past(vehicle)
+            return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
+        return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
+
+    def has_left(self, vehicle: VehicleStatus) -> bool:
+        """Whether a heartbeat says that the vehicle is no longer in the external mode."""
+        return not (vehicle.external and vehicle.armed) and not self._now.shows_the_past(vehicle)
+
+    def update(self, view: View) -> Told:
+        """Decide what one tick may send, and what it asks the vehicle for."""
+        now, before = self._now, self.state
+        for message in view.heard:
+            now.request.hear(message, view.at_ns)
+        events = self._take_orders(view)
+        if now.heard_ns is None and view.vehicle is not None:
+            now.heard_ns = view.at_ns
+        sight = look(now, view)
+        now.boots = 0 if view.vehicle is None else view.vehicle.boots
+        now.state, sending = TRANSITIONS[before, sight.seen]
+        if now.state is not before:
+            self._enter(before, sight, view)
+        if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
+            sending = Sending.NOTHING
+        self._see_to_disarming(view)
+        ask = now.request.due(view.at_ns, view.unfit if now.state in _ON_THE_GROUND else "")
+        if now.state is State.FAILED and before is State.ARMING:
+            ask = Ask.DISARM  # arming may have been granted after all
+        return Told(sending, ask, (*events, *self._tell(view, before, sight)))
+
+    def _take_orders(self, view: View) -> list[Event]:
+        events = []
+        for command in view.commands:
+            if command.order not in _PROMISES:
+                continue
+            refused = self._against(command, view)
+            if not refused and command.order is Order.TAKE_OFF:
+                self._now.ordered_ns, self._now.height_m = view.at_ns, command.height_m or 0.0
+            elif not refused and command.order is Order.STAND_BY:
+                self._now.stands_by, self._now.flown_ns = True, command.flown_ns
+            code, severity = (ORDER_REFUSED, Severity.WARNING) if refused else (ORDER_ACCEPTED, Severity.INFO)
+            text = refused or _PROMISES[command.order]
+            events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
+        return events
+
+    def _against(self, command: Command, view: View) -> str:
+        """Why an order is refused; empty if it is taken."""
+        if command.order is Order.ENGAGE:
+            return against_engaging(self.state, view)
+        if command.order is Order.STAND_BY:
+            return "" if self.state is State.WAITING else f"the vehicle has been heard; now: {self.state}"
+        if not (command.height_m or 0.0) > 0.0:
+            return f"a climb to {command.height_m} m is none"
+        early = self.state in (State.WAITING, State.READY) and not self.ours
+        return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
+
+    def _may_warm_up(self, view: View) -> bool:
+        """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
+        if self.state not in LEAVING or view.vehicle is None:
+            return True
+        return habits_of(view.vehicle).climbs_on_arming
+
+    def _enter(self, before: State, sight: Sight, view: View) -> None:
+        now = self._now
+        now.since_ns, now.stands_by = view.at_ns, False
+        now.request = Request(self._ask(view), view.at_ns, self._patience(now.state))
+        if now.state is State.ARMING:
+            now.ground_up_m = view.up_m
+        if now.state is State.RETURNING and view.vehicle is not None:
+            now.left_mode = view.vehicle.mode
+        if sight.granted_ns is not None:
+            now.granted_ns = sight.granted_ns
+        elif now.state not in (State.CLIMBING, State.ENGAGING):
+            now.granted_ns = None
+        if before is not State.RETURNING:
+            self.failure = self.failure or sight.why
+
+    def _ask(self, view: View) -> Ask | None:
+        climbs = view.vehicle is not None and habits_of(view.vehicle).climbs_on_arming
+        external = view.vehicle is not None and view.vehicle.external
+        asks = {
+            State.MODE: Ask.TAKE_OFF_MODE,
+            State.ARMING: Ask.ARM,
+            State.CLIMBING: None if climbs else Ask.TAKE_OFF,
+            State.ENGAGING: None if external else Ask.EXTERNAL_MODE,
+            State.RETURNING: None if external else Ask.EXTERNAL_MODE,
+            State.LANDING: Ask.LAND,
+        }
+        return asks.get(self.state)
+
+    def _patience(self, state: State) -> Patience:
+        c = self._config
+        limits_s = {
+            State.MODE: c.ground_s,
+            State.ARMING: c.ground_s,
+            State.CLIMBING: c.climb_s,
+            State.ENGAGING: c.engage_s,
+            State.RETURNING: c.engage_s,
+            State.LANDING: c.land_s,
+            State.SETTLING: c.land_s,
+        }
+        limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
+        if state is State.LANDING:
+            return Patience(_ns(c.answer_s), _ns(c.answer_s), LAND_TRIES, limit_ns)
+        # In the air there is no time for long pauses.
+        retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
+        return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
+
+    def _see_to_disarming(self, view: View) -> None:
+        """A vehicle that stands on the ground after a flight of ours and stays armed is asked to disarm."""
+        vehicle = view.vehicle
+        if not (self.ours and self.state is State.SETTLING and vehicle is not None and vehicle.landed):
+            self._landed_ns = None
+        elif self._landed_ns is None:
+            self._landed_ns = view.at_ns
+        elif not self._disarms and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
+            self._disarms = True
+            self._now.request = Request(Ask.DISARM, view.at_ns, self._patience(State.SETTLING))
+
+    def _tell(self, view: View, before: State, sight: Sight) -> list[Event]:
+        events = []
+        silence = self.state is State.ENGAGED and sight.seen is Seen.SILENCE
+        if silence != self._silent:
+            self._silent = silence
+            text = "heartbeat lost: braking and holding" if silence else "heartbeat is back"
+            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
+        if self.state is not before:
+            vehicle = view.vehicle
+            mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
+            severity = Severity.INFO if self.state in _PLAIN else Severity.WARNING
+            text = f"{before} -> {self.state}{mode}"
+            events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
+            if sight.why:
+                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.why))
+        return events
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

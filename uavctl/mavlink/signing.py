@@ -1,0 +1,171 @@
+"""MAVLink 2 signing, sans IO: who holds the key, and whether a frame is newer than the last one.
+
+Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked at,
+so that who has not the key changes nothing here: with the other order one forged frame with a stamp from the future
+locks the true peer out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.mavlink.framing import CHECKSUM, with_checksum
+
+KEY_BYTES = 32
+EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
+UNIT_NS = 10_000  # of a stamp
+NEWEST_STAMP = 2**48 - 1
+FIRST_BEHIND = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
+MAX_STREAMS = 64  # of one key; a flight has a handful
+SIGNATURE = int(mavlink.MAVLINK_SIGNATURE_BLOCK_LEN)
+_HASH = 6
+_FLAGS = 2  # index of the incompatibility flags
+_SIGNED = int(mavlink.MAVLINK_IFLAG_SIGNED)
+
+Stream = tuple[int, int, int]
+"""(system, component, link id)"""
+
+
+class Refusal(StrEnum):
+    """Why a frame is not taken."""
+
+    FORGED = "forged"  # made without the key, or damaged
+    REPLAYED = "replayed"  # not newer than the newest of its stream, or than all before the start
+    STALE = "stale"  # begins a stream more than a minute behind
+    LINK_ID = "link-id"  # another link's, carried over to this one
+    STREAMS = "streams"  # one stream too many
+
+
+class SigningKey:
+    """32 secret bytes that no text of the object shows.
+
+    Raises:
+        ValueError: not 32 bytes, or all zero, which means "no key" to a vehicle.
+    """
+
+    __slots__ = ("_seed", "name")
+
+    def __init__(self, secret: bytes) -> None:
+        if len(secret) != KEY_BYTES or not any(secret):
+            raise ValueError(f"a key is {KEY_BYTES} bytes, not all zero")
+        self._seed = hashlib.sha256(secret)
+        #: says which key it is, and nothing of its bytes
+        self.name = hashlib.sha256(b"uavctl: name of a key" + secret).hexdigest()[:16]
+
+    def __repr__(self) -> str:
+        return f"SigningKey({self.name})"
+
+    def hash(self, data: bytes) -> bytes:
+        """First 48 bits of SHA-256 over key and data."""
+        state = self._seed.copy()
+        state.update(data)
+        return state.digest()[:_HASH]
+
+
+@dataclass
+class Stamps:
+    """Stamps of one key.
+
+    Attributes:
+        floor: newest of all before the start; it has to be kept, so that nothing older is taken ever again.
+        own: newest that was sent or verified since, on any connection.
+        streams: newest that was verified of each stream.
+    """
+
+    floor: int = 0
+    own: int = 0
+    streams: dict[Stream, int] = field(default_factory=dict)
+
+
+class Signing:
+    """Signs and verifies the frames of one connection.
+
+    Args:
+        key: the secret that is shared with the peers.
+        link_id: ours, on this connection.
+        stamps: of this key; shared by all connections, so that a frame of one is none of another.
+        wall_offset_ns: wall clock (UTC, since 1970) − the clock of `at_ns`. It is read once: a step of the wall clock
+            during a flight has no effect.
+        peer_link_ids: link ids that peers may use; none takes the first of each (system, component).
+    """
+
+    def __init__(
+        self,
+        key: SigningKey,
+        link_id: int,
+        stamps: Stamps,
+        wall_offset_ns: int,
+        peer_link_ids: frozenset[int] = frozenset(),
+    ) -> None:
+        self._key, self._link_id, self._stamps = key, link_id, stamps
+        self._offset_ns = wall_offset_ns
+        self._peer_link_ids = peer_link_ids
+        self._links: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
+
+    def sign(self, frame: bytes, at_ns: int) -> bytes:
+        """An unsigned frame of MAVLink 2 with flag, checksum and signature; each stamp is larger than the last."""
+        self._stamps.own = min(max(self._now(at_ns), self._stamps.own + 1), NEWEST_STAMP)
+        body = bytearray(frame[:-CHECKSUM])
+        body[_FLAGS] |= _SIGNED
+        signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._stamps.own.to_bytes(6, "little")
+        return signed + self._key.hash(signed)
+
+    def verify(self, frame: bytes, at_ns: int) -> Refusal | None:
+        """Whether to take a frame that has a signature; None takes it, and none of its kind that is older.
+
+        Args:
+            frame: the whole frame, signature included; its checksum is covered by the hash.
+            at_ns: time of arrival.
+        """
+        if not hmac.compare_digest(self._key.hash(frame[:-_HASH]), frame[-_HASH:]):
+            return Refusal.FORGED
+        address, link_id = (frame[5], frame[6]), frame[-SIGNATURE]
+        stamp = int.from_bytes(frame[-SIGNATURE + 1 : -_HASH], "little")
+        if not self._expects(address, link_id):
+            return Refusal.LINK_ID
+        refusal = self._too_old((*address, link_id), stamp, at_ns)
+        if refusal is None:
+            self._links.setdefault(address, link_id)
+            self._stamps.streams[*address, link_id] = stamp
+            self._stamps.own = max(self._stamps.own, stamp)
+        return refusal
+
+    def _expects(self, address: tuple[int, int], link_id: int) -> bool:
+        if self._peer_link_ids:
+            return link_id in self._peer_link_ids
+        return self._links.get(address) in (None, link_id)
+
+    def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> Refusal | None:
+        newest = self._stamps.streams.get(stream)
+        if newest is not None:
+            return Refusal.REPLAYED if stamp <= newest else None
+        if stamp <= self._stamps.floor:
+            return Refusal.REPLAYED
+        if len(self._stamps.streams) >= MAX_STREAMS:
+            return Refusal.STREAMS
+        ours = max(self._now(at_ns), self._stamps.own)
+        return Refusal.STALE if stamp + FIRST_BEHIND < ours else None
+
+    def _now(self, at_ns: int) -> int:
+        return stamp_at(at_ns + self._offset_ns)
+
+
+def stamp_at(wall_ns: int) -> int:
+    """The stamp of a time of the wall clock (UTC, since 1970) [ns]."""
+    return max(0, (wall_ns - EPOCH_NS) // UNIT_NS)
+
+
+def without_signature(frame: bytes) -> bytes:
+    """A signed frame as it would be without: what recordings hold, since signatures help to guess a key.
+
+    Raises:
+        KeyError: its message id is unknown to the dialect, so that it has no checksum without its signature.
+    """
+    body = bytearray(frame[:-SIGNATURE][:-CHECKSUM])
+    body[_FLAGS] &= ~_SIGNED
+    return with_checksum(bytes(body))

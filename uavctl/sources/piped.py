@@ -1,0 +1,151 @@
+"""The daemon's end of a process that listens to cameras."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
+
+from uavctl.errors import ConnectionSpecError
+from uavctl.sources.natnet_url import SCHEME, NatNetUrl, parse
+from uavctl.sources.pipe import ANSWER_S, COUNTS, LARGEST, READY, REFUSED
+from uavctl.transport import Connection, Rules
+from uavctl.transport.base import Base
+from uavctl.transport.rules import TOO_MANY, AllowList, RateCap
+
+_MAVLINK = (0xFD, 0xFE)
+_START_S = 20.0  # for the interpreter of the process, on a busy computer
+_END_S = 2.0
+
+
+class Piped(Base):
+    """A process that gives MAVLink; see `uavctl.sources`. Implements `uavctl.transport.Connection`.
+
+    When the process ends, the connection shows as `closed`; while only its server is gone it asks on, and nothing
+    comes.
+
+    Args:
+        url: of the source.
+        arguments: of `uavctl.sources.host`, without the pipe.
+        now: clock for the times of arrival [ns].
+        rules: how many messages a second are taken.
+    """
+
+    def __init__(self, url: str, arguments: list[str], now: Callable[[], int], rules: Rules) -> None:
+        super().__init__(url, now)
+        self._cap, self._sender = RateCap(rules.max_per_s), (url, 0)
+        self._too_many = 0
+        self._theirs: Counter[str] = Counter()  # what the process counted
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            command = [sys.executable, "-P", "-m", "uavctl.sources.host", str(theirs.fileno()), *arguments]
+            try:
+                self._process = subprocess.Popen(
+                    command,
+                    pass_fds=(theirs.fileno(),),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    start_new_session=True,  # an interrupt is for the daemon; this process ends with the pipe
+                )
+            except OSError as error:  # no memory, or too many processes
+                self._socket.close()
+                raise ConnectionSpecError(f"connection {url!r}: its process cannot be started ({error})") from error
+
+    def wait_until_ready(self) -> None:
+        """Wait, for a bounded time, until the cameras have answered and know the body.
+
+        Raises:
+            ConnectionSpecError: they did not; its cause is an OSError where the server cannot be reached.
+        """
+        self._socket.settimeout(_START_S + ANSWER_S)
+        try:
+            while (first := self._socket.recv(LARGEST))[:1] == COUNTS:
+                pass
+        except OSError as error:
+            raise ConnectionSpecError(f"connection {self.url!r}: its process does not start ({error})") from error
+        self._socket.setblocking(False)
+        kind, text = first[:1], first[1:].decode()
+        if kind == REFUSED:
+            raise ConnectionSpecError(f"connection {self.url!r}: {text}")
+        if kind != READY:
+            advice = (
+                "does Motive run there, is NatNet enabled in its streaming settings, and does no firewall block it?"
+            )
+            raise ConnectionSpecError(
+                f"connection {self.url!r}: {text or 'its process has ended'}; {advice}"
+            ) from TimeoutError(text)
+
+    def fileno(self) -> int:
+        """See `Connection`."""
+        return self._socket.fileno()
+
+    def receive(self) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the cap allows is dropped, the oldest first."""
+        arrived = super().receive()
+        taken = self._cap.take([self._sender] * len(arrived), self._now())
+        self._too_many += taken.count(False)
+        self.refused = self._theirs + Counter({TOO_MANY: self._too_many})
+        return [one for one, fits in zip(arrived, taken, strict=True) if fits]
+
+    def send(self, data: bytes) -> None:
+        """See `Connection`; only questions for the time go on to the cameras."""
+        try:
+            self._socket.send(data)
+        except OSError:
+            self.send_errors += 1
+
+    def close(self) -> None:
+        """See `Connection`; the process ends."""
+        self.closed = True
+        self._socket.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _read(self) -> bytes | None:
+        data = self._socket.recv(LARGEST)
+        if not data:
+            self.closed = True
+        elif data[0] in _MAVLINK:
+            return data
+        elif data[:1] == COUNTS:
+            self._theirs = Counter(json.loads(data[1:]))
+        return None
+
+
+def open_natnet(url: str, now: Callable[[], int], rules: Rules) -> Connection:
+    """Open a rigid body of an OptiTrack system; see `uavctl.sources.open_source`.
+
+    Raises:
+        ConnectionSpecError: the URL, the package, the server or the body is not as it has to be.
+    """
+    place = parse(url)
+    if find_spec(SCHEME) is None:
+        raise ConnectionSpecError(
+            f"connection {url!r} needs the package natnet, which is not installed; run: pip install 'uavctl[optitrack]'"
+        )
+    address = _resolve(url, place)
+    if not AllowList(rules.allow).lets_in(address):
+        raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
+    piped = Piped(url, [address, str(place.port), place.body, place.up, place.interface], now, rules)
+    with ExitStack() as stack:
+        stack.callback(piped.close)
+        piped.wait_until_ready()
+        stack.pop_all()
+    return piped
+
+
+def _resolve(url: str, place: NatNetUrl) -> str:
+    try:
+        return socket.gethostbyname(place.host)
+    except OSError as error:
+        raise ConnectionSpecError(
+            f"connection {url!r}: host {place.host!r} is unknown ({error}); check the name"
+        ) from error

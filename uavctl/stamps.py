@@ -1,0 +1,132 @@
+"""The newest stamp of a signing key on the disk, so that no restart takes an old frame.
+
+One number for each key is enough: after a start nothing is taken that is not newer. What is written lies a little
+ahead of what was seen, so that whatever a killed process has taken or sent is below it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from uavctl.errors import KeyFileError
+from uavctl.mavlink.signing import NEWEST_STAMP, Stamps
+
+AHEAD = 200_000  # units of 10 µs: written ahead of what was seen, 2 s
+RENEW = 100_000  # written anew when less than this is left
+PERIOD_S = 0.25
+
+
+def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where stamps are kept: systemd's state directory, else the user's."""
+    systemd, xdg = environment.get("STATE_DIRECTORY"), environment.get("XDG_STATE_HOME")
+    if systemd:
+        return Path(systemd.partition(":")[0])
+    return (Path(xdg) if xdg else Path("~/.local/state").expanduser()) / "uavctl"
+
+
+def load(path: Path) -> int:
+    """The stamp in a file; 0 if there is no file.
+
+    Raises:
+        KeyFileError: it cannot be read, or is damaged.
+    """
+    try:
+        text = path.read_text(encoding="ascii")
+        stamp = int(text)
+    except FileNotFoundError:
+        return 0
+    except OSError as error:
+        raise KeyFileError(f"stamp {path}: {error.strerror}; see to the folder's permissions") from error
+    except ValueError as error:
+        raise KeyFileError(
+            f"stamp {path}: holds no number; remove the file, and share a new key, since frames of the old one could "
+            "be replayed"
+        ) from error
+    if not 0 <= stamp <= NEWEST_STAMP:
+        raise KeyFileError(f"stamp {path}: {stamp} does not fit into 48 bits; remove the file, and share a new key")
+    return stamp
+
+
+def save(path: Path, stamp: int) -> None:
+    """Write a stamp, whole or not at all; a larger one that is there stays, whoever wrote it.
+
+    Raises:
+        OSError: it cannot be written.
+        KeyFileError: what is there is damaged.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with path.with_suffix(".lock").open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        draft = path.with_suffix(".new")
+        with draft.open("w", encoding="ascii") as file:
+            file.write(f"{max(stamp, load(path))}\n")
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+class StampKeeper:
+    """Writes the newest stamp to a file from a thread of its own, while a flight goes on.
+
+    A disk that fails does not stop the flight: `failure` says so.
+
+    Args:
+        path: file of the key's stamp.
+        now: the stamp of the start; it is on the disk before anything is taken or sent.
+        write: puts a stamp on the disk.
+
+    Attributes:
+        stamps: for the connections, which keep them up to date.
+        failure: why the newest stamp is not on the disk; None if it is.
+
+    Raises:
+        KeyFileError: the file cannot be read or written.
+    """
+
+    def __init__(self, path: Path, now: int, write: Callable[[Path, int], None] = save) -> None:
+        self._path, self._write = path, write
+        floor = load(path)
+        self.stamps = Stamps(floor=floor, own=max(floor, now))
+        self._written = min(self.stamps.own + AHEAD, NEWEST_STAMP)
+        try:
+            write(path, self._written)
+        except OSError as error:
+            raise KeyFileError(
+                f"stamp {path}: {error.strerror}, so that a restart would take old frames again; see to the folder"
+            ) from error
+        self.failure: str | None = None
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="stamps", daemon=True)
+        self._thread.start()
+
+    def renew(self) -> None:
+        """Write ahead of all that has been seen, if what is written will not last."""
+        seen = self.stamps.own
+        if seen + RENEW <= self._written:
+            return
+        ahead = min(seen + AHEAD, NEWEST_STAMP)
+        try:
+            self._write(self._path, ahead)
+        except (OSError, KeyFileError) as error:
+            self.failure = str(error)
+        else:
+            self._written, self.failure = ahead, None
+
+    def close(self) -> None:
+        """Write once more, and end."""
+        self._done.set()
+        self._thread.join()
+        self.renew()
+
+    def _run(self) -> None:
+        while not self._done.wait(PERIOD_S):
+            self.renew()

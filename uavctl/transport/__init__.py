@@ -1,0 +1,100 @@
+"""Connections by URL: the only sockets and serial ports.
+
+    udpin://HOST:PORT         bind; send to the peer that is heard
+    udpout://HOST:PORT        send to HOST:PORT, hear its answers
+    tcp://HOST:PORT           connect
+    serial:///dev/NAME:BAUD   open a serial port
+
+Nothing here raises once a connection is open: errors are counted, a lost connection shows as `closed`.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import time
+from collections.abc import Callable, Mapping
+from typing import cast
+from urllib.parse import urlsplit
+
+from uavctl.errors import ConnectionSpecError
+from uavctl.transport.base import Connection as Connection
+from uavctl.transport.rules import Address
+from uavctl.transport.rules import Rules as Rules
+from uavctl.transport.streams import SerialConnection, Tcp
+from uavctl.transport.udp import PEER_SILENCE_NS as PEER_SILENCE_NS
+from uavctl.transport.udp import UdpIn, UdpOut
+
+FORMS = "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///dev/NAME:BAUD"
+ANYBODY = Rules()
+
+
+def open_connection(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rules = ANYBODY) -> Connection:
+    """Open a connection.
+
+    Args:
+        url: see the module's page.
+        now: clock for the times of arrival [ns].
+        rules: who may speak, and how much (UDP; a stream has one peer, and its flow control).
+
+    Raises:
+        ConnectionSpecError: the URL cannot be understood or opened; says what to do.
+    """
+    scheme, separator, rest = url.partition("://")
+    if not separator or scheme not in ("udpin", "udpout", "tcp", "serial"):
+        raise ConnectionSpecError(f"connection {url!r} has no known form; write {FORMS}")
+    if scheme == "serial":
+        return SerialConnection(url, *_device_and_baud(url, rest), now)
+    kind = socket.SOCK_STREAM if scheme == "tcp" else socket.SOCK_DGRAM
+    family, address = _resolve(url, kind)
+    if scheme == "udpin":
+        return UdpIn(url, family, address, now, rules)
+    if scheme == "udpout":
+        return UdpOut(url, family, address, now, rules)
+    return Tcp(url, family, address, now)
+
+
+def wait(
+    connections: Mapping[str, Connection], deadline_ns: int, now: Callable[[], int] = time.monotonic_ns
+) -> list[str]:
+    """Sleep until something can be read or the deadline has come.
+
+    Args:
+        connections: open connections by name; closed ones are passed over.
+        deadline_ns: absolute monotonic time.
+        now: the clock [ns].
+
+    Returns:
+        Names of the connections to read, none if the deadline came first.
+    """
+    # select() takes microseconds; epoll would round the deadline up to a millisecond.
+    with selectors.SelectSelector() as selector:
+        for name, connection in connections.items():
+            if not connection.closed:
+                selector.register(connection, selectors.EVENT_READ, name)
+        ready = selector.select(max(0.0, (deadline_ns - now()) * 1e-9))
+    return [str(key.data) for key, _ in ready]
+
+
+def _resolve(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ConnectionSpecError(f"connection {url!r}: {error}; write {FORMS}") from error
+    if not host or port is None or parts.path or parts.query or parts.fragment:
+        raise ConnectionSpecError(f"connection {url!r} needs a host and a port and nothing else; write {FORMS}")
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=kind)[0]
+    except OSError as error:
+        raise ConnectionSpecError(f"connection {url!r}: host {host!r} is unknown ({error}); check the name") from error
+    return family, cast(Address, address)  # (int, bytes) only for families that were not asked for
+
+
+def _device_and_baud(url: str, rest: str) -> tuple[str, int]:
+    device, separator, baud = rest.rpartition(":")
+    if not separator or not device.startswith("/") or not baud.isdecimal() or int(baud) == 0:
+        raise ConnectionSpecError(
+            f"connection {url!r} needs a device and a baud rate; write serial:///dev/ttyUSB0:921600"
+        )
+    return device, int(baud)
