@@ -39,9 +39,10 @@ def place(telemetry: Telemetry) -> tuple[float, float, float]:
     return at.north_m, at.east_m, at.down_m
 
 
-def speed(telemetry: Telemetry) -> float:
-    """Northward speed as telemetry has it."""
-    return float(telemetry.position_velocity_ned().velocity.north_m_s)
+def northward(telemetry: Telemetry) -> tuple[float, float]:
+    """Position [m] and velocity [m/s] of one message."""
+    motion = telemetry.position_velocity_ned()
+    return motion.position.north_m, motion.velocity.north_m_s
 
 
 def fly(url: str) -> dict[str, Any]:
@@ -88,14 +89,14 @@ def fly(url: str) -> dict[str, Any]:
 
     offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     time.sleep(1.0)
-    before = speed(telemetry)
+    seen["began"] = northward(telemetry)
     offboard.set_acceleration_ned(AccelerationNed(0.5, 0.0, 0.0))
     time.sleep(2.0)
-    seen["gained_mps"] = speed(telemetry) - before
+    seen["ended"] = northward(telemetry)
     offboard.set_acceleration_ned(AccelerationNed(-0.5, 0.0, 0.0))
     time.sleep(1.5)
     offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
-    wait("a stop", lambda: abs(speed(telemetry)) < 0.15)
+    wait("a stop", lambda: abs(northward(telemetry)[1]) < 0.15)
     if seen["version"] == 1:
         offboard.stop()
         wait("hold", lambda: telemetry.flight_mode().name == "HOLD")

@@ -40,6 +40,11 @@ def distance(motion: Any, to: tuple[float, float, float]) -> float:
     return math.dist((at.north_m, at.east_m, at.down_m), to)
 
 
+def northward(motion: Any) -> tuple[float, float]:
+    """Position [m] and velocity [m/s] of one message."""
+    return motion.position.north_m, motion.velocity.north_m_s
+
+
 async def fly(url: str, port: int) -> dict[str, Any]:
     """Connect, look, arm, climb, fly offboard, land; what was seen."""
     seen: dict[str, Any] = {}
@@ -72,10 +77,10 @@ async def fly(url: str, port: int) -> dict[str, Any]:
 
     await drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     await asyncio.sleep(1.0)
-    before = (await first("speed", tell.position_velocity_ned())).velocity.north_m_s
+    seen["began"] = northward(await first("speed", tell.position_velocity_ned()))
     await drone.offboard.set_acceleration_ned(AccelerationNed(0.5, 0.0, 0.0))
     await asyncio.sleep(2.0)
-    seen["gained_mps"] = (await first("speed", tell.position_velocity_ned())).velocity.north_m_s - before
+    seen["ended"] = northward(await first("speed", tell.position_velocity_ned()))
     await drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     await first("a stop", tell.position_velocity_ned(), lambda one: abs(one.velocity.north_m_s) < 0.15)
 
