@@ -25,7 +25,7 @@ class Onlookers:
 
     Args:
         views: makes the messages for viewers; None: there are none.
-        watch: is given definition, log time [ns] and bytes of each message before it is written;
+        watch: is given definition, log time [ns] and bytes of each message, soon after its record was taken;
             returns at once and raises nothing.
 
     Attributes:

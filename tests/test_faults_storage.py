@@ -58,7 +58,6 @@ def assert_segments_begin_once(path: Path) -> None:
 
 
 @pytest.mark.fault(29)
-@pytest.mark.fault(29)
 @pytest.mark.parametrize("again_after", [0, 1, 2, 3, 4, 5])
 def test_29_disk_full_at_every_operation_loses_nothing(tmp_path: Path, again_after: int) -> None:
     items = flight(COUNT)
@@ -81,7 +80,6 @@ def test_29_disk_full_at_every_operation_loses_nothing(tmp_path: Path, again_aft
     assert number > 20
 
 
-@pytest.mark.fault(29)
 @pytest.mark.fault(29)
 def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
     items = flight(COUNT)
@@ -108,7 +106,6 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
         assert_segments_begin_once(path)
 
 
-@pytest.mark.fault(29)
 @pytest.mark.fault(29)
 def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
@@ -170,7 +167,6 @@ class _SlowFile(DiskFile):
         super().write(data)
 
 
-@pytest.mark.fault(30)
 @pytest.mark.fault(30)
 def test_30_slow_disk_never_holds_up_the_caller(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
@@ -278,7 +274,6 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault(32)
-@pytest.mark.fault(32)
 def test_32_damage_between_the_chunks_is_refused_after_all_messages(tmp_path: Path) -> None:
     path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     items = record_flight(path, 30)
@@ -301,7 +296,6 @@ def test_32_damage_between_the_chunks_is_refused_after_all_messages(tmp_path: Pa
             assert result.lossless or chunk is summary.chunk_indexes[-1]
 
 
-@pytest.mark.fault(32)
 @pytest.mark.fault(32)
 def test_32_damaged_last_chunk_of_an_unfinished_file_is_no_torn_end(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"

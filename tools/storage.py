@@ -2,9 +2,11 @@
 
 `python tools/storage.py --scenario kill --runs 1000`: recording processes, fed faster than real time, are killed
 (SIGKILL) at random moments; what they left is recovered, and compared record by record with what was put. Nothing but
-the open chunk may be lost, beside what the writing thread had not yet taken from its queue.
+the open chunk may be lost, beside what was put since the writing thread last began a round.
 `python tools/storage.py --scenario flip`: each byte of a small recording, finished and torn, is flipped. It must be
 refused, or recovered, and never give a wrong value, nor a recovered file whose index or statistics are wrong.
+`python tools/storage.py --scenario cost --runs 5 --seconds 60`: a flight's records are put tick by tick in real time,
+and the time is taken that this costs the thread that flies, beside a sink that does nothing; medians of the runs.
 
 Exit code 1 where something was wrong.
 """
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import statistics
 import sys
 import tempfile
 import time
@@ -23,22 +26,29 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the process is forked, so it may have no threads
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from flip_rig import Flips  # the tests' own
+from cost_rig import cost, flown_ticks  # the tests' own
+from flip_rig import Flips
 from kill_rig import KINDS, LOG, Killed, kill_once, truth
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do it, and say whether all was well."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", choices=("kill", "flip"), default="kill")
-    parser.add_argument("--runs", type=int, default=1000, help="kills")
+    parser.add_argument("--scenario", choices=("kill", "flip", "cost"), default="kill")
+    parser.add_argument("--runs", type=int, default=1000, help="kills, or measurements")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of a measurement")
     parser.add_argument("--first", type=int, default=0, help="seed of the first kill")
     parser.add_argument("--json", action="store_true", help="figures as JSON, one document")
     given = parser.parse_args(arguments)
-    if given.runs < 1 or given.first < 0:
-        parser.error("give at least one run, and a first seed of 0 or more")
+    if given.runs < 1 or given.first < 0 or given.seconds < 1.0:
+        parser.error("give at least one run of a second or more, and a first seed of 0 or more")
     begun = time.monotonic()
-    wrong, report = _flips() if given.scenario == "flip" else _kills(given.first, given.runs)
+    if given.scenario == "flip":
+        wrong, report = _flips()
+    elif given.scenario == "cost":
+        wrong, report = _costs(given.runs, given.seconds)
+    else:
+        wrong, report = _kills(given.first, given.runs)
     document = {**report, "wrong": wrong, "wall_s": round(time.monotonic() - begun, 1)}
     sys.stdout.write(json.dumps(document, indent=None if given.json else 2) + "\n")
     return 1 if wrong else 0
@@ -64,7 +74,7 @@ def _figures(found: Sequence[Killed]) -> dict[str, int]:
         "records_put": sum(one.put for one in found),
         "records_kept": sum(one.kept for one in found),
         "most_lost_bytes": max((one.lost_bytes for one in found), default=0),
-        "most_queued_records": max((one.queued for one in found), default=0),
+        "most_since_records": max((one.since for one in found), default=0),
         "most_files": max((one.files for one in found), default=0),
     }
 
@@ -87,6 +97,18 @@ def _flips() -> tuple[dict[str, str], dict[str, object]]:
                     wrong[f"{state}, byte {position}"] = repr(error)
             report[state] = {"bytes": len(flips.data), "refused": refused}
     return wrong, report
+
+
+def _costs(runs: int, seconds: float) -> tuple[dict[str, str], dict[str, object]]:
+    ticks = flown_ticks()
+    found: list[dict[str, float]] = []
+    for _ in range(runs):
+        with tempfile.TemporaryDirectory(prefix="uavctl-cost-") as folder:
+            found.append(cost(Path(folder), ticks, seconds))
+        _tell(f"{len(found)} of {runs}")
+    wrong = {str(number): "records dropped" for number, one in enumerate(found) if one["dropped"]}
+    report = {key: round(statistics.median(one[key] for one in found), 2) for key in found[0]}
+    return wrong, {"runs": runs, "seconds": seconds, **report}
 
 
 def _tell(text: str) -> None:
