@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections import Counter
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import msgspec
@@ -30,7 +31,7 @@ class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
     messages: int
     bytes: int
     rate_hz: float  # mean, from first to last message; 0 with one message
-    longest_gap_s: float  # between two messages in a row
+    longest_gap_s: float  # without a message, also before its first and after its last
     longest_gap_at_s: float  # its start, since the recording's first message
 
 
@@ -130,16 +131,20 @@ class _Course:
         self.messages += 1
         self.bytes += len(message.data)
 
-    def info(self, topic: str, start_ns: int) -> TopicInfo:
+    def info(self, topic: str, start_ns: int, end_ns: int) -> TopicInfo:
         span_s = (self.last_ns - self.first_ns) * 1e-9
+        gaps = [(self.gap_ns, self.gap_at_ns)]
+        if topic not in _OWN:  # what begins late, or falls silent before the end, was missing there
+            gaps += [(self.first_ns - start_ns, start_ns), (end_ns - self.last_ns, self.last_ns)]
+        gap_ns, gap_at_ns = max(gaps, key=itemgetter(0))
         return TopicInfo(
             topic=topic,
             encoding=self.encoding,
             messages=self.messages,
             bytes=self.bytes,
             rate_hz=(self.messages - 1) / span_s if span_s > 0 else 0.0,
-            longest_gap_s=self.gap_ns * 1e-9,
-            longest_gap_at_s=(self.gap_at_ns - start_ns) * 1e-9,
+            longest_gap_s=gap_ns * 1e-9,
+            longest_gap_at_s=(gap_at_ns - start_ns) * 1e-9,
         )
 
 
@@ -269,7 +274,7 @@ def info(path: Path) -> RecordingInfo:
         notes=tuple(NoteInfo(at_s=(at_ns - start_ns) * 1e-9, text=text) for at_ns, text in account.notes),
         connections=account.connections(),
         position_loss=account.position_loss(),
-        topics=tuple(courses[topic].info(topic, start_ns) for topic in sorted(courses)),
+        topics=tuple(courses[topic].info(topic, start_ns, end_ns) for topic in sorted(courses)),
         origin=account.origin,
         library=account.library,
     )

@@ -35,13 +35,15 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
     if port is None:
         yield None
         return
+    if not 0 <= port <= 65535:
+        raise UsageError(f"--live-port {port}: ports are 1 to 65535; 0 takes one that is free")
     foxglove = _sdk()
     context = foxglove.Context()
     try:
         server = foxglove.start_server(
             name="uavctl", host=HOST, port=port, context=context, message_backlog_size=BACKLOG
         )
-    except (RuntimeError, OverflowError) as error:
+    except RuntimeError as error:
         raise UsageError(f"--live: port {port} cannot be had ({error}); choose another with --live-port") from error
     try:
         on_open(server.port)

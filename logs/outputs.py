@@ -32,14 +32,38 @@ def check_free(targets: Sequence[Path], *, force: bool) -> None:
     """Refuse to overwrite.
 
     Raises:
-        UsageError: One of the files exists, and `force` is not given, or is a recording.
+        UsageError: One of the files exists, and `force` is not given, or it is a recording, or no file.
     """
     for target in targets:
         spare_recording(target)
+        if target.exists() and not target.is_file():
+            raise UsageError(f"{target}: is no file (a folder or a device); choose another name")
     there = [target for target in targets if target.exists()]
     if there and not force:
         more = f" (and {len(there) - 1} more of these files)" if len(there) > 1 else ""
         raise UsageError(f"{there[0]} exists{more}; --force writes anew, --out chooses another place")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text; where it cannot be written whole, what was there stays as it was.
+
+    Raises:
+        RecordingError: It cannot be written.
+    """
+    part = path.with_name(path.name + _UNFINISHED)
+    device = path.exists() and not path.is_file()  # /dev/stdout has no other name to come from
+    try:
+        if device:
+            path.write_text(text, encoding="utf-8")
+            return
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    finally:
+        if not device:
+            with contextlib.suppress(OSError):
+                part.unlink()
 
 
 @contextmanager

@@ -91,12 +91,13 @@ def recover(src: Path, dst: Path) -> RecoverResult:
         result = _copy(src, Segment(file, CHUNK_BYTES))
         if result.messages == 0:
             raise RecordingError(f"{src}: no whole chunk in it; nothing can be restored")
-    except (OSError, RecordingError) as error:
+    except BaseException as error:
+        # Also after Ctrl-C: half of it would look like a shorter flight.
         with contextlib.suppress(OSError):
             dst.unlink()
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{dst}: {error.strerror}; make room or choose another place") from error
+        if isinstance(error, OSError):
+            raise RecordingError(f"{dst}: {error.strerror}; make room or choose another place") from error
+        raise
     return result
 
 

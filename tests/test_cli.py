@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -184,3 +185,17 @@ def test_a_fresh_process_writes_one_document_and_keeps_to_one_thread() -> None:
         [sys.executable, "-m", "uavctl", "--version"], capture_output=True, text=True, check=False, timeout=60
     )
     assert done.stdout.strip() == __version__
+
+
+def test_an_interruption_is_one_line(tmp_path: Path) -> None:
+    """Also while modules are imported, which takes most of a short command's time."""
+    command = [sys.executable, "-X", "importtime", "-m", "uavctl", "log", "info", str(tmp_path / "flight.mcap")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    lines = iter(process.stderr.readline, "")
+    assert any("cyclopts" in line for line in lines)
+    process.send_signal(signal.SIGINT)
+    rest = [line for line in lines if not line.startswith("import time:")]
+    process.stderr.close()
+    assert process.wait() == 130
+    assert rest == ["interrupted\n"]

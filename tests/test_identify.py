@@ -198,7 +198,8 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
     link = fit_link(history.seen, history.gaps)
     assert link.rate_hz == pytest.approx(24.7, rel=0.03)
     assert link.loss < 0.01
-    assert link.delay_quantiles_s[2] == pytest.approx(0.055, abs=0.02)  # 80 ms less the shortest
+    # Arrivals alone tell what is above the shortest, for which `clock.latency_s` stands.
+    assert link.delay_quantiles_s[2] == pytest.approx(0.08, abs=0.02)
 
 
 def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:

@@ -7,16 +7,25 @@ import msgspec
 import pytest
 from recording_fakes import HEADER, Clock, record_flight, write_two_segments
 from rich.console import Console
+from view_rig import record
 
 from logs.disk import check_room
-from logs.info import info
+from logs.info import RecordingInfo, info
 from logs.reader import header, read
 from logs.recorder import SyncRecorder
 from logs.recover import recover
 from logs.segment import MAGIC
+from logs.topics import RecorderNote
+from uavctl.cli.app import run
 from uavctl.cli.info_table import info_table
-from uavctl.data import LinkEstimate, LinkStats, Refused, Truth
+from uavctl.data import Datagram, LinkEstimate, LinkStats, Refused, Truth
 from uavctl.errors import RecordingError
+
+
+def shown(found: RecordingInfo) -> str:
+    console = Console(width=160, record=True, file=io.StringIO())
+    console.print(info_table(found))
+    return console.export_text()
 
 
 def test_figures_of_a_flight(tmp_path: Path) -> None:
@@ -35,8 +44,28 @@ def test_figures_of_a_flight(tmp_path: Path) -> None:
     assert topics["/raw/vehicle/in"].encoding == "mavlink"
     assert topics["/raw/vehicle/in"].bytes == 40 * topics["/raw/vehicle/in"].messages
     assert found.bytes == path.stat().st_size
+    assert "closed in order" in shown(found)
     assert found.origin is not None
     assert (found.origin.config, found.origin.seed, found.origin.command) == ("room", 7, "uavctl loopback")
+
+
+def test_a_topic_that_begins_late_or_falls_silent_has_a_gap_there(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    recorder = SyncRecorder(path, clock=Clock())
+    recorder.put("/uavctl/header", 0, HEADER)
+    for at_ds in range(101):
+        for link, since_ds, until_ds in (("dies", 0, 40), ("late", 75, 100), ("whole", 0, 100)):
+            if since_ds <= at_ds <= until_ds:
+                one = Datagram(at_ns=at_ds * 100_000_000, link=link, outgoing=False, data=b"x")
+                recorder.put(f"/raw/{link}/in", one.at_ns, one)
+    recorder.close()
+    found = info(path)
+    gaps = {one.topic: (one.longest_gap_s, one.longest_gap_at_s) for one in found.topics}
+    assert gaps["/raw/dies/in"] == pytest.approx((6.0, 4.0))
+    assert gaps["/raw/late/in"] == pytest.approx((7.5, 0.0))
+    assert gaps["/raw/whole/in"] == pytest.approx((0.1, 0.0))
+    assert gaps["/uavctl/header"] == (0.0, 0.0)
+    assert "6.000 s │ 4.0 s" in shown(found).replace("  ", " ")
 
 
 def test_failed_write_is_told(tmp_path: Path) -> None:
@@ -59,6 +88,7 @@ def test_damage_is_told_not_raised(tmp_path: Path) -> None:
     assert len(found.damage) == 1
     assert found.missing == 63 - found.messages
     assert found.missing > 0
+    assert "damaged: `uavctl log recover` restores the rest" in shown(found)
     gap = next(one for one in found.topics if one.topic == "/uavctl/event")
     assert gap.longest_gap_s > 0.05
     assert 0.1 < gap.longest_gap_at_s < 0.3
@@ -69,6 +99,7 @@ def test_torn_file(tmp_path: Path) -> None:
     record_flight(path, 30)
     path.write_bytes(path.read_bytes()[:-200])
     assert not info(path).finished
+    assert "not closed: `uavctl log recover` makes a clean file" in shown(info(path))
     path.write_bytes(path.read_bytes()[:5])
     found = info(path)
     assert (found.finished, found.messages, found.duration_s, found.origin, found.topics) == (False, 0, 0.0, None, ())
@@ -142,16 +173,13 @@ def test_links_losses_and_what_the_recorder_said(tmp_path: Path) -> None:
     assert loss.believed == pytest.approx(0.3)
     assert (loss.bursts, loss.below_promise, loss.simulated_sent, loss.simulated_lost) == (True, False, 50, 9)
     assert found.segments[0].messages == found.messages and found.segments[0].bytes == found.bytes
-    console = Console(width=160, record=True, file=io.StringIO())
-    console.print(info_table(found))
-    shown = console.export_text()
     for text in (
         "20 datagrams, 18 messages, 2 positions; bad: 2 checksum",
         "refused: 4 address, 3 rate",
         "30 % of the steps without news, as last estimated, in bursts",
         "9 of 50 positions lost",
     ):
-        assert text in shown
+        assert text in shown(found)
 
 
 def test_a_damaged_index_is_told_and_a_torn_one_is_not_called_damaged(tmp_path: Path) -> None:
@@ -169,3 +197,49 @@ def test_a_damaged_index_is_told_and_a_torn_one_is_not_called_damaged(tmp_path: 
     path.write_bytes(whole[:-100])  # killed while it was closed
     assert list(read(path)) == list(read(out))
     assert not info(path).finished
+
+
+@pytest.mark.parametrize(
+    "command", ["info X", "recover X OUT", "replay X", "report X", "compare X X", "export X --to csv", "whatif X"]
+)
+def test_each_command_says_one_line_of_what_it_cannot_read(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.mcap").write_text("a page of text\n" * 50)
+    Path("empty.mcap").touch()
+    Path("folder.mcap").mkdir()
+    there = {*tmp_path.iterdir()}
+    for name in ("missing", "folder", "empty", "text"):
+        assert run(["log", *command.replace("X", f"{name}.mcap").replace("OUT", "out.mcap").split()]) == 1
+        output = capsys.readouterr()
+        assert output.err.startswith(f"error: {name}.mcap: ") and output.err.count("\n") == 1, output.err
+        assert not output.out
+    assert {*tmp_path.iterdir()} == there
+
+
+@pytest.mark.parametrize("tolerance", ["-1", "nan", "inf"])
+def test_a_tolerance_that_is_none_is_refused(tolerance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["log", "replay", "missing.mcap", "--tolerance", tolerance]) == 2
+    assert capsys.readouterr().err.startswith(f"error: --tolerance {tolerance}: ")
+
+
+def test_the_page_of_a_torn_recording_that_lost_records_comes_with_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, noted = record(tmp_path / "flight.mcap"), tmp_path / "noted.mcap"
+    recorder = SyncRecorder(noted)
+    entries = [*read(path)]
+    begin = next(one for _, _, one in entries if isinstance(one, RecorderNote))
+    for topic, at_ns, one in entries:
+        recorder.put(topic, at_ns, one)
+    told = msgspec.structs.replace(begin, dropped=17, text="17 dropped")
+    recorder.put("/uavctl/recorder", entries[-1][1], told)
+    recorder.close()
+    assert run(["log", "report", str(noted)]) == 0
+    output = capsys.readouterr()
+    assert "17 records dropped" in output.out and not output.err
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(path.read_bytes()[:-3000])
+    assert run(["log", "report", str(torn)]) == 0
+    assert capsys.readouterr().err == "the recording is torn: shown up to its end\n"

@@ -161,7 +161,8 @@ def test_a_flight_in_real_time_is_the_same_beside_a_stalled_viewer(tmp_path: Pat
             flight.kill()
     summary = json.loads(out)
     assert flight.returncode == 0 and summary["recorder_dropped"] == 0
-    assert summary["steps"] >= 3 and len([*records(tmp_path / "flight.mcap", Decision)]) >= 35
+    decisions = [*records(tmp_path / "flight.mcap", Decision)]
+    assert sum(1 + one.missed_ticks for one in decisions) == decisions[-1].tick + 1
 
 
 def test_it_listens_on_this_machine_only() -> None:
@@ -183,8 +184,9 @@ def test_a_port_that_is_taken_is_told() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(UsageError, match=f"port {port} cannot be had.*--live-port"), live_view(port):
             pass
-    with pytest.raises(UsageError, match="port 70000 cannot be had"), live_view(70000):
-        pass
+    for number in (70_000, -1):
+        with pytest.raises(UsageError, match=f"--live-port {number}: ports are 1 to 65535"), live_view(number):
+            pass
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

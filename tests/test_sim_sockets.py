@@ -5,6 +5,7 @@ import socket
 from typing import Any
 
 import pytest
+from patience import LIMIT_S
 from sim_rig import Client, bench
 
 from sim.personality import ARDUPILOT
@@ -58,7 +59,7 @@ def test_each_new_tcp_client_is_greeted_around_its_first_packet() -> None:
     address = ("127.0.0.1", int(port.url.rsplit(":", 1)[1]))
 
     def joined(clients: int) -> socket.socket:
-        sock = socket.create_connection(address, timeout=2.0)
+        sock = socket.create_connection(address, timeout=LIMIT_S)
         while len(port.sockets()) < 1 + clients:
             port.read()
         return sock

@@ -5,6 +5,7 @@ import threading
 from dataclasses import replace
 
 import pytest
+from patience import LIMIT_S
 from rich.console import Console
 from sim_rig import bench
 
@@ -130,7 +131,7 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
     seat = Seat(load_config("room"), ANY, ANY, lambda truth: told.append(truth.at_ns))
     with watching(Console(file=stuck, force_terminal=True)) as tell:
         tell((ONE,))
-        assert stuck.tried.wait(10.0)
+        assert stuck.tried.wait(LIMIT_S)
         serve_all(
             (seat,), duration_s=2.0, airborne=True, on_ready=lambda _: None, stop=lambda: False, speed=4.0, on_look=tell
         )

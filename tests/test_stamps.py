@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from mavlink_rig import Peer
+from patience import LIMIT_S
 from signing_rig import OFFSET_NS, STAMP, SignedPeer, make_signing
 
 from uavctl.errors import KeyFileError
@@ -158,7 +159,7 @@ def test_its_thread_writes_by_itself(tmp_path: Path) -> None:
     keeper = StampKeeper(tmp_path / "key.stamp", 0, write=write)
     keeper.stamps.own = STAMP
     try:
-        assert written.wait(10)
+        assert written.wait(LIMIT_S)
     finally:
         keeper.close()
 

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
 import pytest
+from patience import LIMIT_S
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.transport import PEER_SILENCE_NS, Connection, open_connection, wait
 
 FRAME = b"\xfd\x01\x02"
-LIMIT_NS = 5_000_000_000  # longest wait of a test
+LIMIT_NS = round(LIMIT_S * 1e9)  # longest wait of a test
 
 
 class Clock:
@@ -39,7 +40,7 @@ def opened(url: str, now: Callable[[], int] = time.monotonic_ns) -> Iterator[Con
 def udp() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
-        peer.settimeout(5)
+        peer.settimeout(LIMIT_S)
         yield peer
 
 
@@ -168,7 +169,7 @@ def test_tcp_carries_bytes_both_ways_and_reports_the_end() -> None:
     ):
         peer, _ = server.accept()
         with peer:
-            peer.settimeout(5)
+            peer.settimeout(LIMIT_S)
             connection.send(FRAME)
             assert peer.recv(100) == FRAME
             peer.sendall(FRAME * 4)
@@ -193,7 +194,7 @@ def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:
                 connection.send(frame)
                 sent += 1
             taken = (sent - connection.send_errors) * len(frame)
-            peer.settimeout(5)
+            peer.settimeout(LIMIT_S)
             got = b""
             while len(got) < taken:
                 got += peer.recv(65_536)
@@ -272,7 +273,7 @@ def test_setpoints_go_to_the_vehicle_and_not_to_cameras_that_spoke_first_on_the_
         connection = open_connection("udpin://127.0.0.1:0")
         try:
             port = port_of(connection)
-            vehicle.settimeout(5.0)
+            vehicle.settimeout(LIMIT_S)
             cameras.sendto(b"\xfdcameras", ("127.0.0.1", port))
             vehicle.sendto(b"\xfdvehicle", ("127.0.0.1", port))
             arrived: list[bytes] = []

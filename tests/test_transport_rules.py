@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 import pytest
+from patience import LIMIT_S
 from test_transport import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.transport import PEER_SILENCE_NS, Connection, Rules, open_connection, wait
@@ -20,7 +21,7 @@ SECOND = 1_000_000_000
 def peer(host: str = "127.0.0.1") -> Iterator[socket.socket]:
     with socket.socket(type=socket.SOCK_DGRAM) as one:
         one.bind((host, 0))
-        one.settimeout(5)
+        one.settimeout(LIMIT_S)
         yield one
 
 

@@ -23,7 +23,7 @@ from uavctl.cli.app import run
 from uavctl.data import Decision, Estimate, Plan
 
 # What a flight without trouble never says.
-SILENT = {"/uavctl/check", "/uavctl/refused", "/uavctl/library"}
+SILENT = {"/uavctl/check", "/uavctl/refused"}
 WELL_KNOWN = {"FrameTransforms", "FrameTransform", "PoseInFrame", "PosesInFrame", "Log", "SceneUpdate"}
 # What Rerun makes of a well-known message; of the others it shows the fields.
 DRAWN = {
@@ -38,8 +38,8 @@ DRAWN = {
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("viewers")
-    arguments = ("--config", "room", "--duration", "8", "--set", "solver.method=exact", "--out", str(out), "--json")
-    assert run(["loopback", *arguments]) == 0
+    # What `make fly` types, but for its length.
+    assert run(["loopback", "--udp", "--config", "room", "--duration", "8", "--out", str(out), "--json"]) == 0
     return out / "flight.mcap"
 
 

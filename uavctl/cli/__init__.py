@@ -6,6 +6,7 @@ import os
 import sys
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+INTERRUPTED = 130  # as a shell says of what SIGINT ended
 
 
 def main() -> None:
@@ -13,6 +14,11 @@ def main() -> None:
     # The matrices are small: BLAS threads only disturb the control loop. Read once, when numpy is imported.
     for variable in _THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
-    from uavctl.cli.app import run
+    try:
+        from uavctl.cli.app import run
 
-    sys.exit(run(sys.argv[1:]))
+        code = run(sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        code = INTERRUPTED
+    sys.exit(code)

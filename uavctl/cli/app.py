@@ -11,7 +11,8 @@ from uavctl import __version__
 from uavctl.cli.common import messages
 from uavctl.errors import UavctlError, UsageError
 
-_EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss.
+_EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
+130 interrupted.
 
 With --json, standard output holds one JSON document and nothing else; messages go to standard error.
 Every configuration key is described in docs/configuration.md."""
@@ -22,6 +23,7 @@ app = App(
     help_epilogue=_EPILOGUE,
     help_format="markdown",
     version=__version__,
+    suppress_keyboard_interrupt=False,
 )
 
 # A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
@@ -48,10 +50,14 @@ app.register_install_completion_command(add_to_startup=False)
 def run(arguments: Sequence[str]) -> int:
     """Run one command line; returns its exit code. Errors meant for a person come without a traceback."""
     try:
-        result = app(list(arguments), exit_on_error=False, result_action="return_value")
-    except CycloptsError:
-        return UsageError.exit_code  # already told, with the nearest valid name
+        result = app(list(arguments), exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        return _refuse(str(error), UsageError.exit_code)
     except UavctlError as error:
-        messages().print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True)
-        return error.exit_code
+        return _refuse(str(error), error.exit_code)
     return result if isinstance(result, int) else 0
+
+
+def _refuse(text: str, exit_code: int) -> int:
+    messages().print(f"[bold red]error:[/] {escape(text)}", soft_wrap=True)
+    return exit_code

@@ -69,8 +69,12 @@ POSITIVE = validators.Number(gt=0)
 
 
 def messages() -> Console:
-    """Where messages and progress go: standard error."""
-    return Console(stderr=True)
+    """Where messages and progress go: standard error.
+
+    Called interactive also where it is a file or a pipe: there rich shows no progress, but else would leave an empty
+    line where the bar would have been.
+    """
+    return Console(stderr=True, force_interactive=True)
 
 
 @contextmanager

@@ -24,11 +24,11 @@ from uavctl.cli.engagement import (
     tell_verdict,
 )
 from uavctl.cli.flying import (
-    LIVE_PORT,
     Live,
     LivePort,
     conclude,
     live_line,
+    live_view_port,
     onlookers,
     put_header,
     recording_path,
@@ -74,7 +74,7 @@ def fly(
         bool, Parameter(negative=(), help="SCHED_FIFO, locked memory, garbage collected between ticks only")
     ] = False,
     live: Live = False,
-    live_port: LivePort = LIVE_PORT,
+    live_port: LivePort = None,
 ) -> int:
     """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C hands it back.
 
@@ -86,6 +86,7 @@ def fly(
     """
     given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap}
     take_off_m = checked_take_off(arm, takeoff)
+    view_port = live_view_port(live=live, port=live_port)
     overrides = [*(f'{key}="{value}"' for key, value in given.items() if value is not None), *goto_overrides(goto)]
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
@@ -107,7 +108,7 @@ def fly(
             as_realtime(realtime) as collect,
             stop_on_signals() as stopped,
             connected(config) as connections,
-            onlookers(live_port if live else None) as looking,
+            onlookers(view_port) as looking,
         ):
             checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
             recorder = Recorder(path, config.log, onlookers=looking)

@@ -34,6 +34,7 @@ from uavctl.code_id import decider_id
 from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
+from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design_record import design_record
 
@@ -41,7 +42,7 @@ LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
 LIVE_PORT = 8765  # where Foxglove looks first
 Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer on this machine; needs uavctl[live]")]
-LivePort = Annotated[int, Parameter(help="TCP port of the live view")]
+LivePort = Annotated[int | None, Parameter(help=f"TCP port of the live view; else {LIVE_PORT}")]
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
@@ -61,6 +62,17 @@ class Recording(Protocol):
     def status(self) -> RecorderStatus:
         """How it is doing."""
         ...
+
+
+def live_view_port(*, live: bool, port: int | None) -> int | None:
+    """Port of the live view; None if there is none.
+
+    Raises:
+        UsageError: A port, and no view.
+    """
+    if port is not None and not live:
+        raise UsageError(f"--live-port {port} is of the live view; add --live")
+    return (LIVE_PORT if port is None else port) if live else None
 
 
 @contextmanager

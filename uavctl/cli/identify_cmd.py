@@ -63,7 +63,10 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
         config = common.load().config
         one_link = msgspec.structs.replace(config.daemon, vehicle="tlog", mocap="tlog")
         read_as = msgspec.structs.replace(config, daemon=one_link)
-        return from_tlog(read_tlog(flight).packets, read_as), config
+        recorded = read_tlog(flight)
+        for note in recorded.notes:
+            messages().print(note, style="yellow", markup=False, soft_wrap=True)
+        return from_tlog(recorded.packets, read_as), config
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config

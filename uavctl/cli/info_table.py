@@ -20,15 +20,19 @@ def info_table(found: RecordingInfo) -> RenderableType:
     for column in ("topic", "messages", "rate", "longest gap", "at"):
         table.add_column(column, justify="left" if column == "topic" else "right")
     for topic in found.topics:
-        cells = ("", "", "")
-        if topic.messages > 1:
-            cells = (f"{topic.rate_hz:.1f}/s", f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s")
-        table.add_row(Text(topic.topic), str(topic.messages), *cells)
+        rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
+        gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
+        table.add_row(Text(topic.topic), str(topic.messages), rate, *gap)
     return Group(Text(title), table, *map(Text, _lines(found)))
 
 
 def _lines(found: RecordingInfo) -> Iterator[str]:
-    yield "closed in order" if found.finished else "not closed: `uavctl log recover` makes a clean file"
+    if not found.finished:
+        yield "not closed: `uavctl log recover` makes a clean file"
+    elif found.damage:
+        yield "damaged: `uavctl log recover` restores the rest"
+    else:
+        yield "closed in order"
     yield (
         f"records lost: {found.dropped} dropped, {found.refused} refused, {found.missing} missing; "
         f"{found.failures} failed writes"

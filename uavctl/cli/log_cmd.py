@@ -17,7 +17,7 @@ from logs.flight_data import FlightData
 from logs.foreign import is_foreign, read_mcap
 from logs.info import info as recording_info
 from logs.outputs import spare_recording
-from logs.reader import read
+from logs.reader import finished, read
 from logs.recover import RecoverResult
 from logs.recover import recover as restore
 from logs.replay_tlog import ForeignReplay, replay_tlog
@@ -25,6 +25,7 @@ from logs.report import picture, write_report
 from logs.report_verdicts import verdict_rows
 from logs.summary import count, render, summarise
 from logs.tlog import TlogPacket, read_tlog
+from logs.topics import RecorderNote
 from logs.verdicts import judge
 from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, Common, located, messages
@@ -86,6 +87,8 @@ def replay(
     and controller of `--config`. With `--set KEY=VALUE` a recording of ours is replayed with that key changed: what
     the changed controller would have decided of the same inputs, from the first decision that differs on.
     """
+    if not 0.0 <= tolerance < 1.0:
+        raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
     packets = _foreign_packets(flight, topic)
     if packets is not None:
         return _replay_foreign(flight, packets, common)
@@ -125,8 +128,10 @@ def report(
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         spare_recording(target)
-    data = FlightData.from_records(read(flight), flight)
-    summary = summarise(data, wall_s=None, recording=str(flight), report=str(page))
+    entries = tuple(read(flight))
+    data = FlightData.from_records(entries, flight)
+    dropped = max((record.dropped for _, _, record in entries if isinstance(record, RecorderNote)), default=0)
+    summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
     judged = judge(data)
     write_report(data, summary, page, judged)
     if svg is not None:
@@ -134,6 +139,8 @@ def report(
             svg.write_text(picture(data), encoding="utf-8")
         except OSError as error:
             raise UsageError(f"{svg}: cannot be written ({error.strerror}); choose another place") from error
+    if not finished(flight):
+        messages().print("the recording is torn: shown up to its end", style="yellow", markup=False)
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
     Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
     return 0

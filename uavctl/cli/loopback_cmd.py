@@ -28,11 +28,11 @@ from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
 from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_verdict
 from uavctl.cli.flying import (
-    LIVE_PORT,
     Live,
     LivePort,
     conclude,
     live_line,
+    live_view_port,
     onlookers,
     put_header,
     recording_path,
@@ -49,7 +49,7 @@ from uavctl.errors import UavctlError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.sealed import connected
 
-START_LIMIT_S = 20.0
+START_LIMIT_S = 60.0
 TRUTH = "/sim/truth"
 
 
@@ -69,7 +69,7 @@ def loopback(
     ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
     live: Live = False,
-    live_port: LivePort = LIVE_PORT,
+    live_port: LivePort = None,
 ) -> int:
     """Fly the simulated vehicle over a lossy link, record it, and report.
 
@@ -77,6 +77,7 @@ def loopback(
     on the ground, and after its duration it ends there too.
     """
     take_off_m = checked_take_off(arm, takeoff)
+    view_port = live_view_port(live=live, port=live_port)
     if live and not udp:
         raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
     given = {"duration_s": duration, "sim.seed": seed}
@@ -94,7 +95,7 @@ def loopback(
         check_places(config, design, take_off_m, engagement.goal)
         prepared = prepare(config, design)
     if udp:
-        summary, verdict = _real_time(prepared, path, engagement, live_port if live else None)
+        summary, verdict = _real_time(prepared, path, engagement, view_port)
     else:
         summary, verdict = lockstep(prepared, path, engagement)
     common.show(summary, lambda: render(summary))

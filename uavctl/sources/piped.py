@@ -19,7 +19,7 @@ from uavctl.transport.base import Base
 from uavctl.transport.rules import TOO_MANY, AllowList, RateCap
 
 _MAVLINK = (0xFD, 0xFE)
-_START_S = 20.0  # for the interpreter of the process, on a busy computer
+_START_S = 60.0  # for the interpreter of the process, on a busy computer
 _END_S = 2.0
 
 

@@ -1,0 +1,38 @@
+"""Commands that the front page and the quick start ask one to type can be flown."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from uavctl.build import build_design
+from uavctl.cli.common import Common
+
+ROOT = Path(__file__).parent.parent
+
+
+def flights() -> list[str]:
+    """Every `uavctl loopback` of a block of commands."""
+    found = []
+    for page in ("README.md", "docs/quick-start.md"):
+        for block in re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.M | re.S):
+            found += [line for line in block.splitlines() if line.startswith("uavctl loopback")]
+    return found
+
+
+def test_the_pages_have_such_commands() -> None:
+    assert len(flights()) >= 6
+
+
+@pytest.mark.parametrize("line", flights())
+def test_a_design_can_be_made_of_each(line: str) -> None:
+    words = shlex.split(line, comments=True)
+    given = [
+        (words[place], words[place + 1]) for place in range(len(words) - 1) if words[place] in ("--set", "--config")
+    ]
+    config = next((value for name, value in given if name == "--config"), "room")
+    overrides = tuple(value for name, value in given if name == "--set")
+    assert build_design(Common(config=config, overrides=overrides).load().config).schedule

@@ -1,0 +1,75 @@
+"""Files that a command writes: whole or not at all, and never in the place of something that is no file."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from logs.outputs import check_free, write_whole
+from logs.recover import recover
+from logs.segment import Segment
+from uavctl.cli.flying import LIVE_PORT, live_view_port
+from uavctl.errors import RecordingError, UsageError
+
+# Of one file: a write beyond it fails as on a full disk, at a byte that is known.
+LIMITED = """
+import resource, signal, sys
+from pathlib import Path
+from logs.outputs import write_whole
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+write_whole(Path(sys.argv[1]), "new" * 1000)
+"""
+
+
+def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    write_whole(page, "the page of before")
+    done = subprocess.run([sys.executable, "-c", LIMITED, str(page)], capture_output=True, text=True, check=False)
+    assert f"RecordingError: {page}: cannot be written (File too large); choose another place" in done.stderr
+    assert page.read_text(encoding="utf-8") == "the page of before"
+    assert list(tmp_path.iterdir()) == [page]
+
+
+def test_a_text_goes_through_what_is_no_file(tmp_path: Path) -> None:
+    script = "from pathlib import Path; from logs.outputs import write_whole; write_whole(Path('/dev/stdout'), 'a')"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "a"
+    with pytest.raises(RecordingError, match="cannot be written"):
+        write_whole(tmp_path, "a folder")
+    with pytest.raises(RecordingError, match="cannot be written"):
+        write_whole(tmp_path / "missing" / "page.html", "no folder")
+
+
+def test_what_is_no_file_is_never_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for target in (pipe, tmp_path):
+        with pytest.raises(UsageError, match="is no file"):
+            check_free([target], force=True)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_recovery_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Segment, "add", interrupted)
+    source = tmp_path / "flight.mcap"
+    make = [sys.executable, "-m", "uavctl", "loopback", "--duration", "1", "--set", "solver.method=exact", "--json"]
+    subprocess.run([*make, "--out", str(tmp_path)], check=True, stdout=subprocess.DEVNULL)
+    with pytest.raises(KeyboardInterrupt):
+        recover(source, tmp_path / "restored.mcap")
+    assert not (tmp_path / "restored.mcap").exists()
+
+
+def test_a_port_without_a_view_is_refused() -> None:
+    assert (live_view_port(live=False, port=None), live_view_port(live=True, port=None)) == (None, LIVE_PORT)
+    assert live_view_port(live=True, port=1234) == 1234
+    with pytest.raises(UsageError, match="--live-port 1234"):
+        live_view_port(live=False, port=1234)
