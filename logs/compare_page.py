@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from logs import page
 from logs.compare import Comparison
@@ -13,14 +14,17 @@ from logs.compare_side import Loaded
 from logs.compare_words import difference, label, likeness, measured, parameter
 from logs.design_view import AXIS_NUMBER, Floats
 from logs.flight_data import FlightData
-from logs.outputs import spare_recording
+from logs.outputs import spare_recording, write_whole
 from logs.page import Mark, Section
-from logs.plots import DASHED, SEEN, thin
+from logs.plots import DASHED, DOTTED, SEEN, along, thin
 from logs.svg import Canvas, Drawing, canvas, colour
-from uavctl.errors import RecordingError, UsageError
+from uavctl.errors import UsageError
 
 _ROLES = ("truth", "estimate", "sample", "plan", "target")
-_LIMIT = Mark("dashed", "limit", "limit")
+_LIMIT = Mark("dashed", "limit", "limit of A")
+_HORIZON = Mark("dotted", "muted", "horizon H")
+_WIDEST, _FINEST = 3.2, 0.8  # lines of the first flight and of the last: where they are the same, all are seen
+_OTHERS_OF_A_TABLE = 2  # more columns would not fit on paper
 
 
 def write_page(found: Comparison, loaded: Sequence[Loaded], path: Path) -> None:
@@ -33,31 +37,30 @@ def write_page(found: Comparison, loaded: Sequence[Loaded], path: Path) -> None:
     spare_recording(path)
     if len(loaded) > len(_ROLES):
         raise UsageError(f"--out draws {len(_ROLES)} flights at most, these are {len(loaded)}; compare fewer at a time")
-    text = comparison_html(found, loaded)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    write_whole(path, comparison_html(found, loaded))
 
 
 def comparison_html(found: Comparison, loaded: Sequence[Loaded]) -> str:
     """The page as text."""
     names = [one.side.name for one in loaded]
-    sides = [f"{one.name}: {one.recording} ({one.command}, {one.started_utc})" for one in found.recordings]
     story = [*map(likeness, found.likenesses), *(f"Mind: {note}." for note in found.notes)]
-    return page.page(f"Flights {', '.join(names)}", " · ".join(sides), story, _sections(found, loaded))
+    title = f"Flights {', '.join(names)}"
+    return page.page(
+        title, "The first is what the others are compared with.", story, _sections(found, loaded), "How alike they are"
+    )
 
 
 def _sections(found: Comparison, loaded: Sequence[Loaded]) -> Iterator[Section]:
     flights = [one.flight for one in loaded]
     marks = tuple(Mark("line", _ROLES[place], one.side.name) for place, one in enumerate(loaded))
     axes = [axis for axis in flights[0].design.axes if all(axis in one.design.axes for one in flights)]
-    yield Section("Path", "Limits are those of A.", page.grid(list(_paths(flights, axes))), (*marks, _LIMIT))
+    yield Section("Recordings", "", _sides(found))
+    yield Section("Path", "", page.grid(list(_paths(flights, axes))), (*marks, _LIMIT))
     yield Section(
         "Positions and age",
         "Time counts from each flight's first tick. Positions are the true ones where they are known.",
         page.grid([*(_position(flights, axis) for axis in axes), _ages(flights)]),
-        (*marks, _LIMIT),
+        (*marks, _LIMIT, _HORIZON),
     )
     yield Section("Figures", "", _figures(found))
     yield Section("Parameters that differ", "", _parameters(found))
@@ -74,9 +77,9 @@ def _paths(flights: Sequence[FlightData], axes: Sequence[str]) -> Iterator[Drawi
         with canvas(key, 3.7) as one:
             ax = one.axes(title, f"{x_name} [m]", f"{y_name} [m]")
             for place, flight in enumerate(flights):
-                _, points = _course(flight)
+                points = along(_course(flight)[1])
                 x, y = (points[:, AXIS_NUMBER[axis]] for axis in shown)
-                ax.plot(x_sign * x, y_sign * y, color=colour(_ROLES[place]), lw=1.4)
+                ax.plot(x_sign * x, y_sign * y, color=colour(_ROLES[place]), lw=_width(place, flights))
             for side in _limits(flights[0], shown[0]):
                 ax.axvline(side, color=colour("limit"), lw=1.0, ls=DASHED)
             for side in _limits(flights[0], shown[1]):
@@ -93,7 +96,9 @@ def _position(flights: Sequence[FlightData], axis: str) -> Drawing:
         return t_s, sign * points[:, AXIS_NUMBER[axis]]
 
     with canvas(f"position-{axis}", 2.3) as one:
-        _overlay(one, name.capitalize(), f"{name} [m]", flights, values, _limits(flights[0], axis), "default")
+        ax = _overlay(one, name.capitalize(), f"{name} [m]", flights, values)
+        for side in _limits(flights[0], axis):
+            ax.axhline(side, color=colour("limit"), lw=1.0, ls=DASHED)
     return Drawing(f"position-{axis}", one.svg, f"{name.capitalize()} over time of {len(flights)} flights")
 
 
@@ -104,7 +109,9 @@ def _ages(flights: Sequence[FlightData]) -> Drawing:
 
     horizons = sorted({float(flight.design.horizon) for flight in flights})
     with canvas("age", 2.3) as one:
-        _overlay(one, "Age of information", "age [steps]", flights, values, horizons, "steps-post")
+        ax = _overlay(one, "Age of information", "age [steps]", flights, values, "steps-post")
+        for horizon in horizons:
+            ax.axhline(horizon, color=colour("muted"), lw=1.0, ls=DOTTED)
     return Drawing("age", one.svg, f"Age of information over time of {len(flights)} flights")
 
 
@@ -114,15 +121,18 @@ def _overlay(
     y_label: str,
     flights: Sequence[FlightData],
     values: Callable[[FlightData], tuple[Floats, Floats]],
-    limits: Sequence[float],
-    drawstyle: str,
-) -> None:
+    drawstyle: str = "default",
+) -> Axes:
     ax = one.axes(title, "time [s]", y_label)
     for place, flight in enumerate(flights):
-        ax.plot(*thin(*values(flight)), color=colour(_ROLES[place]), lw=1.2, drawstyle=drawstyle)
-    for side in limits:
-        ax.axhline(side, color=colour("limit"), lw=1.0, ls=DASHED)
+        ax.plot(*thin(*values(flight)), color=colour(_ROLES[place]), lw=_width(place, flights), drawstyle=drawstyle)
     ax.set_xlim(0, max(flight.duration_s for flight in flights))
+    return ax
+
+
+def _width(place: int, flights: Sequence[FlightData]) -> float:
+    """Width of a flight's line [pt]."""
+    return float(np.linspace(_WIDEST, _FINEST, len(flights))[place])
 
 
 def _course(flight: FlightData) -> tuple[Floats, Floats]:
@@ -142,14 +152,34 @@ def _limits(flight: FlightData, axis: str) -> list[float]:
     return [side for side in sides if np.isfinite(side)]
 
 
+def _sides(found: Comparison) -> str:
+    return page.facts(
+        (
+            one.name,
+            f"{one.recording} · {one.started_utc} · {one.command} · {one.ended}{'' if one.finished else ', torn'}",
+        )
+        for one in found.recordings
+    )
+
+
 def _figures(found: Comparison) -> str:
-    names = [one.name for one in found.recordings]
-    columns = ["figure", *names, *(text for name in names[1:] for text in (f"{name} − A", f"{name} / A"))]
+    others = range(1, len(found.recordings))
+    parts = [others[begin : begin + _OTHERS_OF_A_TABLE] for begin in range(0, len(others), _OTHERS_OF_A_TABLE)]
+    return "".join(_figures_of(found, part) for part in parts)
+
+
+def _figures_of(found: Comparison, others: Sequence[int]) -> str:
+    """The first flight's figures beside those of some others."""
+    names = {place: found.recordings[place].name for place in others}
+    columns = ["figure", "A"]
+    columns += [text for name in names.values() for text in (name, f"{name} − A", f"{name} / A")]
     rows = []
     for one in found.figures:
-        others = zip(one.differences, one.ratios, strict=True)
-        cells = [text for change, ratio in others for text in (difference(change), measured(ratio))]
-        rows.append([label(one), *map(measured, one.values), *cells])
+        cells = [measured(one.values[0])]
+        for place in others:
+            cells += [measured(one.values[place]), difference(one.differences[place - 1])]
+            cells.append(measured(one.ratios[place - 1]))
+        rows.append([label(one), *(cell.replace("-", "−") for cell in cells)])
     return page.table(columns, rows, frozenset(range(1, len(columns))))
 
 

@@ -6,6 +6,7 @@ One file for each topic of records (and one for each list of records within); wh
 from __future__ import annotations
 
 import csv
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
@@ -15,13 +16,15 @@ from typing import Any, Protocol, Self
 from urllib.parse import quote
 
 import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 
 from logs.chunks import Message
 from logs.encoding import decode
 from logs.flat import Cell, Column, Kind, Tables
 from logs.outputs import check_free, unfinished
-from logs.reader import good_messages
-from logs.topics import record_type
+from logs.reader import finished, good_messages, segment_files
+from logs.topics import HEADER, LIBRARY, is_view, record_type
 from uavctl.data import Record
 from uavctl.errors import RecordingError, UsageError
 
@@ -59,6 +62,31 @@ Watch = Callable[[Iterable[Message], int | None, str], Iterable[Message]]
 def unwatched(messages: Iterable[Message], _total: int | None, _what: str) -> Iterable[Message]:
     """Nobody looks."""
     return messages
+
+
+def known_number(flight: Path) -> int | None:
+    """How many messages `good_messages` will give, by the recording's own statistics; None of a torn recording.
+
+    Raises:
+        RecordingError: There is no such recording.
+    """
+    if not finished(flight):
+        return None
+    number = 0
+    for place, path in enumerate(segment_files(flight)):
+        left_out = {HEADER, LIBRARY} if place else set()  # which later files repeat
+        try:
+            with path.open("rb") as file:
+                summary = make_reader(file).get_summary()
+        except (OSError, McapError, ValueError, struct.error):
+            return None  # whoever reads on will say what is wrong
+        if summary is None or summary.statistics is None:
+            return None
+        for channel, messages in summary.statistics.channel_message_counts.items():
+            topic = summary.channels[channel].topic if channel in summary.channels else ""
+            if not is_view(topic) and topic not in left_out:
+                number += messages
+    return number
 
 
 def export_tables(
@@ -113,7 +141,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
                 unknown[message.definition.topic] += 1
             yield message
 
-    for topic, _, record in _decoded(watch(counted(), None, "reading")):
+    for topic, _, record in _decoded(watch(counted(), known_number(flight), "reading")):
         tables.learn(topic, record)
     return tables, unknown, total
 

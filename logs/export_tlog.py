@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from logs.chunks import Message
-from logs.export import Watch, unwatched
+from logs.export import Watch, known_number, unwatched
 from logs.outputs import check_free, unfinished
 from logs.reader import good_messages, header
 from logs.tlog import MARKERS, frame_length
@@ -55,7 +55,7 @@ def export_tlog(
     packets: Counter[str] = Counter()
     raw = _Raw(_streams(first))
     with unfinished([file]) as parts, parts[file].open("wb") as out:
-        messages = watch(good_messages(flight), None, "writing")
+        messages = watch(good_messages(flight), known_number(flight), "writing")
         for at_ns, topic, packet in _in_order(raw.packets(messages, link)):
             out.write(_STAMP.pack(began_us + (at_ns - first.started_ns) // 1000) + packet)
             packets[topic] += 1

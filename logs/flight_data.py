@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.design_view import DesignView, Floats, design_view
+from logs.topics import RecorderNote
 from uavctl.data import (
     Checked,
     ControlMode,
@@ -59,6 +60,7 @@ class FlightData:
     truths: tuple[Truth, ...]
     link_estimates: tuple[LinkEstimate, ...] = ()
     checks: tuple[Checked, ...] = ()  # before arming
+    notes: tuple[RecorderNote, ...] = ()  # the recorder's own account
 
     @classmethod
     def from_records(cls, records: Iterable[tuple[str, int, Record]], path: Path | None = None) -> Self:
@@ -101,6 +103,7 @@ class FlightData:
             truths=take(Truth),
             link_estimates=take(LinkEstimate),
             checks=take(Checked),
+            notes=take(RecorderNote),
         )
 
     @property
@@ -127,6 +130,16 @@ class FlightData:
     def stopped_ns(self) -> int | None:
         """When the operator asked for the hand-over [ns]; None if nobody did."""
         return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+
+    @property
+    def part(self) -> bool:
+        """Whether the first ticks are not in it, as in a later file of a recording."""
+        return bool(self.decisions[0].tick)
+
+    @property
+    def breaks_off(self) -> bool:
+        """Whether the recorder was not able to end it: killed, without power, or the file was cut."""
+        return bool(self.notes) and not self.notes[-1].text.startswith(("end", "goes on in"))
 
     @cached_property
     def virtual_time(self) -> bool:

@@ -142,7 +142,7 @@ class _Course:
             encoding=self.encoding,
             messages=self.messages,
             bytes=self.bytes,
-            rate_hz=(self.messages - 1) / span_s if span_s > 0 else 0.0,
+            rate_hz=round((self.messages - 1) / span_s, 6) if span_s > 0 else 0.0,
             longest_gap_s=gap_ns * 1e-9,
             longest_gap_at_s=(gap_at_ns - start_ns) * 1e-9,
         )
@@ -266,7 +266,7 @@ def info(path: Path) -> RecordingInfo:
         missing=missing,
         start_ns=start_ns,
         end_ns=end_ns,
-        duration_s=(end_ns - start_ns) * 1e-9,
+        duration_s=(end_ns - start_ns) / 1e9,
         dropped=0 if note is None else note.dropped,
         refused=0 if note is None else note.refused,
         failures=0 if note is None else note.failures,

@@ -36,7 +36,8 @@ font-size:.875rem;color:var(--muted)}
 .legend li{display:flex;align-items:center;gap:.45rem}
 .legend svg{width:26px;height:14px;flex:none}
 table{border-collapse:collapse;width:100%%;font-size:.95rem;font-variant-numeric:tabular-nums}
-.many td:first-child:not(.number){min-width:5rem}
+.many td:first-child:not(.number){min-width:7rem}
+.many th,.many td{padding-right:.65rem}
 th,td{text-align:left;padding:.4rem .9rem .4rem 0;vertical-align:top;border-top:1px solid var(--line)}
 tr:first-child>*{border-top:0}
 th{font-weight:600}
@@ -58,15 +59,20 @@ figure:last-child:nth-child(odd):not(.wide){width:100%%}
 .facts th,.facts td{display:block;width:auto;padding-right:0}
 .facts td{border-top:0;padding-top:0}
 .many thead{display:none}
+.many{min-width:0!important}
 .many tr{display:block;padding:.4rem 0;border-top:1px solid var(--line)}
 .many tr:first-child{border-top:0}
 .many td,.many .number{display:flex;justify-content:space-between;gap:1rem;width:auto;padding:.1rem 0;border:0;
 text-align:right;white-space:normal}
 .many td::before{content:attr(data-name);color:var(--muted);text-align:left;white-space:nowrap}
+.many td:first-child:not(.number){justify-content:start;text-align:left;font-weight:600}
+.many td:first-child:not(.number)::before{content:none}
 }
 @media print{body{font-size:10.5pt}main{max-width:none;padding:0}
 h2,.note,.legend{break-after:avoid}.note,.legend,tr{break-inside:avoid}.grid{break-before:avoid}
 details::details-content{content-visibility:visible;block-size:auto}
+.many{font-size:.82em;min-width:0!important}.many th,.many td{padding-right:.5rem}
+pre{white-space:pre-wrap;overflow-wrap:anywhere;columns:2;column-gap:2rem}
 figure,.card,details{border-color:#ccc}}
 """
 
@@ -75,7 +81,7 @@ figure,.card,details{border-color:#ccc}}
 class Mark:
     """One entry of a legend: how something is drawn, and what it is."""
 
-    kind: str  # line, dashed, dotted, dot, ring, star, cross, tick, band
+    kind: str  # line, thin, dashed, dotted, dot, ring, star, cross, tick, band
     role: str
     text: str
 
@@ -90,8 +96,10 @@ class Section:
     legend: tuple[Mark, ...] = ()
 
 
-def page(title: str, subtitle: str, story: Iterable[str], sections: Iterable[Section]) -> str:
-    """A complete document; `title`, `subtitle` and `story` are plain text."""
+def page(
+    title: str, subtitle: str, story: Iterable[str], sections: Iterable[Section], heading: str = "What happened"
+) -> str:
+    """A complete document; `title`, `subtitle`, `story` and the `heading` over it are plain text."""
     css = _CSS % {"light": css_variables(False), "dark": css_variables(True), "font": FONT}
     sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in story)
     return (
@@ -99,7 +107,7 @@ def page(title: str, subtitle: str, story: Iterable[str], sections: Iterable[Sec
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{css}</style>\n</head>\n<body>\n<main>\n"
         f'<header><h1>{escape(title)}</h1>\n<p class="sub">{escape(subtitle)}</p></header>\n'
-        f'<section><h2>What happened</h2>\n<ul class="story">{sentences}</ul></section>\n'
+        f'<section><h2>{escape(heading)}</h2>\n<ul class="story">{sentences}</ul></section>\n'
         + "\n".join(_section(section) for section in sections)
         + "\n</main>\n</body>\n</html>\n"
     )
@@ -174,8 +182,10 @@ def folded(title: str, text: str) -> str:
 def _swatch(mark: Mark) -> str:
     paint = f"var(--{mark.role})"
     line = f'<path d="M1 7H25" style="stroke:{paint};stroke-width:2.2'
+    faint = 0.9 if mark.role == "grid" else 0.25  # which is next to nothing by itself
     shapes = {
         "line": f'{line}"/>',
+        "thin": f'<path d="M1 7H25" style="stroke:{paint};stroke-width:1"/>',
         "dashed": f'{line};stroke-dasharray:6 4"/>',
         "dotted": f'{line};stroke-dasharray:2 3"/>',
         "planned": f'{line}"/><circle cx="4" cy="7" r="3.4" style="fill:{paint}"/>',
@@ -185,6 +195,6 @@ def _swatch(mark: Mark) -> str:
         f'style="fill:{paint}"/>',
         "cross": f'<path d="M9 3l8 8M17 3l-8 8" style="stroke:{paint};stroke-width:2.2"/>',
         "tick": f'<path d="M13 2v10" style="stroke:{paint};stroke-width:2"/>',
-        "band": f'<rect x="1" y="2" width="24" height="10" style="fill:{paint};opacity:.25"/>',
+        "band": f'<rect x="1" y="2" width="24" height="10" style="fill:{paint};opacity:{faint}"/>',
     }
     return f'<svg viewBox="0 0 26 14" aria-hidden="true">{shapes[mark.kind]}</svg>'

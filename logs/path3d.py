@@ -11,11 +11,10 @@ from matplotlib.patches import Ellipse
 
 from logs.design_view import DesignView, Floats
 from logs.flight_data import FlightData
-from logs.plots import DASHED, choose_plans
+from logs.plots import DASHED, POINTS, along, choose_plans
 from logs.svg import WIDTH_IN, Drawing, canvas, colour
 from uavctl.data import Plan
 
-POINTS = 900
 OPEN_M = 1.0  # an open side of the room is drawn so far beyond what was flown
 _STAGES = (3, 6, 12)  # of a plan whose spread is shown
 _DROPS = 12  # lines from the path to the floor
@@ -42,7 +41,7 @@ def _view(flight: FlightData, key: str, width_in: float, height_in: float) -> Dr
         ax.set_axis_off()
         ax.set_aspect("equal", adjustable="datalim")
         _draw_room(ax, lower, upper)
-        _draw_path(ax, path_m, upper[2])
+        _draw_path(ax, path_m, upper[2], "truth" if flight.truths else "estimate")
         for plan in choose_plans(flight):
             _draw_plan(ax, flight.design, plan)
         _draw_places(ax, flight, path_m, upper[2])
@@ -67,13 +66,10 @@ def outline(semi_axes_m: Floats) -> tuple[float, float, float]:
 
 
 def _flown_m(flight: FlightData) -> Floats:
-    """Where it was (n, 3) [m], by the truth if that is known, thinned evenly."""
+    """Where it was (n, 3) [m], by the truth if that is known, thinned along the way."""
     design = flight.design
-    places = np.array(
-        [t.position_m for t in flight.truths] or [design.position_of(e.mean) for e in flight.estimates]
-    ).reshape(-1, 3)
-    finite = places[np.isfinite(places).all(axis=1)]
-    return np.asarray(finite[:: max(1, -(-len(finite) // POINTS))])
+    places = np.array([t.position_m for t in flight.truths] or [design.position_of(e.mean) for e in flight.estimates])
+    return along(places)
 
 
 def _room(design: DesignView, path_m: Floats) -> tuple[Floats, Floats]:
@@ -119,12 +115,12 @@ def _label(ax: Axes, at_m: Floats, off: tuple[int, int], text: str, ha: str, va:
     )
 
 
-def _draw_path(ax: Axes, path_m: Floats, floor_m: float) -> None:
+def _draw_path(ax: Axes, path_m: Floats, floor_m: float, role: str) -> None:
     """The path, its shadow on the floor, and lines between them for the eye."""
     shadow = path_m.copy()
     shadow[:, 2] = floor_m
     ax.plot(*shown(shadow).T, color=colour("muted"), lw=1.0, alpha=0.6, zorder=2)
-    ax.plot(*shown(path_m).T, color=colour("truth"), lw=1.5, zorder=5)
+    ax.plot(*shown(path_m).T, color=colour(role), lw=1.5, zorder=5)
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path_m, axis=0), axis=1))])
     for place in np.searchsorted(gone, np.linspace(0.0, gone[-1], _DROPS)).tolist():
         ax.plot(*shown(np.array([path_m[place], shadow[place]])).T, color=colour("muted"), lw=0.7, alpha=0.6, zorder=2)

@@ -48,13 +48,13 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
     sign = np.array([SEEN[axis][1] for axis in axes_shown])
 
     def seen(positions: Floats) -> Floats:
-        return np.asarray(_thin(positions.reshape(-1, 3))[:, pick] * sign)
+        return np.asarray(positions[:, pick] * sign)
 
     design = flight.design
-    samples = seen(np.array([s.position_m for s in flight.samples]))
-    estimate = seen(np.array([design.position_of(e.mean) for e in flight.estimates]))
-    truth = seen(np.array([t.position_m for t in flight.truths]))
-    target = seen(np.array([design.position_of(state) for state in _places(flight)]))
+    samples = seen(_thin(np.array([s.position_m for s in flight.samples]).reshape(-1, 3)))
+    estimate = seen(along(np.array([design.position_of(e.mean) for e in flight.estimates])))
+    truth = seen(along(np.array([t.position_m for t in flight.truths])))
+    target = seen(along(np.array([design.position_of(state) for state in _places(flight)])))
     _draw_room(ax, design, axes_shown)
     ax.plot(*estimate.T, color=colour("estimate"), lw=2.8, alpha=0.5, zorder=2)
     ax.plot(*truth.T, color=colour("truth"), lw=1.0, zorder=3)
@@ -156,9 +156,17 @@ def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
         scale = abs(flight.design.c_x[row][index])
         reserve = np.array([max(stage[row] for stage in plan.backoff_x) for plan in plans]) / scale
         if len(plans):
-            shown_s, kept = thin(t_s, side + inwards * reserve)
+            # The last one is flown to the end of its step, or on through a silence.
+            ends_s = np.append(t_s, _played_until_s(flight))
+            shown_s, kept = thin(ends_s, np.append(side + inwards * reserve, side[-1] + inwards * reserve[-1]))
             limit = np.interp(shown_s, t_s, side)
             ax.fill_between(shown_s, sign * limit, sign * kept, step="post", color=colour("limit"), alpha=0.13, lw=0)
+
+
+def _played_until_s(flight: FlightData) -> float:
+    """End of the last tick that flew a plan [s]."""
+    last = next(d for d in reversed(flight.decisions) if d.plan_seq in flight.flown_plans)
+    return float(flight.seconds([last.at_ns + flight.tick_ns])[0])
 
 
 def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
@@ -196,7 +204,7 @@ def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawin
         else [design.position_of(e.mean) for e in flight.estimates]
     )
     t_s = flight.seconds([known.at_ns for known in flight.truths or flight.estimates])
-    flown = _thin(np.array(position).reshape(-1, 3)[t_s <= end_s])
+    flown = along(np.array(position).reshape(-1, 3)[t_s <= end_s])
     with canvas("plan-above", 2.5) as one:
         ax = one.axes("From above", "east [m]", "north [m]")
         for plan in chosen:
@@ -278,6 +286,16 @@ def thin(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
         for place in sorted({int(bucket.argmin()), int(bucket.argmax())})
     ]
     return t_s[index], values[index]
+
+
+def along(points: Floats) -> Floats:
+    """At most about POINTS rows (n, 3) of a way, evenly by the way gone: a long stay takes none from the journey."""
+    points = points.reshape(-1, 3)
+    finite = points[np.isfinite(points).all(axis=1)]
+    if len(finite) <= POINTS:
+        return finite
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(finite, axis=0), axis=1))])
+    return np.asarray(finite[np.unique(np.searchsorted(gone, np.linspace(0.0, gone[-1], POINTS)))])
 
 
 def _thin(points: Floats) -> Floats:

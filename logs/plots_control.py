@@ -162,11 +162,13 @@ def picture(flight: FlightData) -> str:
         draw_path(left, flight, ("east", "north"))
         right.set(title="Age of its position information", xlabel="time [s]", ylabel="age [steps]")
         draw_age(right, flight)
-        names = (("truth", "-", "flown"), ("sample", ".", "position used"), ("target", "*", "target"))
+        flown = "truth" if flight.truths else "estimate"
+        names = ((flown, "-", "flown"), ("sample", ".", "position used"), ("target", "*", "target"))
         marks = [right.plot([], [], mark, color=colour(role), label=name)[0] for role, mark, name in names]
         limit = right.plot([], [], color=colour("limit"), ls=DASHED, label="limits, horizon H")[0]
-        lost = right.plot([], [], "|", ms=7, color=colour("lost"), label="position lost")[0]
-        handles: list[Artist] = [*marks, limit, lost]
+        handles: list[Artist] = [*marks, limit]
+        if flight.truths:
+            handles += right.plot([], [], "|", ms=7, color=colour("lost"), label="position lost")
         if flight.spans(FALLBACK):
             handles.append(Patch(color=colour("fallback"), alpha=0.22, lw=0, label="fallback"))
         one.figure.legend(handles=handles, loc="outside lower center", ncols=6)

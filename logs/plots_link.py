@@ -14,6 +14,7 @@ from logs.verdict_link import LinkVerdict, delays_s
 
 _BINS = 40
 _LEAST_SHARE = 2e-5
+_LEAST_SPAN = 0.01  # of the axis: a delay configured without jitter is seen, too
 
 
 def link(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
@@ -67,13 +68,15 @@ def _delays(flight: FlightData, verdict: LinkVerdict) -> Drawing:
     delay = verdict.delay
     with canvas("link-delay", 2.5) as one:
         ax = one.axes("Capture to arrival, by the stamps", "delay [ms]", "positions")
-        if delay is not None and delay.promised_low_ms is not None and delay.promised_high_ms is not None:
-            low, high = delay.promised_low_ms, delay.promised_high_ms
-            ax.axvspan(low, max(high, low + 0.5), color=colour("limit"), alpha=0.13, lw=0)
         # One position that came very late would leave nothing of the others' shape.
         edge = float(np.percentile(shown_ms, 99.5)) * 1.3 + 1.0
-        counts, edges = np.histogram(np.minimum(shown_ms, edge), bins=_BINS)
+        counted_ms = np.minimum(shown_ms, edge)
+        counts, edges = np.histogram(counted_ms, _BINS, (min(0.0, counted_ms.min()), max(1.0, counted_ms.max())))
         ax.stairs(counts, edges, fill=True, color=colour("estimate"), alpha=0.6)
+        if delay is not None and delay.promised_low_ms is not None and delay.promised_high_ms is not None:
+            low, high = delay.promised_low_ms, delay.promised_high_ms
+            least = _LEAST_SPAN * max(high, edges[-1])
+            ax.axvspan(low, max(high, low + least), color=colour("limit"), alpha=0.13, lw=0)
         ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     label = "Histogram of the time from capture to arrival of the positions, with the span that was configured"
     return Drawing("link-delay", one.svg, label)

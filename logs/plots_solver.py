@@ -10,6 +10,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from logs.flight_data import FlightData
 from logs.plots import span
 from logs.plots_control import largest
+from logs.summary import SLACK_TOLERANCE
 from logs.svg import Drawing, canvas, colour, dots, power_of_ten
 from uavctl.data import Plan
 
@@ -28,7 +29,7 @@ def certificates(flight: FlightData) -> Iterator[Drawing]:
     """Certified gap of each plan, and the slack of those that gave way."""
     if any(np.isfinite(plan.gap) for plan in flight.plans):
         yield _gaps(flight)
-    gave = [plan for plan in flight.flown_plans.values() if plan.slack > 0.0 or plan.terminal_miss > 0.0]
+    gave = [plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE]
     if gave:
         yield _slack(flight, gave)
 
@@ -47,6 +48,9 @@ def _gaps(flight: FlightData) -> Drawing:
         ax.yaxis.set_major_formatter(power_of_ten)
         ax.margins(y=0.08)
         ax.autoscale_view()
+        low, high = np.log10(ax.get_ylim())
+        if np.floor(high) <= np.ceil(low):  # a single tick would say nothing of the scale
+            ax.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
         span(ax, flight)
     label = "Certified gap of each plan between its cost and the least possible, as a share of the cost, over time"
     return Drawing("plan-gap", one.svg, label)

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from logs.design_view import Floats
 from logs.flight_data import FlightData
-from logs.plots import DASHED, SEEN, span
+from logs.plots import DASHED, span
 from logs.statistics import normal_reach
 from logs.svg import Drawing, canvas, colour, dots, strokes
 from logs.verdict_clock import ClockVerdict, offsets
@@ -21,11 +21,10 @@ _MARGIN = 1.25
 
 def whiteness(axis: AxisVerdict) -> Drawing:
     """Correlation of an axis' errors with those of later positions."""
-    name = SEEN[axis.axis][0]
     lags = np.arange(1, len(axis.correlation) + 1, dtype=np.float64)
     values = np.array(axis.correlation)
     with canvas(f"white-{axis.axis}", 2.3) as one:
-        ax = one.axes(f"Whiteness, {name}", "positions apart", "correlation of errors")
+        ax = one.axes(f"Whiteness, {axis.axis}", "positions apart", "correlation of errors")
         ax.axhspan(-axis.correlation_bound, axis.correlation_bound, color=colour("target"), alpha=0.15, lw=0)
         ax.axhline(0.0, color=colour("muted"), lw=0.8)
         strokes(ax, (lags, np.zeros(len(lags))), (lags, values), colour("estimate"), 2.4)
@@ -34,7 +33,7 @@ def whiteness(axis: AxisVerdict) -> Drawing:
         ax.set_ylim(-reach, reach)
         ax.set_xlim(0.0, len(lags) + 1.0)
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    label = f"Correlation of the forecast's errors in {name} with those of later positions; white within the band"
+    label = f"Correlation of the forecast's errors {axis.axis} with those of later positions; white within the band"
     return Drawing(f"white-{axis.axis}", one.svg, label)
 
 
@@ -56,9 +55,8 @@ def coverage(leads: tuple[LeadVerdict, ...]) -> Drawing:
 
 def errors(flight: FlightData, axis: str, t_s: Floats, normalised: Floats) -> Drawing:
     """One-step errors of an axis over time, in foretold deviations."""
-    name = SEEN[axis][0]
     with canvas(f"error-{axis}", 2.3) as one:
-        ax = one.axes(f"Errors of the forecast, {name}", "time [s]", "foretold deviations")
+        ax = one.axes(f"Errors of the forecast, {axis}", "time [s]", "foretold deviations")
         reach = normal_reach()
         ax.axhspan(-reach, reach, color=colour("target"), alpha=0.15, lw=0)
         stride = max(1, -(-len(t_s) // MARKS))
@@ -66,13 +64,13 @@ def errors(flight: FlightData, axis: str, t_s: Floats, normalised: Floats) -> Dr
         most = max(4.0, 1.1 * float(np.abs(normalised).max(initial=0.0)))
         ax.set_ylim(-most, most)
         span(ax, flight)
-    return Drawing(f"error-{axis}", one.svg, f"Errors of the forecast in {name} over time, in foretold deviations")
+    return Drawing(f"error-{axis}", one.svg, f"Errors of the forecast {axis} over time, in foretold deviations")
 
 
 def clocks(flight: FlightData, verdicts: tuple[ClockVerdict, ...]) -> Iterator[Drawing]:
-    """Offsets about their straight line."""
+    """Offsets about their straight line, of clocks that strayed from it."""
     for number, verdict in enumerate(verdicts):
-        if verdict.residual_us is None:
+        if not verdict.residual_us:
             continue
         t_s, residual_s = offsets(flight, verdict.link)
         with canvas(f"clock-{number}", 2.3) as one:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import msgspec
 import numpy as np
 
-from uavctl.data import Decision, PositionSample, Record, Sink, StepInput
+from uavctl.data import Decision, LinkStats, PositionSample, Record, Sink, StepInput
 from uavctl.loop import ControlLoop
 
 
@@ -34,6 +34,7 @@ class ForeignReplay(msgspec.Struct, frozen=True, kw_only=True):
     decisions: int
     solves: dict[str, int]
     modes: dict[str, int]
+    left_out: dict[str, int]  # what the connection did not take, by reason
     age_ms: Quantiles | None  # capture -> arrival, after clock conversion
     age_steps: dict[str, int]  # at Δt boundaries
 
@@ -44,9 +45,15 @@ class _Collector:
     def __init__(self) -> None:
         self.samples: list[PositionSample] = []
         self.decisions: list[Decision] = []
+        self.stats: dict[str, LinkStats] = {}  # the last of each connection
+        self.over = False  # the flight is, and only the counters are waited for
 
     def put(self, _topic: str, _at_ns: int, record: Record) -> None:
-        if isinstance(record, StepInput):
+        if isinstance(record, LinkStats):
+            self.stats[record.link] = record
+        elif self.over:
+            return
+        elif isinstance(record, StepInput):
             self.samples.extend(record.samples)
         elif isinstance(record, Decision):
             self.decisions.append(record)
@@ -78,13 +85,19 @@ def replay_tlog(
             tick += 1
         loop.receive(link, data, at_ns)
         datagrams += 1
-    if start_ns is not None:  # the tick that sees the last packets
-        deque(loop.tick(tick, start_ns + tick * tick_ns), maxlen=0)
-        tick += 1
-    return _figures(collector, datagrams, tick)
+    if start_ns is None:
+        return _figures(collector, link, datagrams, tick)
+    end_ns = start_ns + tick * tick_ns
+    deque(loop.tick(tick, end_ns), maxlen=0)  # sees the last packets
+    tick += 1
+    collector.over, later = True, tick
+    while collector.stats[link].at_ns < end_ns:  # they are told once a second
+        deque(loop.tick(later, start_ns + later * tick_ns), maxlen=0)
+        later += 1
+    return _figures(collector, link, datagrams, tick)
 
 
-def _figures(collector: _Collector, datagrams: int, ticks: int) -> ForeignReplay:
+def _figures(collector: _Collector, link: str, datagrams: int, ticks: int) -> ForeignReplay:
     captured = np.array([s.captured_ns for s in collector.samples], dtype=np.int64)
     age_ms = np.array([(s.received_ns - s.captured_ns) * 1e-6 for s in collector.samples])
     boundaries = [d for d in collector.decisions if d.boundary]
@@ -99,6 +112,7 @@ def _figures(collector: _Collector, datagrams: int, ticks: int) -> ForeignReplay
         decisions=len(boundaries),
         solves=dict(Counter(d.solve.value for d in collector.decisions if d.solve is not None)),
         modes=dict(Counter(d.mode.value for d in collector.decisions)),
+        left_out=dict(sorted(collector.stats[link].bad.items())) if link in collector.stats else {},
         age_ms=_quantiles(age_ms),
         age_steps={str(age): count for age, count in sorted(ages.items())},
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from logs import page, plots, plots_control, plots_link, plots_solver
 from logs.flight_data import FALLBACK, FlightData
+from logs.outputs import write_whole
 from logs.page import Mark, Section
 from logs.path3d import path_3d
 from logs.plots_control import picture
@@ -17,9 +18,8 @@ from logs.summary import FlightSummary, rows
 from logs.timeline import timeline
 from logs.verdict_link import LinkVerdict
 from logs.verdicts import Judged, judge
-from logs.words import story
+from logs.words import part_begins, story
 from uavctl.data import Event
-from uavctl.errors import RecordingError
 
 __all__ = ["picture", "report_html", "write_report"]
 
@@ -38,11 +38,7 @@ def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged:
     Raises:
         RecordingError: the file cannot be written.
     """
-    text = report_html(flight, summary, judged)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    write_whole(path, report_html(flight, summary, judged))
 
 
 def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | None = None) -> str:
@@ -51,12 +47,15 @@ def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | Non
     header = flight.header
     name = _config_name(header.config_toml)
     title = f"Flight “{name}”" if name else "Flight"
+    title += ", a part" if part_begins(flight) else ""
     subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
     return page.page(title, subtitle, story(flight, summary), _sections(flight, summary, judged))
 
 
 def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Iterator[Section]:
-    yield Section("Summary", "", page.facts([*rows(summary), *verdict_rows(judged.verdicts)]))
+    begins = part_begins(flight)
+    part = [("Part of a flight", f"begins at {begins}")] if begins else []
+    yield Section("Summary", "", page.facts([*part, *rows(summary), *verdict_rows(judged.verdicts)]))
     yield _timeline_section(flight)
     yield _path_section(flight)
     yield _axes_section(flight)
@@ -128,6 +127,8 @@ def _age_section(flight: FlightData) -> Section:
 
 def _link_section(flight: FlightData, verdict: LinkVerdict) -> Section:
     drawings = list(plots_link.link(flight, verdict))
+    bound = (Mark("thin", "estimate", "lower bound in flight"),) if flight.link_estimates else ()
+    horizon = (Mark("dotted", "muted", f"horizon H = {flight.design.horizon}"),) if verdict.ages else ()
     note = "The dashed line is what the design counts on, by the link of the configuration."
     if verdict.delay is not None and verdict.delay.from_quickest:
         note += " Delays are short of the quickest one, as the sender's clock is only known by it."
@@ -137,9 +138,13 @@ def _link_section(flight: FlightData, verdict: LinkVerdict) -> Section:
         page.paragraph(verdict.text) + (page.grid(drawings) if drawings else ""),
         (
             Mark("line", "estimate", "measured"),
+            *bound,
             Mark("dashed", "limit", "promised"),
-            Mark("band", "limit", "configured"),
-        ),
+            *horizon,
+            Mark("band", "limit", "delay configured"),
+        )
+        if drawings
+        else (),
     )
 
 

@@ -8,7 +8,7 @@ from logs import page, plots_verdicts
 from logs.flight_data import FlightData
 from logs.page import Mark, Section
 from logs.statistics import LEVEL, Share
-from logs.verdict_clock import ClockVerdict
+from logs.verdict_clock import ClockVerdict, plain
 from logs.verdict_model import AxisVerdict, LeadVerdict
 from logs.verdict_risk import LimitRisk
 from logs.verdicts import Judged, Verdicts
@@ -57,8 +57,8 @@ def _risk(verdicts: Verdicts) -> Section:
     if risk.unpromised:
         body.append(
             page.note(
-                f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: the first one, those in the "
-                "fallback, and those after a plan in which a constraint gave way."
+                f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: it takes a plan that was "
+                "flown in the step before, and in which no constraint gave way."
             )
         )
     note = (
@@ -113,7 +113,8 @@ def _model(flight: FlightData, judged: Judged) -> Section:
         "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is foretold for "
         "the inputs that were then flown."
     )
-    return Section(title, note, "".join(body), (_ESTIMATE, _BAND, Mark("dashed", "limit", "promised")))
+    legend = (_ESTIMATE, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()
+    return Section(title, note, "".join(body), legend)
 
 
 def _axis_row(one: AxisVerdict) -> tuple[str, ...]:
@@ -122,7 +123,7 @@ def _axis_row(one: AxisVerdict) -> tuple[str, ...]:
         f"{1e3 * one.rms_m:.3g}",
         f"{one.variance**0.5:.2f}{_mark(one.variance_refuted)}",
         f"{one.variance_low**0.5:.2f} … {one.variance_high**0.5:.2f}",
-        f"{one.mean:+.2f}{_mark(one.mean_refuted)}".replace("-", "−"),
+        f"{round(one.mean, 2) + 0.0:+.2f}{_mark(one.mean_refuted)}".replace("-", "−"),
         f"{_p(one.whiteness_p)}{_mark(one.whiteness_refuted)}",
     )
 
@@ -159,7 +160,7 @@ def _clocks(flight: FlightData, verdicts: Verdicts) -> Section:
 
 def _clock_row(one: ClockVerdict) -> tuple[str, ...]:
     def figure(value: float | None) -> str:
-        return "–" if value is None else f"{value:.3g}".replace("-", "−")
+        return "–" if value is None else plain(value)
 
     return (
         one.link,
@@ -180,4 +181,4 @@ def _percent(share: float) -> str:
 
 
 def _p(value: float) -> str:
-    return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}".replace("e-0", "e-").replace("-", "−")
+    return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"

@@ -50,7 +50,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     steps: int  # flown Δt boundaries
     duration_s: float  # first tick to the end of the last
-    received: int  # positions: sent - lost when simulated, else samples accepted
+    received: int  # positions: sent - lost when simulated, else samples accepted; in a part of a flight, those of it
     lost: int | None  # positions that the simulated channel lost; None for a real flight
     max_age: int  # largest age of information at a flown boundary [steps]
     fallbacks: int  # entries into braking, holding or landing, but for the operator's stop
@@ -78,6 +78,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     final_error_m: float | None  # distance from the target at the last flown boundary
     recorder_dropped: int  # records that the disk was too slow for
     ended: Ending
+    breaks_off: bool = False  # the recording was not closed in order
 
 
 def summarise(
@@ -96,15 +97,15 @@ def summarise(
     flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}
     accepted = sum(d.accepted for d in flight.decisions)
-    last = flight.truths[-1] if flight.truths else None
+    received, lost = _channel(flight)
     solves = [d.solve for d in flight.decisions if d.solve is not None]
     error_m = position_error_m(flight)
     settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
     return FlightSummary(
         steps=len(steps),
         duration_s=round(flight.duration_s, 9),
-        received=accepted if last is None else last.sent - last.lost,
-        lost=None if last is None else last.lost,
+        received=max(received, accepted),  # the last truth may be older than the last position
+        lost=lost,
         max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
         fallbacks=_fallback_entries([d.mode for d in flight.flown]),
         state_violations=int(np.count_nonzero(state_outside(flight))),
@@ -133,7 +134,17 @@ def summarise(
         final_error_m=float(error_m[-1]) if len(error_m) else None,
         recorder_dropped=recorder_dropped,
         ended=_ending(flight),
+        breaks_off=flight.breaks_off,
     )
+
+
+def _channel(flight: FlightData) -> tuple[int, int | None]:
+    """Positions that the simulated channel brought and lost, in this part of the flight; 0 and None without one."""
+    if not flight.truths:
+        return 0, None
+    first, last = flight.truths[0], flight.truths[-1]
+    sent, lost = (last.sent - first.sent, last.lost - first.lost) if flight.part else (last.sent, last.lost)
+    return sent - lost, lost
 
 
 def _methods(s: FlightSummary) -> str:
@@ -178,7 +189,8 @@ def spread(values_us: Floats) -> Spread:
     if not len(values_us):
         return Spread()
     p50, p99 = np.percentile(values_us, [50, 99])
-    return Spread(p50=float(p50), p99=float(p99), max=float(values_us.max()))
+    # To the nanosecond that was measured: more digits are the division's.
+    return Spread(p50=round(float(p50), 3), p99=round(float(p99), 3), max=round(float(values_us.max()), 3))
 
 
 def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
@@ -198,7 +210,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
     found = [
         ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
-        ("Ended", s.ended.value),
+        ("Ended", f"{s.ended.value}; the recording breaks off" if s.breaks_off else s.ended.value),
         ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
         ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),

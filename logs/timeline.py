@@ -93,7 +93,7 @@ def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
         if not _fits(one, character_s):
             texts.setdefault(one.role, {})[one.text] = None
     for role, told in texts.items():
-        yield Mark("band", role, ", ".join(told))
+        yield Mark("band", role, " · ".join(told))
 
 
 def lanes(flight: FlightData) -> Iterator[Lane]:

@@ -102,6 +102,12 @@ _SOURCES = {
 }
 
 
+def plain(value: float) -> str:
+    """A figure for people: three digits, all of those before the point, never an exponent."""
+    told = f"{value:.0f}" if abs(value) >= 999.5 or abs(value) < 5e-4 else f"{value:.3g}"
+    return told.removeprefix("-") if told == "-0" else told.replace("-", "−")
+
+
 def _text(found: ClockVerdict) -> str:
     told = f"The offset of “{found.link}” was found {_SOURCES.get(found.source, found.source)}"
     if found.residual_us is None or found.drift_ppm is None:
@@ -109,9 +115,9 @@ def _text(found: ClockVerdict) -> str:
     trip = "" if found.rtt_ms is None else f"; a round trip took {found.rtt_ms:.3g} ms"
     refused = f"; {found.rejected} answers were refused" if found.rejected else ""
     return (
-        f"{told}; it drifted by {found.drift_ppm:.3g} ppm and moved by "
+        f"{told}; it drifted by {plain(found.drift_ppm)} ppm and moved by "
         f"{duration(found.residual_us)} about that (root mean square){trip}{refused}."
-    ).replace(" -", " −")
+    )
 
 
 def judge_stamps(flight: FlightData) -> StampVerdict | None:

@@ -112,7 +112,8 @@ def _promises(config: Config | None) -> tuple[float | None, tuple[float, ...]]:
     except DesignError:
         return None, ()
     ages = model.age(_LONG)[_LONG]
-    return promised(model), tuple(ages[: np.flatnonzero(ages > _RARE)[-1] + 1].tolist())
+    shown = ages[: np.flatnonzero(ages > _RARE)[-1] + 1].tolist()
+    return promised(model), tuple(float(f"{share:.12g}") for share in shown)  # 0.16, not 0.15999999999999998
 
 
 def _lost(flight: FlightData) -> Share | None:
@@ -161,9 +162,12 @@ def _text(found: LinkVerdict, independent: bool) -> str:
     if news.high < found.promised_news:
         told = f"{seen}, where the design counts on {least}: fewer than promised."
     else:
-        told = f"{seen}, where the design counts on {least} at least: nothing speaks against it."
+        chance = "nothing speaks against it" if news.rate >= found.promised_news else "so few may still be chance"
+        told = f"{seen}, where the design counts on {least} at least: {chance}."
     if found.bursts and independent:
-        told += f" Losses come in bursts (z = {found.burst_statistic:.2g}), where the model takes them for independent."
+        told += (
+            f" But losses come in bursts (z = {found.burst_statistic:.2g}), where the model takes them for independent."
+        )
     late = found.delay.late if found.delay is not None else None
     if late is not None and late.hits:
         told += f" {count(late.hits, 'position')} of {late.trials} took longer than the longest delay configured."

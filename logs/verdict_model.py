@@ -145,25 +145,27 @@ def _leads(found: Innovations, axes: int, dt_s: float) -> tuple[LeadVerdict, ...
         held = share(int(np.count_nonzero(inside[chosen])), int(np.count_nonzero(chosen)), len(leads))
         refuted = not held.low <= PROMISED_INSIDE <= held.high
         verdicts.append(
-            LeadVerdict(lead_steps=lead, lead_s=lead * dt_s, promised=PROMISED_INSIDE, inside=held, refuted=refuted)
+            LeadVerdict(
+                lead_steps=lead, lead_s=round(lead * dt_s, 9), promised=PROMISED_INSIDE, inside=held, refuted=refuted
+            )
         )
     return tuple(verdicts)
 
 
 def _text(axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...], count: int) -> str:
     if not axes:
-        return f"{count} positions in flown time are too few to judge the model; {FEWEST} are the least."
+        return f"{count} forecasts of a position in flown time are too few to judge the model; {FEWEST} are the least."
     return " ".join((_errors_text(axes, count), _leads_text(leads)))
 
 
 def _errors_text(axes: tuple[AxisVerdict, ...], count: int) -> str:
-    large = _each([one for one in axes if one.variance_refuted and one.variance > 1.0], lambda one: one.variance**0.5)
-    small = _each([one for one in axes if one.variance_refuted and one.variance < 1.0], lambda one: one.variance**0.5)
+    large = _times([one for one in axes if one.variance_refuted and one.variance > 1.0])
+    small = _times([one for one in axes if one.variance_refuted and one.variance < 1.0])
     tells = _each([one for one in axes if one.whiteness_refuted], lambda one: one.correlation[0])
     off = _each([one for one in axes if one.mean_refuted], lambda one: one.mean)
     found = [
-        *([f"the errors are {large} times the foretold ones, so back-offs are too small"] if large else ()),
-        *([f"the errors are only {small} times the foretold ones, so it is cautious"] if small else ()),
+        *([f"errors are larger than foretold ({large}), so back-offs are too small"] if large else ()),
+        *([f"errors are smaller than foretold ({small}), so it is cautious there"] if small else ()),
         *([f"an error tells of the next (correlation {tells})"] if tells else ()),
         *([f"the errors are {off} deviations off on average"] if off else ()),
     ]
@@ -173,6 +175,11 @@ def _errors_text(axes: tuple[AxisVerdict, ...], count: int) -> str:
             "speaks against the model."
         )
     return f"Over {count} positions the model is not the vehicle: {'; '.join(found)}."
+
+
+def _times(axes: list[AxisVerdict]) -> str:
+    """Sizes of errors of some axes over the foretold ones, as in "0.8 × east, 0.7 × down"; empty without any."""
+    return ", ".join(f"{one.variance**0.5:.2g} × {one.axis}" for one in axes)
 
 
 def _each(axes: list[AxisVerdict], value: Callable[[AxisVerdict], float]) -> str:

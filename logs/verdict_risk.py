@@ -51,7 +51,7 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
     steps = flight.steps
     trial, promised = _trials(flight)
     rows = _rows_outside(flight)
-    risk_x, risk_u = (None, None) if config is None else (1.0 - config.smpc.delta_x, 1.0 - config.smpc.delta_u)
+    risk_x, risk_u = (None, None) if config is None else map(_risk, (config.smpc.delta_x, config.smpc.delta_u))
     tests = 2 + rows.shape[1]
     limits = [
         _limit("all states", risk_x, state_outside(flight), trial, tests),
@@ -69,6 +69,11 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
         unpromised=len(steps) - int(np.count_nonzero(promised)),
         source="truth" if steps.from_truth else "estimate",
     )
+
+
+def _risk(likelihood: float) -> float:
+    """What is left to 1, in the decimals that people write a likelihood with: 0.05, not 0.050000000000000044."""
+    return round(1.0 - likelihood, 12)
 
 
 def _limit(name: str, promised: float | None, outside: Flags, trial: Flags, tests: int) -> LimitRisk:

@@ -8,7 +8,7 @@ import numpy as np
 
 from logs.flight_data import FALLBACK, FLOWN, FlightData
 from logs.moving_limits import box_at
-from logs.summary import Ending, FlightSummary, count, input_outside, number, position_error_m, state_outside
+from logs.summary import Ending, FlightSummary, count, duration, input_outside, number, position_error_m, state_outside
 from uavctl.data import ControlMode
 from uavctl.naming import severity, tell, worst
 
@@ -25,25 +25,63 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Sentences that say what happened; each is true of this flight's data."""
     if summary.final_error_m is None or summary.settled_error_m is None:
         last = (flight.flown or flight.decisions)[-1]
-        return [f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}."]
+        return [*_part(flight), f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}.", *_cut(flight)]
     return [
+        *_part(flight),
         _engaged(flight, summary, summary.final_error_m, summary.settled_error_m),
         _silence(flight, summary),
         _fallback(flight, summary),
         _state_limits(flight, summary),
         _input_limits(flight, summary),
         _plans(flight, summary),
+        *_amiss(summary),
         *(_trajectory(flight) if summary.trajectory else _waypoints(flight)),
         _ending(flight, summary),
+        *_cut(flight),
     ]
+
+
+def part_begins(flight: FlightData) -> str:
+    """Where in its flight a recording begins that lacks the first ticks, as a later file does; empty if it has them."""
+    first = flight.decisions[0]
+    if not flight.part:
+        return ""
+    into_s = first.tick * flight.tick_ns * 1e-9
+    return f"tick {first.tick}" + (f", {number(into_s)} s into the flight" if into_s else "")
+
+
+def _part(flight: FlightData) -> list[str]:
+    begins = part_begins(flight)
+    which = f"file {flight.notes[0].segment}" if flight.notes and flight.notes[0].segment > 1 else "a part"
+    return [f"This is {which} of a flight: it begins at {begins}. All times count from there."] if begins else []
+
+
+def _cut(flight: FlightData) -> list[str]:
+    """Why there is no more of it, where that is not the flight's end."""
+    if not flight.notes:
+        return []
+    text = flight.notes[-1].text
+    if text.startswith("recovered"):
+        return [f"The recording was {text}."]
+    if text.startswith("goes on in"):
+        return ["The flight goes on in the next file."]
+    if flight.breaks_off:
+        return [
+            "The recording breaks off here: it was not closed in order (the process was killed, the power failed, or "
+            "the file was cut)."
+        ]
+    return []
 
 
 def _engaged(flight: FlightData, s: FlightSummary, final_m: float, settled_m: float) -> str:
     begun_s = flight.spans(FLOWN)[0][0]
+    took = f"took over {_after(begun_s)} and flew"
+    if begun_s == 0 and flight.part:
+        took = "was flying already, and flew"
     start_m = position_error_m(flight)[0]
     seen = "" if s.state_source == "truth" else ", by the estimate"
     return (
-        f"The controller took over {_after(begun_s)} and flew {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
+        f"The controller {took} {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
         f"It began {number(start_m)} m from the {_goal(s)} and ended {number(final_m)} m from it{seen}; "
         f"over the last quarter the distance was {number(settled_m)} m (root mean square)."
     )
@@ -128,6 +166,22 @@ def _plans(flight: FlightData, s: FlightSummary) -> str:
     if s.slack_used:
         slack = f"in {s.slack_used} flown a constraint gave way{_gave_way(flight)}"
     return f"{count(s.solves, 'plan')} {_were(s.solves)} computed, {ended}; {slack}."
+
+
+def _amiss(s: FlightSummary) -> list[str]:
+    """What went wrong beside the flight: time, and the record of it."""
+    told = []
+    if s.missed_ticks:
+        late = (
+            "" if s.tick_lateness_us.max is None else f"; the latest tick began {duration(s.tick_lateness_us.max)} late"
+        )
+        told.append(f"{count(s.missed_ticks, 'tick')} {_were(s.missed_ticks)} missed{late}.")
+    if s.recorder_dropped:
+        lack = count(s.recorder_dropped, "record")
+        told.append(
+            f"{lack} {_were(s.recorder_dropped)} dropped because the disk was too slow, and missing from all figures."
+        )
+    return told
 
 
 def _gave_way(flight: FlightData) -> str:

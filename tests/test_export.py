@@ -9,7 +9,7 @@ import re
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,17 +17,21 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 import view_rig
-from recording_fakes import flight, record_flight
+from recording_fakes import record_flight
 from test_flat import tabulate
 
 from logs.chunks import Message
 from logs.disk import DiskFile
 from logs.export import TableFormat, export_tables, file_stem
-from logs.reader import good_messages, read
+from logs.export_tlog import export_tlog
+from logs.onlookers import Onlookers
+from logs.reader import good_messages, read, segment_files
 from logs.recorder import SyncRecorder
 from logs.segment import Entry, Segment
 from logs.topics import Definition
+from logs.views import Views
 from uavctl.cli.app import run
+from uavctl.config.log import LogConfig
 from uavctl.data import Event, LinkStats, Record, Setpoint, SetpointSource, Severity, Timing
 from uavctl.errors import RecordingError, UsageError
 
@@ -294,12 +298,19 @@ def test_people_are_shown_what_was_written(tmp_path: Path, capsys: pytest.Captur
     assert f"in {tmp_path / 'flight-csv'}" in shown.replace("\n", "")
 
 
-def test_progress_sees_every_message(tmp_path: Path) -> None:
+@pytest.mark.parametrize("files", [1, 3])
+def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, files: int) -> None:
     path = tmp_path / "flight.mcap"
-    record_flight(path, 30)
+    segment_bytes = 10**9 if files == 1 else view_rig.record(path).stat().st_size * 2 // 5
+    path.unlink(missing_ok=True)
+    recorder = SyncRecorder(path, LogConfig(segment_bytes=segment_bytes), onlookers=Onlookers(Views()))
+    for entry in view_rig.flown().entries:
+        recorder.put(*entry)
+    assert recorder.close().ok and len(segment_files(path)) == files
+    whole = sum(1 for _ in good_messages(path))
     seen: list[tuple[str, int | None, int]] = []
 
-    def watch(messages: Any, total: int | None, what: str) -> Iterator[Message]:
+    def watch(messages: Iterable[Message], total: int | None, what: str) -> Iterator[Message]:
         count = 0
         for message in messages:
             count += 1
@@ -307,5 +318,20 @@ def test_progress_sees_every_message(tmp_path: Path) -> None:
         seen.append((what, total, count))
 
     export_tables(path, tmp_path / "out", TableFormat.CSV, watch=watch)
-    whole = len(flight(30)) + 2  # the recorder's first and last word
-    assert seen == [("reading", None, whole), ("writing", whole, whole)]
+    assert seen == [("reading", whole, whole), ("writing", whole, whole)]
+    export_tlog(path, tmp_path / "a.tlog", watch=watch)
+    assert seen[2:] == [("writing", whole, whole)]
+    last = segment_files(path)[-1]
+    last.write_bytes(last.read_bytes()[:-100])
+    export_tlog(path, tmp_path / "b.tlog", watch=watch)
+    assert seen[3][:2] == ("writing", None)
+
+
+@pytest.mark.parametrize("arguments", [["--to", "csv"], ["--to", "tlog"], ["--to", "tlog", "--link", "radio"]])
+def test_an_error_is_one_line(tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "flight.mcap"
+    if "--link" in arguments:
+        record_flight(path, 30)
+    assert run(["log", "export", str(path), *arguments]) != 0
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and told.count("\n") == 1

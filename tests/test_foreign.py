@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from functools import cache
 from pathlib import Path
 
 import pytest
+from foreign_rig import DATA, TLOGS, by_tlog, flown, rows_of, write
 from loopback_rig import lockstep, make_loop
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from logs.foreign import ForeignMcap, is_foreign, read_mcap
 from logs.recorder import SyncRecorder
@@ -21,40 +21,6 @@ from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, raw_topic
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import VEHICLE
-
-DATA = Path(__file__).parent / "data"
-TLOGS = ("arducopter-vicon.tlog", "px4-offboard.tlog", "hand-over-arducopter-gps.tlog")
-Row = tuple[str, str, int, bytes]  # topic, encoding, log time, message
-
-
-def write(path: Path, rows: list[Row], *, finish: bool = True, **options: object) -> Path:
-    """An MCAP by the official writer."""
-    with path.open("wb") as file:
-        writer = Writer(file, **options)  # type: ignore[arg-type]
-        writer.start(profile="", library="another program")
-        channels: dict[tuple[str, str], int] = {}
-        for number, (topic, encoding, at_ns, data) in enumerate(rows):
-            if (topic, encoding) not in channels:
-                channels[topic, encoding] = writer.register_channel(topic, encoding, schema_id=0)
-            writer.add_message(channels[topic, encoding], at_ns, data, at_ns, number)
-        if finish:
-            writer.finish()  # type: ignore[no-untyped-call]
-    return path
-
-
-def rows_of(tlog: str, topic: str = "/mavlink", encoding: str = "mavlink") -> list[Row]:
-    return [(topic, encoding, packet.at_ns, packet.data) for packet in read_tlog(DATA / tlog)]
-
-
-def flown(packets: tuple[TlogPacket, ...]) -> ForeignReplay:
-    config = load_config("room", ["daemon.vehicle=tlog", "daemon.mocap=tlog", "solver.method=exact"])
-    incoming = [(packet.at_ns, packet.data) for packet in packets if not packet.outgoing]
-    return replay_tlog(incoming, lambda sink: make_loop(config, sink), link=VEHICLE, tick_ns=50_000_000)
-
-
-@cache
-def by_tlog(name: str) -> ForeignReplay:
-    return flown(read_tlog(DATA / name).packets)
 
 
 @pytest.mark.parametrize("encoding", ["mavlink", "", "x-mavlink", "application/octet-stream"])

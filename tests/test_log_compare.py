@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ import msgspec
 import numpy as np
 import pytest
 from loopback_rig import Memory, lockstep
+from report_rig import unwritten, walk
 from rich.console import Console
 
 from logs.compare import Comparison, compare
 from logs.compare_figures import Figure
+from logs.compare_page import comparison_html
 from logs.compare_side import load_all
 from logs.flight_data import FlightData
 from logs.recorder import SyncRecorder
@@ -176,8 +179,25 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
     for part in ('id="path-above"', 'id="position-north"', 'id="age"', "sim.seed", "distance from target"):
         assert part in text
     assert "<script" not in text and "http" not in text
+    seen = walk(text)
+    assert "How alike they are" in seen.text
+    assert any(cell.startswith("−") for cell in seen.text)
+    assert not any(re.fullmatch(r"-[\d.e]+", cell) for cell in seen.text)
     assert run(["log", "compare", str(a), str(b)]) == 0
     assert "Parameters that differ" in capsys.readouterr().out
+
+
+def test_a_page_of_many_flights_has_tables_that_paper_can_hold(base: Memory, other: Memory, tmp_path: Path) -> None:
+    paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
+    loaded = load_all([*paths, *paths, paths[0]])
+    found = compare(loaded)
+    with unwritten():
+        page = comparison_html(found, loaded)
+    heads = [re.findall(r"<th>|<th class=\"number\">", head) for head in re.findall(r"<thead>.*?</thead>", page)]
+    assert max(map(len, heads)) <= 8
+    for name in "BCDE":
+        assert page.count(f">{name} − A<") == 1
+    assert page.count(">positions received<") == 2
 
 
 def test_refusals(base: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -185,7 +205,9 @@ def test_refusals(base: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run(["log", "compare", str(a)]) == 2
     capsys.readouterr()
     assert run(["log", "compare", str(a), str(tmp_path / "none.mcap")]) == 1
-    assert "none.mcap: no such recording" in capsys.readouterr().err.replace("\n", "")
+    err = capsys.readouterr().err
+    assert err.startswith("error:")  # no empty line of a bar that nobody sees
+    assert "none.mcap: no such recording" in err.replace("\n", "")
     data = bytearray(a.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "damaged.mcap").write_bytes(data)

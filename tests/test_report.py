@@ -21,6 +21,12 @@ from logs.svg import PALETTE, compact
 from uavctl.data import Checked, ControlMode, Decision, Estimate, Plan, Record, StepInput, Timing, Truth
 from uavctl.errors import RecordingError
 
+SECTIONS = [
+    *("What happened", "Summary", "Timeline", "Path", "Each axis against its limits", "Age of information"),
+    *("The link, estimated against promised", "Inputs", "Plans against what was flown", "Certificates and slack"),
+    *("Time taken", "Events", "Verdict: promised risk against measured"),
+    *("Verdict: the model against what was flown", "Verdict: clocks", "Configuration and parameters", "Made with"),
+]
 ROOM_PLOTS = (
     {"path-above", "path-side", "age-wide", "age-narrow", "plan-index", "plan-above", "time-decision", "time-late"}
     | {"timeline-wide", "timeline-narrow", "path-3d-wide", "path-3d-narrow", "age-share", "link-delay", "plan-gap"}
@@ -45,6 +51,10 @@ def test_every_plot_is_there_and_says_what_it_shows(room_html: str) -> None:
     assert set(seen.plots) == ROOM_PLOTS
     assert all(len(label) > 20 for label in seen.plots.values())
     assert seen.lang == "en"
+
+
+def test_sections_are_these_in_this_order(judged_html: str) -> None:
+    assert re.findall(r"<h2[^>]*>(.*?)</h2>", judged_html) == SECTIONS
 
 
 def test_nothing_comes_from_outside(room_html: str) -> None:

@@ -9,6 +9,8 @@ from synthetic_flight import fly
 from synthetic_scene import room
 
 from logs.flight_data import FlightData
+from logs.summary import Spread, summarise
+from logs.words import story
 from uavctl.data import ControlMode, Decision, Record, StepInput
 
 TICK_S = room().tick_s
@@ -74,3 +76,14 @@ def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
 def test_a_simulated_flight_that_never_began_has_a_page() -> None:
     assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.WAIT})
     assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.STOPPED}, stop_tick=0)
+
+
+def test_what_went_amiss_is_told() -> None:
+    flight = FlightData.from_records(fly(room(), 4.0))
+    good = summarise(flight, wall_s=1.0)
+    assert not any("missed" in sentence or "dropped" in sentence for sentence in story(flight, good))
+    times = Spread(p50=100.0, p99=900.0, max=73_400.0)
+    bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
+    told = story(flight, bad)
+    assert "3 ticks were missed; the latest tick began 73.4 ms late." in told
+    assert "1 record was dropped because the disk was too slow, and missing from all figures." in told

@@ -71,7 +71,7 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
         capsys, "log", "whatif", str(flown), "--controller", "lqg", "--set", "link.loss=0.2", "--out", str(tmp_path)
     )
     assert code == 0
-    assert text.startswith("Reproduced with nothing changed, bit for bit: states within 0.0e+00")
+    assert text.startswith("Reproduced with nothing changed, bit for bit.")
     assert text.index("Reproduced") < text.index("Model (the recording's [plant])") < text.index("what-if")
     assert "Changed: link.loss=0.2; controller lqg; link: configured." in text
     assert "lqg" in text and "Decision time" not in text

@@ -1,21 +1,28 @@
-"""The page in a real browser: nothing on its console, every figure drawn, nothing beyond the edge, no text on text."""
+"""Pages in a real browser: nothing on the console, every figure drawn, nothing beyond the edge, no text on text."""
 
 from __future__ import annotations
 
+import base64
 import json
-import re
+import os
 import shutil
 import subprocess
 import sys
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 LIMIT_S = 60.0
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-# Measures the page from inside and leaves the figures in its title. Texts of one figure must not lie on each other.
+WIDTHS = (390, 500, 800, 1400)
+PAPER = 690  # pixels between the margins of A4
+# Measures the page from inside. Texts of one figure must not lie on each other, nor reach beyond it; what scrolls
+# on a screen is cut on paper.
 PROBE = """
-<script>
+(() => {
 const shown = [...document.querySelectorAll('figure')].filter(f => f.getBoundingClientRect().width > 0);
 const on = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1.5
   && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1.5;
@@ -28,13 +35,86 @@ for (const figure of shown) {
     for (const [other, at] of texts.slice(i + 1)) if (on(box, at)) clashes.push(figure.id + ': ' + name + '|' + other);
   });
 }
-document.title = JSON.stringify({
+const hidden = [...document.querySelectorAll('pre,.card')]
+  .filter(e => e.checkVisibility() && e.scrollWidth > e.clientWidth + 1);
+return {
   wide: document.documentElement.scrollWidth, seen: document.documentElement.clientWidth,
-  figures: shown.length, flat: shown.filter(f => f.getBoundingClientRect().height < 60).map(f => f.id), clashes, cut,
+  figures: shown.map(f => f.id), flat: shown.filter(f => f.getBoundingClientRect().height < 60).map(f => f.id),
+  clashes, cut, hidden: hidden.map(e => e.textContent.slice(0, 80)), words: document.body.innerText,
   background: getComputedStyle(document.body).backgroundColor,
-});
-</script>
+};
+})()
 """
+
+
+class Browser:
+    """A headless browser, told what to do by the DevTools protocol over pipes."""
+
+    def __init__(self, folder: Path) -> None:
+        (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
+        # The browser reads from descriptor 3 and writes to 4. (Some shells know no descriptor above 9.)
+        self._process = subprocess.Popen(
+            ["bash", "-c", f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}', browser(), "--headless", "--no-sandbox",
+             "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={folder}"],
+            pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._out, self._in = os.fdopen(ours_out, "wb", 0), os.fdopen(ours_in, "rb", 0)
+        self._rest, self._count, self._session = b"", 0, ""
+        self._events: deque[dict[str, Any]] = deque()
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        """What the browser answers to a command."""
+        self._count += 1
+        command: dict[str, object] = {"id": self._count, "method": method, "params": parameters}
+        if self._session:
+            command["sessionId"] = self._session
+        self._out.write(json.dumps(command).encode() + b"\0")
+        while (message := self._next()).get("id") != self._count:
+            self._events.append(message)
+        assert "error" not in message, message
+        found: dict[str, Any] = message["result"]
+        return found
+
+    def open(self, page: Path, width: int, *, dark: bool = False, paper: bool = False) -> tuple[dict[str, Any], str]:
+        """What the probe finds in a page, and what that said on the console."""
+        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        self.call("Emulation.setEmulatedMedia", media="print" if paper else "", features=scheme)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 600
+        )
+        self._events.clear()
+        self.call("Page.navigate", url=page.as_uri())
+        while not any(event.get("method") == "Page.loadEventFired" for event in self._events):
+            self._events.append(self._next())
+        found = self.call("Runtime.evaluate", expression=PROBE, returnByValue=True)["result"]["value"]
+        told = ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
+        return found, "\n".join(json.dumps(event) for event in self._events if event.get("method") in told)
+
+    def pdf(self) -> bytes:
+        """The page that is open, on paper."""
+        return base64.b64decode(self.call("Page.printToPDF", printBackground=True)["data"])
+
+    def close(self) -> None:
+        self._session = ""
+        self.call("Browser.close")
+        self._process.wait(LIMIT_S)
+        self._out.close()
+        self._in.close()
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            some = self._in.read(1 << 20)
+            assert some, "the browser has ended"
+            self._rest += some
+        text, _, self._rest = self._rest.partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        return message
 
 
 def browser() -> str:
@@ -46,51 +126,80 @@ def browser() -> str:
 
 
 @pytest.fixture(scope="module")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    one = Browser(tmp_path_factory.mktemp("browser"))
+    yield one
+    one.close()
+
+
+def uavctl(*arguments: str) -> None:
+    run = [sys.executable, "-m", "uavctl", *arguments]
+    subprocess.run(run, check=True, stdout=subprocess.DEVNULL, timeout=LIMIT_S)
+
+
+@pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
-    fly = ["loopback", "--duration", "14", "--set", "link.blackout=[[6, 8]]", "--out", str(folder), "--json"]
-    subprocess.run([sys.executable, "-m", "uavctl", *fly], check=True, stdout=subprocess.DEVNULL, timeout=LIMIT_S)
-    out = folder / "probed.html"
-    text = (folder / "flight.html").read_text(encoding="utf-8")
-    out.write_text(text.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
+    uavctl("loopback", "--duration", "14", "--set", "link.blackout=[[6, 8]]", "--out", str(folder), "--json")
+    return folder / "flight.html"
+
+
+@pytest.fixture(scope="module")
+def comparison(page: Path) -> Path:
+    """A flight, what is left of it when it is torn, and the flight again."""
+    whole, torn, out = page.with_name("flight.mcap"), page.with_name("torn.mcap"), page.with_name("compare.html")
+    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
+    uavctl("log", "compare", str(whole), str(torn), str(whole), "--out", str(out))
     return out
 
 
-def open_page(page: Path, width: int, *options: str) -> tuple[dict[str, object], str]:
-    """What the probe found, and what the page said on the console."""
-    run = subprocess.run(
-        [browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={page.parent / str(width)}",
-         "--enable-logging=stderr", "--dump-dom", f"--window-size={width},900", *options, page.as_uri()],
-        capture_output=True, text=True, timeout=LIMIT_S, check=True,
-    )  # fmt: skip
-    title = re.search(r"<title>(.*?)</title>", run.stdout, re.DOTALL)
-    assert title is not None
-    found = json.loads(title.group(1).replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
-    return found, "\n".join(line for line in run.stderr.splitlines() if "CONSOLE" in line)
+def faults(found: dict[str, Any]) -> list[object]:
+    """What should be nothing: pixels beyond the edge, figures without height, texts on texts, texts beyond figures."""
+    return [found["wide"] - found["seen"], found["flat"], found["clashes"], found["cut"]]
 
 
-@pytest.mark.parametrize("width", [500, 800, 1400])
-def test_the_page_is_whole_at_every_width(page: Path, width: int) -> None:
-    found, console = open_page(page, width)
+NONE: list[object] = [0, [], [], []]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_page_is_whole_at_every_width(window: Browser, page: Path, width: int) -> None:
+    found, console = window.open(page, width)
     assert console == ""
-    assert found["wide"] == found["seen"]
-    assert found["figures"] == 32
-    assert (found["flat"], found["clashes"], found["cut"]) == ([], [], [])
+    assert found["seen"] == width
+    assert faults(found) == NONE
+    assert found["hidden"] == []
+    assert len(found["figures"]) == 32
+    assert "nan" not in found["words"].lower().split()
 
 
-def test_dark_pages_are_dark(page: Path) -> None:
-    light, _ = open_page(page, 1000)
-    dark, console = open_page(page, 1001, "--blink-settings=preferredColorScheme=0")
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_comparison_is_whole_at_every_width(window: Browser, comparison: Path, width: int) -> None:
+    found, console = window.open(comparison, width)
+    assert console == ""
+    assert faults(found) == NONE
+    positions = ["position-north", "position-east", "position-down"]
+    assert found["figures"] == ["path-above", "path-side", *positions, "age"]
+    assert found["hidden"] == []
+    assert "B is torn: compared up to its end" in found["words"]
+
+
+def test_dark_pages_are_dark(window: Browser, page: Path) -> None:
+    light, _ = window.open(page, 1000)
+    dark, console = window.open(page, 1000, dark=True)
     assert console == ""
     assert (light["background"], dark["background"]) == ("rgb(243, 245, 247)", "rgb(18, 22, 27)")
 
 
-def test_it_prints(page: Path, tmp_path: Path) -> None:
-    out = tmp_path / "flight.pdf"
-    subprocess.run(
-        [browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'user'}",
-         f"--print-to-pdf={out}", page.as_uri()],
-        capture_output=True, timeout=LIMIT_S, check=True,
-    )  # fmt: skip
-    assert out.read_bytes().startswith(b"%PDF")
-    assert out.stat().st_size > 20_000
+def test_paper_is_white_and_cuts_nothing(window: Browser, page: Path, comparison: Path) -> None:
+    for one in (page, comparison):
+        found, _ = window.open(one, PAPER, dark=True, paper=True)
+        assert found["background"] == "rgb(255, 255, 255)"
+        assert faults(found) == NONE
+        assert found["hidden"] == []
+
+
+def test_it_prints(window: Browser, page: Path) -> None:
+    window.open(page, 1000)
+    printed = window.pdf()
+    assert printed.startswith(b"%PDF")
+    assert len(printed) > 20_000

@@ -29,6 +29,7 @@ _FARTHEST_PERCENT = 1e6  # what is beyond stands there
 _TALLEST = 1e5
 _TITLE_WIDTH = 48
 _LABEL_WIDTH = 16  # characters of a link's name in a line
+_LETTER_IN = 0.08  # of the page's font, the widest that browsers take for it
 _LOOKS = tuple(
     (role, kind)
     for kind in ("planned", "dashed")
@@ -150,7 +151,7 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
     who = list(dict.fromkeys(cell.controller for cell in cells))
     labels = [fill(link, _LABEL_WIDTH) for link in links]
     with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
-        ax = one.axes(quantity.title, quantity.label, "")
+        ax = one.axes(quantity.title, quantity.label, "", _left_in(labels))
         floor = _scale(ax, quantity, cells, ax.set_xscale)
         for place, controller in enumerate(who):
             role, kind, marker = looks.of(controller)
@@ -176,7 +177,7 @@ def differences(verdicts: Sequence[Verdict], looks: Looks, title: str, key: str)
     who = list(dict.fromkeys(one.baseline.controller for verdict in shown for one in verdict.comparisons))
     name = f"difference-{key}"
     with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
-        ax = one.axes(fill(title, _TITLE_WIDTH), "what the baseline costs more [%]", "")
+        ax = one.axes(fill(title, _TITLE_WIDTH), "what the baseline costs more [%]", "", _left_in(labels))
         ax.set_xscale("symlog", linthresh=_LINEAR_PERCENT, linscale=0.8)
         ax.axvline(0.0, color=colour("ink"), lw=0.9)
         for row, verdict in enumerate(shown):
@@ -278,6 +279,11 @@ def _offset(place: int, count: int) -> float:
 def _row_in(label: str, count: int) -> float:
     """Height of a row [in]."""
     return max(0.13 * count + 0.08, 0.15 * (label.count("\n") + 1) + 0.06)
+
+
+def _left_in(labels: Sequence[str]) -> float:
+    """Room for the names of links beside the axis [in]."""
+    return 0.2 + _LETTER_IN * max(len(line) for label in labels for line in label.splitlines())
 
 
 def _rows(ax: Axes, labels: Sequence[str]) -> None:

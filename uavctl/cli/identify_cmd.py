@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from logs.outputs import spare_recording
+from logs.outputs import spare_recording, write_whole
 from logs.reader import header, read
 from logs.tlog import read_tlog
 from uavctl.build import build_design
@@ -50,8 +50,8 @@ def identify_command(
     doubts = (*found.result.warnings, *_design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
     page = target.with_suffix(".html")
-    _write(target, dump_config(found.config))
-    _write(page, write_page(found, history.seen, str(flight)))
+    write_whole(target, dump_config(found.config))
+    write_whole(page, write_page(found, history.seen, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
     common.show(document, lambda: _picture(result, found, target, page))
     return 0
@@ -80,13 +80,6 @@ def _design_doubts(config: Config) -> tuple[str, ...]:
     except DesignError as error:
         return (f"no design yet with this plant and link: {error}; for another gain: `uavctl design --synthesize`",)
     return ()
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
 
 
 @contextmanager

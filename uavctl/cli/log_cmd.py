@@ -14,9 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from logs.flight_data import FlightData
-from logs.foreign import is_foreign, read_mcap
 from logs.info import info as recording_info
-from logs.outputs import spare_recording
+from logs.outputs import spare_recording, write_whole
 from logs.reader import finished, read
 from logs.recover import RecoverResult
 from logs.recover import recover as restore
@@ -24,7 +23,7 @@ from logs.replay_tlog import ForeignReplay, replay_tlog
 from logs.report import picture, write_report
 from logs.report_verdicts import verdict_rows
 from logs.summary import count, render, summarise
-from logs.tlog import TlogPacket, read_tlog
+from logs.tlog import TlogPacket
 from logs.topics import RecorderNote
 from logs.verdicts import judge
 from uavctl.build import build_design
@@ -34,7 +33,7 @@ from uavctl.cli.info_table import info_table
 from uavctl.cli.log_compare_cmd import compare_command
 from uavctl.cli.prepare import prepare
 from uavctl.cli.replay_table import replay_table
-from uavctl.cli.replaying import replay_flight
+from uavctl.cli.replaying import foreign_packets, replay_flight
 from uavctl.cli.whatif_cmd import whatif
 from uavctl.config import Config
 from uavctl.data import Sink
@@ -89,7 +88,7 @@ def replay(
     """
     if not 0.0 <= tolerance < 1.0:
         raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
-    packets = _foreign_packets(flight, topic)
+    packets = foreign_packets(flight, topic)
     if packets is not None:
         return _replay_foreign(flight, packets, common)
     if common.config != DEFAULTS.config or topic:
@@ -133,12 +132,9 @@ def report(
     dropped = max((record.dropped for _, _, record in entries if isinstance(record, RecorderNote)), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
     judged = judge(data)
-    write_report(data, summary, page, judged)
     if svg is not None:
-        try:
-            svg.write_text(picture(data), encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"{svg}: cannot be written ({error.strerror}); choose another place") from error
+        write_whole(svg, picture(data))
+    write_report(data, summary, page, judged)
     if not finished(flight):
         messages().print("the recording is torn: shown up to its end", style="yellow", markup=False)
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
@@ -155,26 +151,6 @@ def layout() -> int:
 
 def _loop_maker(config: Config, controller: Controller) -> Callable[[Sink], ControlLoop]:
     return lambda sink: ControlLoop(config, controller, sink, lambda: 0)
-
-
-def _foreign_packets(flight: Path, topics: tuple[str, ...]) -> tuple[TlogPacket, ...] | None:
-    """What another program has recorded, and None if the recording is one of ours.
-
-    Raises:
-        RecordingError: It cannot be read, or holds no MAVLink.
-        UsageError: It has no such topic.
-    """
-    if flight.suffix == ".tlog":
-        if topics:
-            raise UsageError("--topic is for an MCAP: a .tlog has no topics")
-        return read_tlog(flight).packets
-    if not is_foreign(flight):
-        return None
-    found = read_mcap(flight, topics)
-    messages().print(f"MAVLink in {', '.join(found.topics)}", markup=False, soft_wrap=True)
-    if found.torn:
-        messages().print("the recording is torn: replayed up to its end", style="yellow", markup=False)
-    return found.packets
 
 
 def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Common) -> int:
@@ -239,6 +215,7 @@ def _foreign_table(result: ForeignReplay, horizon: int) -> Table:
         ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
         ("solves", _counts(result.solves)),
         ("ticks by mode", _counts(result.modes)),
+        *([("not taken by the connection", _counts(result.left_out))] if result.left_out else []),
         ("decisions by age in steps", _ages(result.age_steps, horizon)),
     ]
     if ages is not None:

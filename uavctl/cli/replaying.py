@@ -1,4 +1,4 @@
-"""The replay of a recording of ours from its file alone, as recorded or with another configuration."""
+"""What is replayed: a recording of ours from its file alone, as recorded or otherwise; another program's packets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from pathlib import Path
 
 import msgspec
 
+from logs.foreign import is_foreign, read_mcap
 from logs.reader import finished, header, read, records
 from logs.replay import MAKERS, ReplayResult
 from logs.replay import replay as replay_recording
+from logs.tlog import TlogPacket, read_tlog
 from logs.topics import RecorderNote
+from uavctl.cli.common import messages
 from uavctl.cli.flying import cpu, versions
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.config.load import parse
@@ -83,6 +86,34 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         ignored=MAKERS if overrides else frozenset(),
     )
     return Replayed(result, whole, changed, tuple(other_versions(recorded)))
+
+
+def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
+    """What another program has recorded, and None if the recording is one of ours; says what was left out.
+
+    Args:
+        flight: The recording.
+        topics: Of an MCAP: those to take; all that hold MAVLink if none is named.
+
+    Raises:
+        RecordingError: It cannot be read, or holds no MAVLink.
+        UsageError: It has no such topic.
+    """
+    if flight.suffix == ".tlog":
+        if topics:
+            raise UsageError("--topic is for an MCAP: a .tlog has no topics")
+        tlog = read_tlog(flight)
+        packets, notes = tlog.packets, tlog.notes
+    elif is_foreign(flight):
+        found = read_mcap(flight, topics)
+        messages().print(f"MAVLink in {', '.join(found.topics)}", markup=False, soft_wrap=True)
+        torn = ("the recording is torn: replayed up to its end",) if found.torn else ()
+        packets, notes = found.packets, (*found.notes, *torn)
+    else:
+        return None
+    for note in notes:
+        messages().print(note, style="yellow", markup=False, soft_wrap=True)
+    return packets
 
 
 def check_first(flight: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -10,19 +12,21 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from logs.disk import check_room
+from logs.export import known_number
 from logs.flight_data import FlightData
 from logs.foreign import is_foreign
-from logs.info import info as recording_info
 from logs.journal import RecorderStatus
 from logs.onlookers import Onlookers
-from logs.reader import header, read
+from logs.outputs import write_whole
+from logs.reader import finished, header, read
 from logs.recorder import SyncRecorder
-from logs.summary import summarise
-from logs.topics import HEADER
+from logs.summary import count, summarise
+from logs.topics import HEADER, RecorderNote
 from logs.views import Views
 from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
@@ -37,7 +41,7 @@ from uavctl.config.load import parse
 from uavctl.data import Header, Record
 from uavctl.errors import UsageError
 from uavctl.whatif.compare import WhatIf, departure_m, model_fit, reproduction, until
-from uavctl.whatif.fly import Course, OtherLink, fly
+from uavctl.whatif.fly import Course, OtherLink, Watch, fly
 from uavctl.whatif.history import Entry, History, history_of
 from uavctl.whatif.other_link import Relinked
 from uavctl.whatif.page import HEADINGS, side_by_side, story, write_page
@@ -77,7 +81,7 @@ def whatif(
     The recorded inputs of the control loop come again at their times; positions are moved by as much as the vehicle,
     by its model, would have been elsewhere. docs/what-if.md says what that can tell, and what not.
     """
-    if flight.suffix == ".tlog" or is_foreign(flight):
+    if (flight.suffix == ".tlog" and flight.exists()) or is_foreign(flight):
         raise UsageError(
             f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
             "`uavctl identify` read it"
@@ -92,8 +96,10 @@ def whatif(
     keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
     on = changed(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link
     answers, source = model_of(model, before)
-    _warn(flight, recorded)
-    history = history_of(read(flight), before, str(flight))
+    with _progress() as progress:
+        entries = progress.track(read(flight), total=known_number(flight), description="reading")
+        history = history_of(entries, before, str(flight))
+    _warn(flight, recorded, history)
     was = recorded_flyer(flight, before)
     if controller == "smpc":
         now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
@@ -103,51 +109,70 @@ def whatif(
     check_room(path, before.log.free_bytes)
     other = None if over == RECORDED else _relinked(history, on, seed)
     begun = time.perf_counter()
-    with messages().status("flying the recording again"):
-        again = _reproduced(history, was, answers)
-        course, status = _recorded(history, now, answers, other, path, recorded)
-    conclude(path, time.perf_counter() - begun, status)
-    given = (
-        *((f"--config {config}",) if config else ()),
-        *overrides,
-        *((f"--seed {seed}",) if seed is not None else ()),
-    )
-    sides = [
-        FlightData.from_records(until(entries, course.end_ns))
-        for entries in (history.entries, again, tuple(read(path)))
-    ]
-    result = WhatIf(
-        flight=str(flight),
-        reproduction=reproduction(sides[0], sides[1]),
-        model=model_fit(history, answers, source),
-        controller=controller,
-        link=over,
-        changed=given,
-        compared_s=(course.end_ns - sides[0].origin_ns + sides[0].tick_ns) * 1e-9,
-        ended=course.ended,
-        largest_departure_m=departure_m(sides[0], sides[2]),
-        recorded=summarise(sides[0], wall_s=None),
-        reproduced=summarise(sides[1], wall_s=None),
-        what_if=summarise(sides[2], wall_s=None),
-        recording=str(path),
-        report=str(path.with_suffix(".html")),
-        page=str(path.with_name("what-if.html")),
-    )
-    _write(Path(result.page), write_page(result, sides[0], sides[2]))
+    with _progress() as progress:
+        again = _reproduced(history, was, answers, _watch(progress, "reproducing the flight"))
+        course, status = _recorded(
+            history, now, answers, other, path, recorded, _watch(progress, "flying it otherwise")
+        )
+        progress.add_task("writing the pages", total=None)
+        conclude(path, time.perf_counter() - begun, status)
+        given = (
+            *((f"--config {config}",) if config else ()),
+            *overrides,
+            *((f"--seed {seed}",) if seed is not None else ()),
+        )
+        sides = [
+            FlightData.from_records(until(entries, course.end_ns))
+            for entries in (history.entries, again, tuple(read(path)))
+        ]
+        result = WhatIf(
+            flight=str(flight),
+            reproduction=reproduction(sides[0], sides[1]),
+            model=model_fit(history, answers, source),
+            controller=controller,
+            link=over,
+            changed=given,
+            compared_s=(course.end_ns - sides[0].origin_ns + sides[0].tick_ns) * 1e-9,
+            ended=course.ended,
+            largest_departure_m=departure_m(sides[0], sides[2]),
+            recorded=summarise(sides[0], wall_s=None),
+            reproduced=summarise(sides[1], wall_s=None),
+            what_if=summarise(sides[2], wall_s=None),
+            recording=str(path),
+            report=str(path.with_suffix(".html")),
+            page=str(path.with_name("what-if.html")),
+        )
+        write_whole(Path(result.page), write_page(result, sides[0], sides[2]))
     Common(json=json).show(result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
 
-def _warn(flight: Path, recorded: Header) -> None:
+def _warn(flight: Path, recorded: Header, history: History) -> None:
     """Say why the reproduction may not be exact."""
-    whole = recording_info(flight)
     texts = [f"{text}: decisions may differ" for text in other_versions(recorded)]
-    if whole.missing or whole.dropped:
-        texts.append(f"{whole.missing + whole.dropped} records are missing in the recording")
-    if not whole.finished:
+    lost = max((one.dropped + one.refused for _, _, one in history.entries if isinstance(one, RecorderNote)), default=0)
+    if lost:
+        texts.append(f"{count(lost, 'record')} missing in the recording")
+    if not finished(flight):
         texts.append("the recording is torn: flown up to its end")
     for text in texts:
         messages().print(text, style="yellow", markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        yield progress
+
+
+def _watch(progress: Progress, what: str) -> Watch:
+    """A bar for a flight through a recording's entries."""
+
+    def watch(entries: Iterable[Entry]) -> Iterable[Entry]:
+        return progress.track(entries, description=what)
+
+    return watch
 
 
 def _start(history: History) -> NDArray[np.float64]:
@@ -184,32 +209,33 @@ class _Memory:
         self.entries.append((topic, at_ns, record))
 
 
-def _reproduced(history: History, was: Prepared, model: LinearModel) -> tuple[Entry, ...]:
+def _reproduced(history: History, was: Prepared, model: LinearModel, watch: Watch) -> tuple[Entry, ...]:
     """The recorded flight again, nothing changed."""
     memory = _Memory()
     memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
-    fly(history, was.config, was.controller, model, memory, lambda: 0)
+    fly(history, was.config, was.controller, model, memory, lambda: 0, watch=watch)
     return tuple(memory.entries)
 
 
 def _recorded(
-    history: History, now: Prepared, model: LinearModel, other: OtherLink | None, path: Path, recorded: Header
+    history: History,
+    now: Prepared,
+    model: LinearModel,
+    other: OtherLink | None,
+    path: Path,
+    recorded: Header,
+    watch: Watch,
 ) -> tuple[Course, RecorderStatus]:
-    """Fly what was changed, and record it."""
+    """Fly what was changed, and record it; half of it would look like a shorter flight, so it is removed."""
     recorder = SyncRecorder(path, now.config.log, onlookers=Onlookers(Views()))
     try:
         put_header(recorder, now, recorded.started_ns)
-        course = fly(history, now.config, now.controller, model, recorder, time.perf_counter_ns, other)
-    finally:
-        status = recorder.close()
-    return course, status
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+        course = fly(history, now.config, now.controller, model, recorder, time.perf_counter_ns, other, watch)
+    except BaseException:
+        recorder.close()
+        path.unlink(missing_ok=True)
+        raise
+    return course, recorder.close()
 
 
 def _picture(result: WhatIf) -> RenderableType:

@@ -29,8 +29,11 @@ def write_page(found: Identification, seen: Seen, source: str) -> str:
     result = found.result
     story = [
         f"{result.flown_s:.0f} s were flown under setpoints; {found.link.received} positions came, {found.link.lost} "
-        f"did not ({found.link.loss:.1%}), {'in bursts' if found.link.bursts else 'each by itself'}.",
-        *(f"{one.axis}: {one.r2:.1%} of the motion of the next {AHEAD_S:g} s is predicted." for one in result.response),
+        f"did not ({100 * found.link.loss:.1f} %), {'in bursts' if found.link.bursts else 'each by itself'}.",
+        *(
+            f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {AHEAD_S:g} s is predicted."
+            for one in result.response
+        ),
         *result.warnings,
     ]
     return page("Identified plant and link", source, story, _sections(found, seen))
@@ -96,12 +99,12 @@ def _moved(name: str, one: Prediction) -> Drawing:
 
 def _innovations(name: str, one: Prediction) -> Drawing:
     with canvas(f"innovations-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "[m]")
+        ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "difference [m]")
         for sign in (-2.0, 2.0):
             ax.plot(one.times_s, sign * one.stds_m, color=colour("limit"), linewidth=0.8)
         dots(ax, one.times_s, one.innovations_m, "estimate", 2.5)
     inside = float(np.mean(np.abs(one.innovations_m) <= 2.0 * one.stds_m))
-    label = f"{name}: innovations with two standard deviations; {inside:.0%} are inside, 95 % should be"
+    label = f"{name}: innovations with two standard deviations; {100 * inside:.0f} % are inside, 95 % should be"
     return Drawing(f"innovations-{name}", drawn.svg, label)
 
 
@@ -109,7 +112,7 @@ def _whiteness(name: str, one: Prediction) -> Drawing:
     lags = np.arange(1, len(one.correlation) + 1)
     band = 1.96 / np.sqrt(max(len(one.innovations_m), 1))
     with canvas(f"white-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(f"{name}: correlation of innovations", "positions apart", "")
+        ax = drawn.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
         ax.bar(lags, one.correlation, color=colour("estimate"), width=0.6)
         for sign in (-band, band):
             ax.axhline(sign, color=colour("limit"), linewidth=0.8)
@@ -122,7 +125,7 @@ def _whiteness(name: str, one: Prediction) -> Drawing:
 
 def _delays(seen: Seen) -> Drawing:
     with canvas("delays", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Delay from capture to arrival", "time [s]", "[ms]")
+        ax = drawn.axes("Delay from capture to arrival", "time [s]", "delay [ms]")
         every = slice(None, None, max(1, len(seen.times_s) // _MOST_DELAYS))
         dots(ax, seen.times_s[every], 1e3 * seen.delays_s[every], "sample", 2.0)
         ax.set_xlim(float(seen.times_s[0]), float(seen.times_s[-1]))

@@ -137,7 +137,7 @@ def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
     found = []
     for one in responses:
         if one.r2 < 0.5:
-            found.append(f"{one.axis}: only {one.r2:.0%} of the motion of the next second is predicted")
+            found.append(f"{one.axis}: only {100 * one.r2:.0f} % of the motion of the next second is predicted")
         if one.lag_std_s is None or one.lag_std_s > 0.5 * one.lag_s:
             found.append(f"{one.axis}: the lag of {one.lag_s:.2f} s is uncertain; fly more changes of direction")
     return found

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from logs.encoding import encode
 from logs.flight_data import FlightData
 from logs.summary import FlightSummary
-from sim.vehicle import LinearModel
+from logs.topics import RecorderNote
+from sim.vehicle import CACHED_TRANSITIONS, LinearModel
 from uavctl.data import Decision, Estimate, Plan, Record, Setpoint, Truth
 from uavctl.whatif.history import Entry, History
 
@@ -20,6 +22,7 @@ Array = NDArray[np.float64]
 AHEAD_S = 1.0
 _COMPARED = (Decision, Plan, Setpoint)
 R = TypeVar("R", bound=Record)
+_Transition = Callable[[int], tuple[Array, Array, Array]]
 
 
 class Reproduction(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,8 +65,8 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def until(entries: Iterable[Entry], end_ns: int) -> list[Entry]:
-    """The part of a recording up to a tick, that included [ns]."""
-    return [entry for entry in entries if entry[1] <= end_ns]
+    """The part of a recording up to a tick, that included [ns], with all that the recorder says of itself."""
+    return [entry for entry in entries if entry[1] <= end_ns or isinstance(entry[2], RecorderNote)]
 
 
 def reproduction(recorded: FlightData, again: FlightData) -> Reproduction:
@@ -100,8 +103,9 @@ def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
         d.at_ns for d in flight.decisions if d.boundary and d.at_ns in states and d.at_ns + ahead_ns in states
     ]
     moved, told = [], []
+    transition = lru_cache(maxsize=CACHED_TRANSITIONS)(model.transition)
     for at_ns in boundaries:
-        predicted = _predicted(history, model, states[at_ns], at_ns, at_ns + ahead_ns)
+        predicted = _predicted(history, model, transition, states[at_ns], at_ns, at_ns + ahead_ns)
         if predicted is not None:
             index = list(model.position_index)
             moved.append((states[at_ns + ahead_ns] - states[at_ns])[index])
@@ -117,7 +121,9 @@ def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
     )
 
 
-def _predicted(history: History, model: LinearModel, x: Array, begin_ns: int, end_ns: int) -> Array | None:
+def _predicted(
+    history: History, model: LinearModel, transition: _Transition, x: Array, begin_ns: int, end_ns: int
+) -> Array | None:
     """State at the end under the setpoints that were flown; None if any was not."""
     tick_ns = max(1, history.flight.tick_ns)
     for at_ns in range(begin_ns, end_ns, tick_ns):
@@ -125,7 +131,7 @@ def _predicted(history: History, model: LinearModel, x: Array, begin_ns: int, en
         if accel is None or not history.taken.get(at_ns, False):
             return None
         u = np.array([accel[axis] for axis in model.axes]) / model.accel_per_input
-        a, b, _ = model.transition(min(tick_ns, end_ns - at_ns))
+        a, b, _ = transition(min(tick_ns, end_ns - at_ns))
         x = a @ x + b @ u
     return x
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,13 +16,15 @@ from uavctl.data import Datagram, Record, Refused, Setpoint, Sink, StepInput, Tr
 from uavctl.flight.controller import Controller
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.whatif.departure import Departure
-from uavctl.whatif.history import History
+from uavctl.whatif.history import Entry, History
 from uavctl.whatif.rewrite import Axes
 
 TRUTH = "/sim/truth"
 # As in identification: without setpoints for longer than this, the vehicle does as it likes.
 LONGEST_PAUSE_NS = 500_000_000
 _WHOLE = "the recording ends"
+Watch = Callable[[Iterable[Entry]], Iterable[Entry]]
+"""Looks at a recording's entries as they go by, for a progress bar."""
 
 
 class OtherLink(Protocol):
@@ -61,6 +63,7 @@ def fly(
     sink: Sink,
     stopwatch: Callable[[], int],
     other: OtherLink | None = None,
+    watch: Watch = iter,
 ) -> Course:
     """Fly a recorded flight otherwise.
 
@@ -72,11 +75,12 @@ def fly(
         sink: Gets what a recording of this flight holds, but for its header.
         stopwatch: Time for the timing records [ns].
         other: The link that positions come over; else they come when they came.
+        watch: Sees the entries as they are flown.
     """
     tap = _Tap(sink)
     loop = ControlLoop(config, controller, tap, stopwatch)
     flight = _Flight(history, loop, tap, Course(Departure(model)), other)
-    for _, _, record in history.entries:
+    for _, _, record in watch(history.entries):
         if isinstance(record, StepInput):
             flight.tick(record)
         elif isinstance(record, Datagram) and not record.outgoing:

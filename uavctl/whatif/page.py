@@ -45,13 +45,14 @@ def write_page(found: WhatIf, recorded: FlightData, other: FlightData) -> str:
 def story(found: WhatIf) -> list[str]:
     """What was done, and what it is worth, in sentences."""
     again, model = found.reproduction, found.model
-    same = "bit for bit" if again.identical else "not bit for bit"
+    same = "bit for bit"
+    if not again.identical:
+        same = f"not bit for bit: states within {again.largest_state:.1e}, inputs within {again.largest_input:.1e}"
     within = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
-    explained = "" if model.r2 is None else f": {model.r2:.1%} of it is told{within}"
+    explained = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{within}"
     changed = ", ".join(found.changed) or "nothing"
     return [
-        f"Reproduced with nothing changed, {same}: states within {again.largest_state:.1e}, inputs within "
-        f"{again.largest_input:.1e}.",
+        f"Reproduced with nothing changed, {same}.",
         f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times{explained}.",
         f"Changed: {changed}; controller {found.controller}; link: {found.link}.",
         f"Compared over {found.compared_s:.1f} s: {found.ended}. The flights came {found.largest_departure_m:.3g} m "
@@ -82,7 +83,7 @@ def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterato
 
 def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Drawing:
     with canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(name, "time [s]", "[m]")
+        ax = drawn.axes(name, "time [s]", "position [m]")
         for flight, role in ((recorded, RECORDED), (other, MIGHT)):
             steps = flight.steps
             ax.plot(steps.t_s, steps.state[:, place], color=colour(role))
