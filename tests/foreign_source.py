@@ -1,11 +1,14 @@
 """A vehicle and its cameras in bare pymavlink, sharing no code with the project.
 
-Run as a script against `uavctl fly`; prints one JSON line with what it got back.
+Run as a script against `uavctl fly`; prints one JSON line with what it got back once it has come to rest at the target
+that it is told, and flies on until it is killed. Its time is that of the setpoints: each moves it by one tick, and
+their number ends a phase. A machine that stands still so takes nothing from the flight.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import select
 import socket
 import sys
@@ -15,24 +18,51 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ARMED_CUSTOM = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 PX4_OFFBOARD = 6 << 16
-FLIGHT_S, PAUSE_S, AFTER_S, STEP_S = 4.0, 4.0, 4.0, 0.02
+FLIGHT, PAUSE, AFTER, LONGEST = 80, 80, 80, 1200  # setpoints: seen, unseen, seen again at least, and all at most
+TICK_S, WAIT_S = 0.05, 0.02
+NEAR_M, SLOW_MPS = 0.1, 0.1
 
 
-def main(port: int) -> None:
-    """Fly a frictionless point mass on the setpoints that come back; be silent for a while in the middle."""
+class Vehicle:
+    """A point mass without friction, moved by what it is told, and what it has got."""
+
+    def __init__(self) -> None:
+        self.position_m, self.velocity_mps = [0.5, 0.5, -1.0], [0.0, 0.0, 0.0]
+        self.setpoints, self.poses, self.largest_mps2 = 0, 0, 0.0
+        self.masks: set[int] = set()
+
+    @property
+    def unseen(self) -> bool:
+        return FLIGHT <= self.setpoints < FLIGHT + PAUSE
+
+    def fly(self, message: mavlink.MAVLink_message) -> None:
+        """One tick on a setpoint."""
+        accel = (message.afx, message.afy, message.afz)
+        for axis in range(3):
+            self.velocity_mps[axis] += accel[axis] * TICK_S
+            self.position_m[axis] += self.velocity_mps[axis] * TICK_S
+        self.setpoints += 1
+        self.largest_mps2 = max(self.largest_mps2, *map(abs, accel))
+        self.masks.add(message.type_mask)
+
+    def is_over(self, target_m: list[float]) -> bool:
+        rests = math.dist(self.position_m, target_m) < NEAR_M and math.hypot(*self.velocity_mps) < SLOW_MPS
+        return (rests and self.setpoints >= FLIGHT + PAUSE + AFTER) or self.setpoints >= LONGEST
+
+
+def main(port: int, target_m: list[float]) -> None:
+    """Fly; be unseen for a while in the middle."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect(("127.0.0.1", port))
     out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
-    position, velocity, accel = [0.5, 0.5, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-    received: list[tuple[float, float]] = []
-    masks: set[int] = set()
-    start = now = time.monotonic()
-    next_pose = next_heartbeat = start
-    while now - start < FLIGHT_S + PAUSE_S + AFTER_S:
+    vehicle, told = Vehicle(), False
+    next_pose = next_heartbeat = time.monotonic()
+    while True:
+        now = time.monotonic()
         if now >= next_heartbeat:
-            next_heartbeat += 0.5
+            next_heartbeat = now + 0.5
             beat = out.heartbeat_encode(
                 mavlink.MAV_TYPE_QUADROTOR,
                 mavlink.MAV_AUTOPILOT_PX4,
@@ -41,29 +71,30 @@ def main(port: int) -> None:
                 mavlink.MAV_STATE_ACTIVE,
             )
             send(sock, out, beat)
-        if now >= next_pose:
-            next_pose += 0.1
-            if not FLIGHT_S <= now - start < FLIGHT_S + PAUSE_S:
-                pose = out.vision_position_estimate_encode(round(now * 1e6), *position, 0.0, 0.0, 0.0)
-                send(sock, out, pose)
-        select.select([sock], [], [], STEP_S)
-        before, now = now, time.monotonic()
-        for axis in range(3):
-            velocity[axis] += accel[axis] * (now - before)
-            position[axis] += velocity[axis] * (now - before)
+        if now >= next_pose and not vehicle.unseen:
+            next_pose = now + 0.1
+            pose = out.vision_position_estimate_encode(round(now * 1e6), *vehicle.position_m, 0.0, 0.0, 0.0)
+            send(sock, out, pose)
+            vehicle.poses += 1
+        select.select([sock], [], [], WAIT_S)
         for message in drain(sock, parser):
-            accel = [message.afx, message.afy, message.afz]
-            masks.add(message.type_mask)
-            received.append((now - start, max(map(abs, accel))))
-    seen = {
-        "setpoints": len(received),
-        "in_pause": sum(FLIGHT_S < t < FLIGHT_S + PAUSE_S for t, _ in received),
-        "largest_mps2": max((a for _, a in received), default=0.0),
-        "masks": sorted(masks),
-        "position_m": [round(p, 3) for p in position],
-        "velocity_mps": [round(v, 3) for v in velocity],
+            vehicle.fly(message)
+        if not told and vehicle.is_over(target_m):
+            told = True
+            sys.stdout.write(json.dumps(seen(vehicle)) + "\n")
+            sys.stdout.flush()
+
+
+def seen(vehicle: Vehicle) -> dict[str, object]:
+    """What the vehicle got, and where that has taken it."""
+    return {
+        "setpoints": vehicle.setpoints,
+        "poses": vehicle.poses,
+        "largest_mps2": vehicle.largest_mps2,
+        "masks": sorted(vehicle.masks),
+        "position_m": [round(p, 3) for p in vehicle.position_m],
+        "velocity_mps": [round(v, 3) for v in vehicle.velocity_mps],
     }
-    sys.stdout.write(json.dumps(seen) + "\n")
 
 
 def send(sock: socket.socket, out: mavlink.MAVLink, message: mavlink.MAVLink_message) -> None:
@@ -87,4 +118,4 @@ def drain(sock: socket.socket, parser: mavlink.MAVLink) -> list[mavlink.MAVLink_
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), [float(word) for word in sys.argv[2:]])

@@ -28,6 +28,7 @@ class Body:
     xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
     tracked: bool = True
     shown: bool = True
+    exposed_s: float | None = None  # when it was there, on our monotonic clock; None: the server's latency ago
 
 
 def message(kind: int, payload: bytes) -> bytes:
@@ -125,7 +126,7 @@ class Server:
         self._socket.close()
 
     def _serve(self) -> None:
-        next_s = time.monotonic()
+        next_s, last_s = time.monotonic(), 0.0
         while not self._over.is_set():
             try:
                 data, sender = self._socket.recvfrom(2048)
@@ -134,9 +135,14 @@ class Server:
                 pass
             if self._client is not None and time.monotonic() >= next_s:
                 next_s = time.monotonic() + 0.01
+                bodies, now_s = self.bodies.copy(), time.monotonic()
+                stamped = [body.exposed_s for body in bodies if body.exposed_s is not None]
+                exposed_s = max(stamped, default=now_s - self.latency_s)
+                if exposed_s == last_s:  # nothing new was seen
+                    continue
+                last_s = exposed_s
                 self.frames += 1
-                now_s = time.monotonic()
-                data = frame(self.frames, self.bodies, self.version, now_s - self.latency_s, now_s)
+                data = frame(self.frames, bodies, self.version, exposed_s, now_s)
                 self._socket.sendto(data, self.group or self._client)
 
     def _answer(self, data: bytes, sender: tuple[str, int]) -> None:

@@ -1,4 +1,4 @@
-"""`uavctl fly` as a process against the simulated peers in a thread, with every datagram of its counted on the way."""
+"""`uavctl fly` as a process against the simulated peers in a thread, its datagrams counted on the way."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+
+import pytest
+from patience import LIMIT_S, until
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_rig import Client
 
 from sim.server import serve
 from uavctl.cli.app import run
@@ -22,7 +26,11 @@ from uavctl.config import load_config
 from uavctl.data import Truth
 from uavctl.lock import lock_path
 
-LIMIT_S = 60.0  # for what is stuck, not for what is slow: a machine may have much else to do
+# The machine may stand still for a while, and then neither side has failed: the vehicle bears with a pause in the
+# setpoints that is long for a flight, and the daemon with one in the positions and in the vehicle's answers.
+PATIENT_VEHICLE = "sim.setpoint_timeout_s=600.0"
+PATIENT_DAEMON = ("fallback.hold_s=60.0", "hand_over.engage_s=60.0")
+MARK = b"the test's own mark"
 
 
 def port() -> socket.socket:
@@ -33,10 +41,11 @@ def port() -> socket.socket:
 
 
 class Tap:
-    """Sits between vehicle and daemon, hands everything on, and notes when the daemon spoke."""
+    """Sits between vehicle and daemon, hands everything on, and counts what the daemon says."""
 
     def __init__(self, daemon_port: int) -> None:
-        self.spoken_s: list[float] = []  # monotonic times of the daemon's datagrams
+        self.spoken = 0  # datagrams of the daemon's
+        self._marked = threading.Event()
         self._daemon = ("127.0.0.1", daemon_port)
         self._ours, self._theirs = port(), port()
         self.vehicle_port = int(self._theirs.getsockname()[1])
@@ -56,9 +65,25 @@ class Tap:
                     data = self._ours.recv(65_536)
                 except ConnectionRefusedError:
                     continue  # nobody listens at the daemon's port
-                self.spoken_s.append(time.monotonic())
+                if data == MARK:
+                    self._marked.set()
+                    continue
+                self.spoken += 1
                 if self._vehicle is not None:
                     self._theirs.sendto(data, self._vehicle)
+
+    def spoken_by_now(self) -> int:
+        """How much the daemon has said, with what waits in the socket's queue: a mark put behind it has come out."""
+        self._marked.clear()
+        with port() as here:
+            here.sendto(MARK, self._ours.getsockname())
+        assert self._marked.wait(LIMIT_S)
+        return self.spoken
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set one of the vehicle's parameters, as a ground station on the same link does."""
+        message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32)
+        self._theirs.sendto(Client().pack(message), self._vehicle)
 
     def close(self) -> None:
         self._done.set()
@@ -79,10 +104,16 @@ class Scene:
     def mode(self) -> str:
         return self.truths[-1].mode if self.truths else ""
 
+    def wait_on_board(self, seconds: float) -> None:
+        """Let some of the vehicle's own time go by."""
+        end_ns = self.truths[-1].at_ns + round(seconds * 1e9)
+        until(lambda: self.truths[-1].at_ns >= end_ns, f"{seconds:g} s on board")
+
     def fly(self, out: str, *options: str, environ: dict[str, str] | None = None) -> subprocess.Popen[str]:
         """The daemon, ready to fly or already over."""
         urls = ["--vehicle", self.vehicle, "--mocap", self.mocap]
-        command = [sys.executable, "-m", "uavctl", "fly", *urls, "--json"]
+        patience = [word for setting in PATIENT_DAEMON for word in ("--set", setting)]
+        command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
             [*command, *places, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environ
@@ -100,14 +131,6 @@ class Scene:
         return found
 
 
-def until(holds: Callable[[], bool], what: str) -> None:
-    """Wait for something that other processes do."""
-    end_s = time.monotonic() + LIMIT_S
-    while not holds():
-        assert time.monotonic() < end_s, f"{what}: not within {LIMIT_S:g} s"
-        time.sleep(0.02)
-
-
 @contextmanager
 def scene(*overrides: str) -> Iterator[Scene]:
     """A simulated vehicle in the air, as long as the block lasts."""
@@ -118,7 +141,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
         tap = Tap(vehicle_port)
         found = Scene(Path(folder), tap, vehicle_port, mocap_port)
         done = threading.Event()
-        config = load_config("room", overrides)
+        config = load_config("room", [PATIENT_VEHICLE, *overrides])
 
         def serve_peers() -> None:
             serve(
@@ -135,7 +158,9 @@ def scene(*overrides: str) -> Iterator[Scene]:
         peers = threading.Thread(target=serve_peers)
         peers.start()
         try:
-            yield found
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", LIMIT_S)
+                yield found
         finally:
             done.set()
             peers.join()

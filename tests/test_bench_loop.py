@@ -44,7 +44,7 @@ def test_a_short_bench_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> Non
     result = msgspec.convert(found, LoopBench)
     assert (result.seconds, result.runs, result.tick_s) == (2.0, 1, 0.05)
     for measured in (result.plain, result.realtime):
-        assert 0 <= measured.unanswered <= measured.positions <= 45  # one a tick, unless the machine was away
+        assert 0 <= measured.unanswered < measured.positions == 40
         assert measured.recorded > measured.positions and measured.dropped == 0
         assert 0.0 < measured.in_to_out_us.p50 <= measured.in_to_out_us.p99 <= measured.in_to_out_us.max
         assert measured.memory_mib > 10.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import signal
 import socket
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from uavctl.library_bytes import decode
 from uavctl.library_store import library_for
 from uavctl.lock import lock_path, sole_daemon
 
+FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 SOURCE = Path(__file__).parent / "foreign_source.py"
 LIMIT_S = 180.0  # for what is stuck, not for what is slow: a machine may have much else to do
 
@@ -65,12 +68,19 @@ def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str
                 stream.close()
 
 
-def source(port: int) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, str(SOURCE), str(port)], capture_output=True, text=True, check=True, timeout=LIMIT_S
-    )
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+@contextmanager
+def source(port: int) -> Iterator[dict[str, Any]]:
+    """What the source saw; it goes on flying as long as the block lasts."""
+    target = map(str, load_config("room").target.position_m)
+    command = [sys.executable, str(SOURCE), str(port), *target]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            ready, _, _ = select.select([process.stdout], [], [], LIMIT_S)
+            assert ready, "the source is not at rest at the target"
+            yield json.loads(process.stdout.readline())
+        finally:
+            process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +88,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dic
     """What the source saw, what the daemon summed up, its exit code, and the recording; SIGINT ends it."""
     out = tmp_path_factory.mktemp("flight")
     port = free_port()
-    with daemon(port, out) as process:
-        seen = source(port)
+    # It holds for as long as the pause lasts, also where the machine makes it longer.
+    with daemon(port, out, "--set", "fallback.hold_s=60") as process, source(port) as seen:
         process.send_signal(signal.SIGINT)
         summary, _ = process.communicate(timeout=LIMIT_S)
         return seen, json.loads(summary), process.returncode, out / "flight.mcap"
@@ -91,11 +101,11 @@ Flown = tuple[dict[str, Any], dict[str, Any], int, Path]
 def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target(flown: Flown) -> None:
     seen, summary, code, _ = flown
     assert code == 0
-    assert seen["setpoints"] > 150
+    assert seen["setpoints"] >= 240  # a source in whose pause none came would never have got to its end
     assert seen["masks"] == [3135]  # acceleration only, vehicles.md
     assert 0.1 < seen["largest_mps2"] <= 2.0 + 1e-6
     assert seen["position_m"] == pytest.approx(load_config("room").target.position_m, abs=0.15)
-    assert summary["received"] > 50 and summary["lost"] is None
+    assert summary["received"] > 0.5 * seen["poses"] and summary["lost"] is None
 
 
 @pytest.mark.fault(35)
@@ -122,18 +132,24 @@ def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flo
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:
-    decisions = [d for d in records(flown[3], Decision) if d.boundary and d.age_steps is not None]
+    """Told by the steps: a machine that stood still leaves some out, and may make more pauses than the source's."""
+    every = [d for d in records(flown[3], Decision) if d.boundary and d.age_steps is not None]
+    asked = next(i for i, d in enumerate(every) if "operator" in d.reason)
+    decisions = [(d, d.age_steps or 0) for d in every[:asked]]
     horizon = load_config("room").smpc.horizon
-    at = next(i for i, d in enumerate(decisions) if d.mode in (ControlMode.BRAKE, ControlMode.HOLD))
-    assert decisions[at].age_steps == horizon
-    assert [d.age_steps for d in decisions[at - horizon : at]] == list(range(horizon))
-    assert all(d.mode is ControlMode.TRACK for d in decisions[at - horizon : at])
-    assert any(d.mode is ControlMode.TRACK and d.news for d in decisions[at + 1 :])
-    assert flown[1]["fallbacks"] == 1
+    for (before, age), (after, later) in pairwise(decisions):
+        assert later <= age + after.step - before.step
+        if not after.news and before.mode is after.mode is ControlMode.TRACK:
+            assert later == age + after.step - before.step
+    assert all(age < horizon for d, age in decisions if d.mode is ControlMode.TRACK)
+    falls = [i for i, (d, _) in enumerate(decisions) if d.mode in FALLBACK and decisions[i - 1][0].mode not in FALLBACK]
+    assert falls and len(falls) == flown[1]["fallbacks"]
+    for at in falls:
+        assert decisions[at - 1][1] < horizon <= decisions[at][1]
+    assert any(d.mode is ControlMode.TRACK and d.news for d, _ in decisions[falls[-1] + 1 :])
 
 
-def test_setpoints_go_on_in_the_pause_and_the_hand_over_ends_in_zero(flown: Flown) -> None:
-    assert flown[0]["in_pause"] > 50
+def test_the_hand_over_ends_in_zero(flown: Flown) -> None:
     last = [*records(flown[3], Setpoint)][-1]
     assert last.source is SetpointSource.HOLD and last.accel_mps2 == (0.0, 0.0, 0.0)
     assert ControlMode.LAND in [d.mode for d in records(flown[3], Decision)][-200:]
@@ -148,9 +164,13 @@ def test_the_recording_replays_identically(flown: Flown) -> None:
     assert result.decisions > 200
 
 
-def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
-    with daemon(free_port(), tmp_path) as process:
-        process.send_signal(signal.SIGTERM)
+@pytest.mark.parametrize("options", [[], ["--duration", "0.2"]])
+def test_sigterm_and_a_duration_close_the_recording_even_when_nothing_was_heard(
+    tmp_path: Path, options: list[str]
+) -> None:
+    with daemon(free_port(), tmp_path, *options) as process:
+        if not options:
+            process.send_signal(signal.SIGTERM)
         process.communicate(timeout=LIMIT_S)
         assert process.returncode == 1  # ran, but flew nothing
     decisions = list(records(tmp_path / "flight.mcap", Decision))

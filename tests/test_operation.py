@@ -8,12 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.resources import files
+from itertools import groupby
 
 import pytest
-from operation_rig import LIMIT_S, Scene, ended, scene, until
+from operation_rig import Scene, ended, scene
+from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
@@ -66,7 +67,8 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
         name = air.status()["name"]
         # obeyed at the next boundary that has news: which one, the lossy link decides
         until(lambda: air.status()["target_m"] == {"north": -1.0, "east": 0.5, "down": -1.4}, "the order is obeyed")
-        assert air.status()["recorder"]["ok"] and air.status()["vehicle"]["armed"]
+        assert air.status()["recorder"]["ok"]
+        until(lambda: (air.status()["vehicle"] or {}).get("armed", False), "a vehicle in flight is shown")
         assert air.ctl("land", "--vehicle", name)[0] == 0
         until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
         process.communicate(timeout=LIMIT_S)
@@ -79,23 +81,24 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
     with ended(air.fly("f")) as process:
         wait_for_flight(air)
-        tracks_s = time.monotonic()
-        until(lambda: time.monotonic() - tracks_s > 2.0, "more than the second that may be lost")
+        # What is on the disk once stays there: the last second at most may be lost.
+        until(lambda: ControlMode.TRACK in [one.mode for one in decisions(air)], "the flight is on the disk")
+        kept = len(decisions(air))
         assert air.mode == "OFFBOARD"
         process.send_signal(signal.SIGKILL)
         process.wait(LIMIT_S)
-        killed_s = time.monotonic()
-        until(lambda: air.mode != "OFFBOARD", "the failsafe")
-        until(lambda: time.monotonic() - killed_s > 3.0, "three seconds")
-    # What was in the socket's queue when the process died is read within the tap's next turns.
-    assert [s for s in air.tap.spoken_s if s > killed_s + 0.2] == []
+    spoken = air.tap.spoken_by_now()
+    air.tap.set_parameter("COM_OF_LOSS_T", 1.0)  # PX4's own value
+    until(lambda: air.mode != "OFFBOARD", "the failsafe")
+    air.tap.set_parameter("COM_OF_LOSS_T", 600.0)
     until(lambda: max(map(abs, air.truths[-1].velocity_mps)) < 0.3, "the failsafe brings it to rest")
-    assert decisions(air)[-1].mode is ControlMode.TRACK  # whole up to the last second
+    air.wait_on_board(3.0)
+    assert air.tap.spoken_by_now() == spoken
+    assert len(decisions(air)) >= kept
     with ended(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
         until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
         until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
-        heard_s = time.monotonic()
-        until(lambda: time.monotonic() - heard_s > 1.0, "a second")
+        air.wait_on_board(1.0)
         assert air.mode != "OFFBOARD"  # to which PX4 would return by itself if setpoints came again
         assert air.ctl("engage")[0] == 0
         wait_for_flight(air)
@@ -119,19 +122,20 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
 def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     with ended(air.fly("f")) as process:
         wait_for_flight(air)
+        assert air.ctl("goto", "-1,0.5,-1.4")[0] == 0  # wherever it is by now
         until(lambda: max(map(abs, air.truths[-1].velocity_mps)) > 0.3, "it moves, so that there is something to brake")
         process.send_signal(signal.SIGTERM)
         summary, _ = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 0 and json.loads(summary)["recording"].endswith("flight.mcap")
-    modes = list(dict.fromkeys(decision.mode for decision in decisions(air)))
-    assert modes[modes.index(ControlMode.TRACK) :][:4] == [
-        ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND,
-    ]  # fmt: skip
+    # From the last plan on: a machine that stood still may have made it brake before.
+    modes = [mode for mode, _ in groupby(decision.mode for decision in decisions(air))]
+    last = len(modes) - modes[::-1].index(ControlMode.TRACK)
+    assert modes[last:][:3] == [ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND]
     assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
-    over_s = air.tap.spoken_s[-1]
-    until(lambda: time.monotonic() - over_s > 1.0, "a second")
-    assert air.tap.spoken_s[-1] == over_s
+    spoken = air.tap.spoken_by_now()
+    air.wait_on_board(1.0)
+    assert air.tap.spoken_by_now() == spoken
 
 
 def test_the_service_manager_hears_of_the_flight_from_its_ticks(air: Scene) -> None:
@@ -139,19 +143,27 @@ def test_the_service_manager_hears_of_the_flight_from_its_ticks(air: Scene) -> N
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
         environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
-        with ended(air.fly("f", "--duration", "2.5", environ=environ)) as process:
-            heard = [manager.recv(4096).decode()]
-            while heard[-1] != "STOPPING=1":
+        heard: list[str] = []
+
+        def hear(enough: Callable[[], bool]) -> None:
+            def heard_enough() -> bool:
                 heard.append(manager.recv(4096).decode())
+                return enough()
+
+            until(heard_enough, "what the manager is to be told", pause_s=0.0)
+
+        with ended(air.fly("f", environ=environ)) as process:
+            hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in one for one in heard))
+            process.send_signal(signal.SIGINT)
+            hear(lambda: heard[-1] == "STOPPING=1")
             _, told = process.communicate(timeout=LIMIT_S)
     assert heard[0] == "READY=1"
-    assert heard.count("WATCHDOG=1") > 10
     lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
-    assert len(lines) >= 2 and "OFFBOARD armed" in lines[-1]
     assert lines[0] in told  # the health line of a daemon without a terminal
 
 
-def test_a_hanging_loop_gives_no_sign_of_life(air: Scene) -> None:
+def test_a_hanging_loop_gives_no_sign_of_life(air: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", 0.5)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)

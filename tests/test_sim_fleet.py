@@ -3,11 +3,11 @@
 import json
 import socket
 import threading
-import time
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import LAND, Bench, Client, bench, decode
 
@@ -87,7 +87,7 @@ class Station:
 
     def __init__(self, ready: Ready) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(2.0)
+        self._socket.settimeout(LIMIT_S)
         self._to = ("127.0.0.1", int(ready.vehicle.rsplit(":", 1)[1]))
         self.client = Client()
 
@@ -124,28 +124,30 @@ def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_
     arguments = {"duration_s": None, "airborne": True, "on_ready": ready, "stop": stop.is_set}
     thread = threading.Thread(target=serve_all, args=(pair,), kwargs=arguments)
     thread.start()
-    assert opened.wait(5.0)
+    assert opened.wait(LIMIT_S)
     stations = [Station(one) for one in readies]
     try:
-        while not all(told):  # time has begun
-            time.sleep(0.01)
+        until(lambda: all(told), "time has begun")
         for i, one in enumerate(stations):
             one.send(one.client.timesync(1))
             assert one.hear("HEARTBEAT").get_srcSystem() == i + 1
-        while not told[1] or told[1][-1].input[:2] != (1.0, 0.0):
+
+        def obeyed() -> bool:
             for one in stations:  # both hear it
                 one.send(one.client.setpoint(1.0, 0.0, 0.0, system=2))
             stations[1].hear("LOCAL_POSITION_NED")
+            return told[1][-1].input[:2] == (1.0, 0.0)
+
+        until(obeyed, "the second one flies the setpoint")
         for one in stations:
             one.send(one.client.command(LAND, system=2))
         ack = stations[1].hear("COMMAND_ACK")
         assert (ack.get_srcSystem(), ack.command, ack.result) == (2, LAND, 0)
         external = told[0][0].mode
-        while told[1][-1].mode == external:
-            time.sleep(0.01)
+        until(lambda: told[1][-1].mode != external, "the second one lands")
     finally:
         stop.set()
-        thread.join(5.0)
+        thread.join(LIMIT_S)
         for one in stations:
             one.close()
     assert not thread.is_alive()

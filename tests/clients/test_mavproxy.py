@@ -43,17 +43,24 @@ class Console:
 
     def wait(self, pattern: str) -> re.Match[str]:
         """The next line in which a pattern is found."""
-        end = time.monotonic() + LIMIT_S / 2
-        while time.monotonic() < end:
+        (found,) = self.wait_for_each(pattern)
+        return found
+
+    def wait_for_each(self, *patterns: str) -> list[re.Match[str]]:
+        """The next lines in which each pattern is found, in any order."""
+        found: dict[str, re.Match[str]] = {}
+        end = time.monotonic() + LIMIT_S
+        while len(found) < len(patterns):
+            assert time.monotonic() < end, f"waited in vain for {set(patterns) - found.keys()}: {self.seen}"
             try:
                 line = self._lines.get(timeout=0.1)
             except queue.Empty:
                 assert self._process.poll() is None, self.seen
                 continue
             self.seen.append(line)
-            if found := re.search(pattern, line):
-                return found
-        raise AssertionError(f"waited in vain for {pattern!r}: {self.seen}")
+            matches = {pattern: re.search(pattern, line) for pattern in patterns if pattern not in found}
+            found |= {pattern: match for pattern, match in matches.items() if match}
+        return [found[pattern] for pattern in patterns]
 
 
 @contextmanager
@@ -103,7 +110,8 @@ def test_mavproxy_lists_parameters_changes_mode_arms_and_takes_off(tmp_path: Pat
         assert len((next(tmp_path.rglob("mav.parm"))).read_text().splitlines()) == count
         console.say("param show GUID_TIMEOUT")
         console.wait(r"GUID_TIMEOUT +\d")
-        for name, value in (("GUID_TIMEOUT", 2.5), ("WP_YAW_BEHAVIOR", 0.0)):  # a float and an integer
+        # A float and two integers, one of which keeps it armed until it takes off.
+        for name, value in (("GUID_TIMEOUT", 2.5), ("WP_YAW_BEHAVIOR", 0.0), ("DISARM_DELAY", 0.0)):
             console.say(f"param set {name} {value:g}")
             poll(console, f"param fetch {name}", rf"{name} = ([\d.]+)", value.__eq__)
 
@@ -120,5 +128,4 @@ def test_mavproxy_lists_parameters_changes_mode_arms_and_takes_off(tmp_path: Pat
 
         console.say("mode LAND")
         console.wait("Mode LAND")
-        console.wait("AP: Disarming motors")
-        console.wait("DISARMED")
+        console.wait_for_each("AP: Disarming motors", "DISARMED")  # its words, and its next heartbeat

@@ -9,7 +9,7 @@ import subprocess
 from typing import Any
 
 import pytest
-from client_rig import HERE, LIMIT_S, free_port, interpreter, simulator
+from client_rig import FLIGHT_LIMIT_S, HERE, free_port, interpreter, simulator
 
 ASKED_MPS2 = 0.5
 # Drag [1/s] and lag [s] of what is flown: the linear plant's as set below; the quadrotor's under ArduPilot, which makes
@@ -45,7 +45,7 @@ def fly(script: str, python: str, autopilot: str, plant: str) -> dict[str, Any]:
         command = [python, str(HERE / script), f"{ours}://127.0.0.1:{port}"]
         if "grpc" in script:
             command.append(str(free_port(socket.SOCK_STREAM)))
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=FLIGHT_LIMIT_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found: dict[str, Any] = json.loads(done.stdout[done.stdout.index("{") :])
     return found

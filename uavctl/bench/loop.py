@@ -78,7 +78,7 @@ def _run(config: Config, options: Sequence[str], seconds: float, real: bool) -> 
         free.close()
         with _daemon(port, options, folder, real) as process, _empty_loop(tick_ns, seconds, real) as empty:
             peer = Peer(port, tick_ns)
-            memory_kib = _fly(peer, process, seconds)
+            memory_kib = _fly(peer, process, round(seconds * 1e9) // tick_ns)
             peer.finish()
             peer.close()
             process.terminate()
@@ -188,11 +188,15 @@ def _lateness(tick_ns: int, seconds: float) -> list[int]:
     return late_ns
 
 
-def _fly(peer: Peer, process: subprocess.Popen[str], seconds: float) -> list[int]:
-    """Be the vehicle; gives the daemon's resident memory, second by second [KiB]."""
+def _fly(peer: Peer, process: subprocess.Popen[str], positions: int) -> list[int]:
+    """Be the vehicle for as many ticks as the empty loop has; gives the daemon's resident memory by the second [KiB].
+
+    Ticks and not a time: one that the machine slept through has no position, and takes none from the others.
+    """
     memory_kib: list[int] = []
-    begun_ns = next_ns = time.monotonic_ns()
-    while (now_ns := time.monotonic_ns()) - begun_ns < seconds * 1e9:
+    next_ns = time.monotonic_ns()
+    while peer.seen.positions < positions:
+        now_ns = time.monotonic_ns()
         peer.tick()
         if now_ns >= next_ns:
             next_ns += _SAMPLE_NS

@@ -1,0 +1,58 @@
+"""`uavctl loopback --udp` as a process: it flies until enough is seen, and what holds of such a flight at any pace."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from patience import LIMIT_S, until
+
+from logs.reader import records
+from uavctl.data import ControlMode, Decision, Setpoint, Truth
+
+# The machine may stand still for a while: that is no failsafe of the vehicle's.
+PATIENT = ("--set", "sim.setpoint_timeout_s=600.0")
+
+
+def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str) -> dict[str, Any]:
+    """Fly until 15 steps were planned and the truth shows enough; gives the summary."""
+    command = [sys.executable, "-m", "uavctl", "loopback", "--udp", "--duration", "600", "--out", str(out), "--json"]
+    recording = out / "flight.mcap"
+
+    def seen() -> bool:
+        assert process.poll() is None, "it ended by itself"
+        if not recording.exists():
+            return False
+        planned = sum(one.boundary and one.mode is ControlMode.TRACK for one in records(recording, Decision))
+        truths = list(records(recording, Truth))
+        return planned >= 15 and bool(truths) and enough(truths)
+
+    with subprocess.Popen([*command, *PATIENT, *options], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            until(seen, "it flies")
+            process.send_signal(signal.SIGINT)
+            told, _ = process.communicate(timeout=LIMIT_S)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    found: dict[str, Any] = json.loads(told)
+    return found
+
+
+def assert_in_order(recording: Path, dt_ns: int) -> None:
+    """No tick and no step is unaccounted for, and what the vehicle flew is what it was told."""
+    decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
+    assert sum(1 + one.missed_ticks for one in decisions) == decisions[-1].tick + 1
+    assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
+    told = np.array([(0.0, 0.0, 0.0), *(one.accel_mps2 for one in records(recording, Setpoint))])
+    flown = np.unique([one.input for one in truths], axis=0)
+    assert flown.any()
+    for one in flown:
+        assert np.abs(told - one).max(axis=1).min() < 1e-6
