@@ -36,7 +36,7 @@ def _view(flight: FlightData, key: str, width_in: float, height_in: float) -> Dr
     path_m = _flown_m(flight)
     lower, upper = _room(flight.design, path_m)
     with canvas(key, height_in, width_in) as one:
-        ax = one.figure.add_axes((0.01, 0.05, 0.98, 0.93))
+        ax = one.figure.add_axes((0.04, 0.05, 0.92, 0.93))
         one.figure.set_layout_engine(None)
         ax.set_axis_off()
         ax.set_aspect("equal", adjustable="datalim")
