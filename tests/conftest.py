@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
@@ -17,6 +18,7 @@ LONGEST = (
     "test_campaign_cmd", "test_report", "test_properties", "test_operation", "test_closed_loop", "test_soak",
     "test_fly", "test_general_plants", "test_identify", "test_take_off", "test_engagement", "test_bench_loop",
     "test_sim_quadrotor_peers", "test_late", "test_library_solver", "test_sources",
+    "test_difference", "test_paper_cmd", "test_conic", "test_check_cmd", "test_whatif_cmd", "test_natnet_flight",
 )  # fmt: skip
 
 
@@ -46,6 +48,8 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    settings.register_profile("patient", deadline=None)  # how long an example takes is the machine's affair
+    settings.load_profile("patient")
     # Workers inherit the variable from the process that starts them; a cache that somebody chose is kept.
     if CACHE not in os.environ:
         config.stash[OWN] = os.environ[CACHE] = tempfile.mkdtemp(prefix="uavctl-test-cache-")

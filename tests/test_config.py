@@ -58,7 +58,7 @@ def test_dumped_text_gives_an_equal_configuration(preset: str) -> None:
 
 
 @given(name=st.text(), numbers=st.lists(st.floats(min_value=0.0) | st.just(math.inf), min_size=1))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_any_text_and_any_number_is_dumped_as_it_is(name: str, numbers: list[float]) -> None:
     config = load_config("paper")
     link = msgspec.structs.replace(config.link, trace_s=tuple(numbers), blackout=((0.0, 5e-324), (1e16, 1e300)))
@@ -234,7 +234,6 @@ _LEAVES = st.one_of(st.integers(), st.booleans(), st.text(max_size=5), st.floats
 _VALUES = st.recursive(_LEAVES, lambda inner: st.lists(inner, max_size=3), max_leaves=6)
 
 
-@settings(deadline=None)
 @given(st.dictionaries(st.sampled_from("abc"), st.dictionaries(st.sampled_from("xyz"), _VALUES, min_size=1)))
 def test_index_agrees_with_a_document_written_line_by_line(document: dict[str, dict[str, object]]) -> None:
     written, wanted = [], {}

@@ -186,7 +186,7 @@ def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
     assert np.all(half > bare)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0.0, 0.15), st.floats(0.01, 0.05), st.integers(0, 5), st.floats(1e-3, 2e-2))
 def test_older_positions_longer_gaps_and_more_noise_never_help(
     age_s: float, more_s: float, gap: int, std_m: float

@@ -123,7 +123,7 @@ def found(name: str, which: int) -> tuple[float, Multipliers]:
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-9, 1e-6, 1e-3, 0.1, 1.0]), st.sampled_from(PRESETS))
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300, derandomize=True)
 def test_any_multipliers_give_a_bound(seed: int, noise: float, name: str) -> None:
     """Those of the QP disturbed a little or beyond recognition, with another mixture of cuts."""
     one, rng = case(name), np.random.default_rng(seed)

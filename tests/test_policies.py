@@ -180,7 +180,7 @@ def multipliers(name: str) -> tuple[PolicyProgram, Policy, Multipliers]:
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-6, 1e-3, 0.1, 1.0]), st.sampled_from(PRESETS))
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 def test_a_cut_from_any_multipliers_is_a_bound(seed: int, noise: float, name: str) -> None:
     """Solver errors of any size only loosen it; cones and stationarity are left on purpose."""
     program, policy, (equal, triangle, heads, tails) = multipliers(name)

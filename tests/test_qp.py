@@ -71,7 +71,7 @@ def test_the_optimum_is_cvxpy_s(seed: int) -> None:
 
 @given(st.integers(0, 10_000))
 @example(17)  # a row without a curve is left by 4.7, where the least curve shows
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 def test_multipliers_are_those_of_the_optimum(seed: int) -> None:
     """Stationary, of the sign of the side that is met, 0 inside, and at most a soft row's slope."""
     drawn = Drawn(seed)
