@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from recording_fakes import record_flight
 
 from logs.outputs import check_free, write_whole
 from logs.recover import recover
@@ -59,10 +60,9 @@ def test_recovery_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Segment, "add", interrupted)
     source = tmp_path / "flight.mcap"
-    make = [sys.executable, "-m", "uavctl", "loopback", "--duration", "1", "--set", "solver.method=exact", "--json"]
-    subprocess.run([*make, "--out", str(tmp_path)], check=True, stdout=subprocess.DEVNULL)
+    record_flight(source, 5)
+    monkeypatch.setattr(Segment, "add", interrupted)
     with pytest.raises(KeyboardInterrupt):
         recover(source, tmp_path / "restored.mcap")
     assert not (tmp_path / "restored.mcap").exists()

@@ -41,7 +41,7 @@ def test_recording_without_header_says_so(tmp_path: Path) -> None:
 
 def test_cut_anywhere_it_reads_to_the_last_whole_chunk(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
-    items = record_flight(path, 40)
+    items = record_flight(path, 20)
     data = path.read_bytes()
     cut = tmp_path / "cut.mcap"
     counts = []

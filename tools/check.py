@@ -28,7 +28,7 @@ PAGES = {
     ROOT / "docs" / "hand-over.md": hand_over_page,
 }
 BIN = Path(sys.executable).parent
-_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # a test process takes a core, and no more
+_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
 
 
 class StageError(Exception):
@@ -92,10 +92,9 @@ def check_wheel(cache: str) -> str:
 def check_tests(cache: str) -> None:
     """All tests; pytest's own closing line is the last one, and no test at all is a failure (exit code 5).
 
-    A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order. One
-    process more than cores: flights in real time mostly wait.
+    A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
     """
-    command = [str(BIN / "pytest"), "-n", "3", "--dist", "loadfile", "--no-loadscope-reorder"]
+    command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_THREADS, "UAVCTL_CACHE": cache}, check=False)
     if done.returncode != 0:
         raise StageError(f"pytest: exit code {done.returncode}")
