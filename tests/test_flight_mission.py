@@ -12,6 +12,7 @@ import pytest
 from flight_rig import MS, TICKS, StubSolver, codes, inputs_of, make_controller, one_a_step, run, small_plant, vehicle
 from loopback_rig import Memory, flight, lockstep, make_loop
 from numpy.typing import NDArray
+from report_rig import unwritten
 
 from logs.moving_limits import box_at
 from logs.replay import replay
@@ -172,6 +173,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
     assert "the upper limit of north position gave way by " in sentence
 
 
+@unwritten()
 def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
     data = flight(flown(22.0, *WAYPOINTS))
     times_s, targets = data.targets
