@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from campaign_rig import cells, controller
+from patience import LIMIT_S, until
 
 from uavctl.campaign import pool
 from uavctl.campaign.pool import ONE_THREAD, processes
@@ -18,7 +18,6 @@ from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.tasks import CHUNK, Columns, Task, tasks_of
 from uavctl.errors import UsageError
 
-LIMIT_S = 60.0
 ORPHAN = """
 import os, sys
 from uavctl.campaign.pool import processes
@@ -61,10 +60,7 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
     worker = int(parent.stdout.readline())
     parent.kill()
     parent.communicate(timeout=LIMIT_S)
-    until = time.monotonic() + LIMIT_S
-    while _runs(worker):
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: not _runs(worker), "the worker ends with its parent")
 
 
 def test_workers_that_would_give_other_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from loopback_rig import make_loop
+from operation_rig import ended
 
 from logs.reader import read, records
 from logs.replay import recorded_library, replay
@@ -53,19 +54,12 @@ def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str
     url = f"udpin://127.0.0.1:{port}"
     command = [sys.executable, "-m", "uavctl", "fly", "--vehicle", url, "--mocap", url, "--out", str(out), "--json"]
     process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
+    with ended(process):
         assert process.stderr is not None
         for line in process.stderr:
             if "recording to" in line:
                 break
         yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-        for stream in (process.stdout, process.stderr):
-            if stream is not None:
-                stream.close()
 
 
 @contextmanager

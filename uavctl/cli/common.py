@@ -77,6 +77,11 @@ def messages() -> Console:
     return Console(stderr=True, force_interactive=True)
 
 
+def warn(text: str) -> None:
+    """Say what one should know, on a line of its own; nothing in it is markup."""
+    messages().print(text, style="yellow", markup=False, soft_wrap=True)
+
+
 @contextmanager
 def located(loaded: Loaded) -> Iterator[None]:
     """Tell a refused design with the file and line of the key that is to blame.

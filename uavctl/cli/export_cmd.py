@@ -18,7 +18,7 @@ from logs.export import Exported, TableFormat, Watch, export_tables
 from logs.export_tlog import ExportedTlog, export_tlog
 from logs.reader import finished
 from logs.summary import count
-from uavctl.cli.common import Common, messages
+from uavctl.cli.common import Common, messages, warn
 from uavctl.errors import UsageError
 
 TLOG = "tlog"
@@ -51,9 +51,9 @@ def export(
             exported = export_tables(flight, folder, TableFormat(to), force=force, watch=watch)
         Common(json=json).show(exported, lambda: _tables_picture(exported, folder))
         for topic, number in exported.unknown.items():
-            _warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
+            warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
     if not finished(flight):
-        _warn("the recording is torn: exported up to its end")
+        warn("the recording is torn: exported up to its end")
     return 0
 
 
@@ -62,17 +62,13 @@ def _export_tlog(flight: Path, file: Path, link: str | None, *, force: bool, com
         exported = export_tlog(flight, file, link=link, force=force, watch=watch)
     common.show(exported, lambda: _tlog_picture(exported))
     if exported.left_out_bytes:
-        _warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
+        warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
 
 
 def _tlog_file(flight: Path, out: Path | None) -> Path:
     if out is None:
         return flight.with_suffix(".tlog")
     return out / f"{flight.stem}.tlog" if out.is_dir() else out
-
-
-def _warn(text: str) -> None:
-    messages().print(text, style="yellow", markup=False, soft_wrap=True)
 
 
 @contextmanager

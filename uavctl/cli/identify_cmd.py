@@ -18,7 +18,7 @@ from logs.outputs import spare_recording, write_whole
 from logs.reader import header, read
 from logs.tlog import read_tlog
 from uavctl.build import build_design
-from uavctl.cli.common import DEFAULTS, Common, messages
+from uavctl.cli.common import DEFAULTS, Common, messages, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -65,7 +65,7 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
         read_as = msgspec.structs.replace(config, daemon=one_link)
         recorded = read_tlog(flight)
         for note in recorded.notes:
-            messages().print(note, style="yellow", markup=False, soft_wrap=True)
+            warn(note)
         return from_tlog(recorded.packets, read_as), config
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")

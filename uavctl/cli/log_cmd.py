@@ -24,10 +24,9 @@ from logs.report import picture, write_report
 from logs.report_verdicts import verdict_rows
 from logs.summary import count, render, summarise
 from logs.tlog import TlogPacket
-from logs.topics import RecorderNote
 from logs.verdicts import judge
 from uavctl.build import build_design
-from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.common import DEFAULTS, Common, located, warn
 from uavctl.cli.export_cmd import export
 from uavctl.cli.info_table import info_table
 from uavctl.cli.log_compare_cmd import compare_command
@@ -99,12 +98,12 @@ def replay(
     replayed = replay_flight(flight, tolerance, common.overrides)
     result = replayed.result
     for text in replayed.other_versions:
-        messages().print(f"{text}: decisions may differ", style="yellow", markup=False)
+        warn(f"{text}: decisions may differ")
     if result.dropped:
         text = f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
-        messages().print(text, style="yellow", markup=False)
+        warn(text)
     if not replayed.finished:
-        messages().print("the recording is torn: compared up to its end", style="yellow", markup=False)
+        warn("the recording is torn: compared up to its end")
     document = {
         **msgspec.structs.asdict(result),
         "changed": replayed.changed,
@@ -127,16 +126,15 @@ def report(
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         spare_recording(target)
-    entries = tuple(read(flight))
-    data = FlightData.from_records(entries, flight)
-    dropped = max((record.dropped for _, _, record in entries if isinstance(record, RecorderNote)), default=0)
+    data = FlightData.from_records(read(flight), flight)
+    dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
     judged = judge(data)
     if svg is not None:
         write_whole(svg, picture(data))
     write_report(data, summary, page, judged)
     if not finished(flight):
-        messages().print("the recording is torn: shown up to its end", style="yellow", markup=False)
+        warn("the recording is torn: shown up to its end")
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
     Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
     return 0

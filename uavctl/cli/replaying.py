@@ -14,7 +14,7 @@ from logs.replay import MAKERS, ReplayResult
 from logs.replay import replay as replay_recording
 from logs.tlog import TlogPacket, read_tlog
 from logs.topics import RecorderNote
-from uavctl.cli.common import messages
+from uavctl.cli.common import messages, warn
 from uavctl.cli.flying import cpu, versions
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.config.load import parse
@@ -112,7 +112,7 @@ def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ..
     else:
         return None
     for note in notes:
-        messages().print(note, style="yellow", markup=False, soft_wrap=True)
+        warn(note)
     return packets
 
 

@@ -30,7 +30,7 @@ from logs.topics import HEADER, RecorderNote
 from logs.views import Views
 from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
-from uavctl.cli.common import Common, messages
+from uavctl.cli.common import Common, messages, warn
 from uavctl.cli.flying import conclude, put_header, recording_path
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
@@ -156,7 +156,7 @@ def _warn(flight: Path, recorded: Header, history: History) -> None:
     if not finished(flight):
         texts.append("the recording is torn: flown up to its end")
     for text in texts:
-        messages().print(text, style="yellow", markup=False, soft_wrap=True)
+        warn(text)
 
 
 @contextmanager
