@@ -11,37 +11,23 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
 
+from logs.contents import Contents, Message, Order
 from logs.segment import MAGIC
-from logs.topics import Definition, definition
 from uavctl.errors import RecordingError
+
+__all__ = ["Damage", "End", "Message", "Order", "is_finished", "scan"]
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
 _CHUNK_FIELDS = _CHUNK.size - _RECORD.size
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
-_IS_MESSAGE, _IS_INDEX = int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)  # plain numbers: compared for every record
-
-
-class Message(NamedTuple):
-    """A message whose chunk has the right checksum."""
-
-    definition: Definition
-    sequence: int
-    at_ns: int
-    data: bytes
-    offset: int  # of its chunk in the file
-    repeated: bool = False  # header or library, once more, at the start of a later segment
+_IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
 
 
 @dataclass(frozen=True)
@@ -77,11 +63,15 @@ class _TornRecordError(_BadRecordError):
 Buffer = bytes | mmap.mmap
 
 
-def scan(path: Path) -> Iterator[Message | Damage | End]:
+def scan(path: Path, order: Order | None = None) -> Iterator[Message | Damage | End]:
     """Messages and damage of one file in file order, and then its `End`.
 
+    Args:
+        path: the file.
+        order: where the reader is, moved on; what was made for viewers is then looked at for its number only.
+
     Raises:
-        RecordingError: the file cannot be read, or is no recording at all.
+        RecordingError: the file cannot be read, is no recording at all, or lacks a message that the order wants.
     """
     try:
         with path.open("rb") as file:
@@ -89,7 +79,7 @@ def scan(path: Path) -> Iterator[Message | Damage | End]:
                 yield End(finished=False, complete=False)
                 return
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                yield from _scan(path, data)
+                yield from _scan(path, data, order)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
 
@@ -110,7 +100,7 @@ def is_finished(path: Path) -> bool:
         raise RecordingError(f"{path}: {error.strerror}") from error
 
 
-def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
+def _scan(path: Path, data: Buffer, order: Order | None) -> Iterator[Message | Damage | End]:
     size = len(data)
     at = len(MAGIC)
     damaged = False
@@ -124,13 +114,14 @@ def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
             raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){_hint(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
-    contents = _Contents()
+    contents = Contents()
     while at < size:
         opcode = data[at]
         try:
             length = _whole(data, at)
             if opcode == Opcode.CHUNK:
-                yield from contents.messages(_chunk(data, at, length), at)
+                content = _chunk(data, at, length)
+                yield from contents.messages(content, at) if order is None else contents.records(content, at, order)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
                 if not damaged and stored != _crc(data, at):
@@ -156,52 +147,8 @@ def _scan(path: Path, data: Buffer) -> Iterator[Message | Damage | End]:
     yield End(finished=False, complete=False)
 
 
-class _Contents:
-    """Messages of chunks; remembers the schemas that it has seen."""
-
-    def __init__(self) -> None:
-        self._schemas: dict[int, Schema] = {}
-        self._known: dict[bytes, tuple[int, Definition]] = {}
-
-    def messages(self, content: bytes, offset: int) -> Iterator[Message]:
-        """Messages of one chunk, whose checksum is right."""
-        channels: dict[int, Definition] = {}
-        at = 0
-        size = len(content)
-        while at < size:
-            if content[at] == _IS_MESSAGE:
-                _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-                begin, at = at + _MESSAGE.size, at + _RECORD.size + length
-                yield Message(channels[channel], sequence, at_ns, content[begin:at], offset)
-                continue
-            opcode, length = _RECORD.unpack_from(content, at)
-            at += _RECORD.size
-            if opcode == Opcode.CHANNEL:
-                channel, channels[channel] = self._channel(content[at : at + length])
-            elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
-                self._schemas[schema.id] = schema
-            at += length
-
-    def _channel(self, record: bytes) -> tuple[int, Definition]:
-        if record not in self._known:
-            channel = Channel.read(ReadDataStream(BytesIO(record)))
-            schema = self._schemas.get(channel.schema_id)
-            self._known[record] = (channel.id, _definition(channel, schema))
-        return self._known[record]
-
-
 def _hint(path: Path) -> str:
     return "; `uavctl log replay` and `uavctl identify` read a .tlog" if path.suffix == ".tlog" else ""
-
-
-def _definition(channel: Channel, schema: Schema | None) -> Definition:
-    if schema is not None:
-        return Definition(channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
-    try:
-        return definition(channel.topic)  # the chunk with its schema is damaged
-    except KeyError:
-        return Definition(channel.topic, channel.message_encoding)
 
 
 def _whole(data: Buffer, at: int) -> int:

@@ -67,6 +67,14 @@ def alike(one: Record, other: Record) -> bool:
     return binary is not None and binary == _exact(other)
 
 
+def says(record: Record, message: bytes) -> bool:
+    """Whether a message is surely this record, in every bit: its bytes are those that it would be recorded as."""
+    try:
+        return encode(record) == message
+    except EncodingError:
+        return False
+
+
 def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
     """Bytes of a record that a reader will get back from under this topic and log time [ns].
 

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from logs.chunks import Damage, End, Message, is_finished, scan
+from logs.chunks import Damage, End, Message, Order, is_finished, scan
 from logs.disk import later_segments
 from logs.encoding import decode
-from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, is_view, record_type
+from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, record_type
 from uavctl.data import Header, Record
 from uavctl.errors import RecordingError
 
@@ -38,15 +38,19 @@ def segment_files(path: Path) -> tuple[Path, ...]:
     return files
 
 
-def walk(path: Path) -> Iterator[Message | Damage | End]:
+def walk(path: Path, order: Order | None = None) -> Iterator[Message | Damage | End]:
     """Messages and damage of all segments; header and library that later segments repeat are marked.
 
+    Args:
+        path: the recording.
+        order: see `logs.chunks.scan`.
+
     Raises:
-        RecordingError: there is no such recording, or a file of it is none.
+        RecordingError: there is no such recording, a file of it is none, or it is not in order.
     """
     first: dict[str, bytes] = {}
     for file in segment_files(path):
-        for item in scan(file):
+        for item in scan(file, order):
             if isinstance(item, Message) and item.definition.topic in (HEADER, LIBRARY):
                 yield item._replace(repeated=item.data == first.get(item.definition.topic))
                 first.setdefault(item.definition.topic, item.data)
@@ -105,16 +109,9 @@ def good_messages(path: Path) -> Iterator[Message]:
     Raises:
         RecordingError: as `read`.
     """
-    expected: int | None = None
-    for item in walk(path):
+    for item in walk(path, Order(path)):
         if isinstance(item, Message):
-            if expected is not None and item.sequence != expected:
-                raise RecordingError(
-                    f"{path}: message {item.sequence} where {expected} should be (is a segment file gone?); "
-                    f"`uavctl log recover {path} OUT` restores the rest"
-                )
-            expected = item.sequence + 1
-            if not item.repeated and not is_view(item.definition.topic):
+            if not item.repeated:
                 yield item
         elif isinstance(item, Damage) and not item.torn:
             raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")

@@ -31,9 +31,9 @@ from logs.difference import (
     plain,
     stage,
 )
-from logs.encoding import alike
+from logs.encoding import alike, decode, says
 from logs.reader import records
-from logs.topics import RecorderNote
+from logs.topics import RecorderNote, raw_link, record_type
 from uavctl.data import Datagram, PolicyLibrary, Record, Refused, Sink, StepInput
 from uavctl.errors import RecordingError
 from uavctl.loop import ControlLoop
@@ -51,7 +51,6 @@ COMPARED = frozenset(
         "/uavctl/link",
     }
 )
-Key = tuple[str, int]
 Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
@@ -89,23 +88,23 @@ class _Produced:
     """Sink that keeps what the replayed loop says until the recording's word is read."""
 
     def __init__(self) -> None:
-        self.waiting: dict[Key, deque[Record]] = defaultdict(deque)
+        self.waiting: deque[tuple[str, int, Record]] = deque()
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         if _is_compared(topic):
-            self.waiting[topic, at_ns].append(record)
+            self.waiting.append((topic, at_ns, record))
 
     def take(self, topic: str, at_ns: int) -> Record | None:
         """The next record said under this topic and time."""
-        queue = self.waiting.get((topic, at_ns))
-        found = queue.popleft() if queue else None
-        if queue is not None and not queue:
-            del self.waiting[topic, at_ns]
-        return found
+        for place, (its_topic, its_ns, record) in enumerate(self.waiting):  # nearly always the first
+            if its_ns == at_ns and its_topic == topic:
+                del self.waiting[place]
+                return record
+        return None
 
     def unsaid(self) -> list[tuple[str, int, Record]]:
         """What the loop has said and the recording has not; it is forgotten."""
-        found = [(topic, at_ns, one) for (topic, at_ns), queue in self.waiting.items() for one in queue]
+        found = [*self.waiting]
         self.waiting.clear()
         return found
 
@@ -153,6 +152,11 @@ class _Findings:
         """A tick begins."""
         self._tick = inp
         self._begun_ns = inp.at_ns if self._begun_ns is None else self._begun_ns
+
+    def same(self, topic: str) -> None:
+        """Take one record that is alike, while all were."""
+        self.compared += 1
+        self.decisions += topic == DECISION
 
     def compare(self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None) -> None:
         """Take one record of the recording and what the loop says in its place; either may be missing."""
@@ -237,7 +241,7 @@ class _Findings:
 
 
 def replay(
-    messages: Iterable[tuple[str, int, Record]],
+    messages: Iterable[tuple[str, int, Record | bytes]],
     make_loop: Callable[[Sink], ControlLoop],
     tolerance: float = 0.0,
     *,
@@ -247,7 +251,7 @@ def replay(
     """Drive a loop with the recorded inputs and compare all that it says, and that it says no more.
 
     Args:
-        messages: (topic, log time [ns], record) in the order of recording.
+        messages: (topic, log time [ns], record or the bytes that it is recorded as) in the order of recording.
         make_loop: builds the loop from the recording's configuration, around the given sink.
         tolerance: largest difference of two numbers that counts as none, relative to the larger
             of 1 and their size; 0 compares bit for bit. For a recording of another CPU type.
@@ -257,7 +261,8 @@ def replay(
     produced = _Produced()
     loop = make_loop(produced)
     found = _Findings(Places(loop.plant), tolerance, ignored)
-    for topic, at_ns, record in messages:
+    for topic, at_ns, message in messages:
+        record = _decoded(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
         if isinstance(record, StepInput):
             # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
             _unsaid(found, produced)
@@ -272,10 +277,18 @@ def replay(
         elif isinstance(record, RecorderNote):
             found.dropped = record.dropped
         if _is_compared(topic):
-            found.compare(topic, at_ns, record, produced.take(topic, at_ns))
+            replayed = produced.take(topic, at_ns)
+            if found.first is None and isinstance(message, bytes) and replayed is not None and says(replayed, message):
+                found.same(topic)
+            else:
+                found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
     if finished:
         _unsaid(found, produced)
     return found.result()
+
+
+def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:
+    return decode(topic, message, at_ns) if isinstance(message, bytes) else message
 
 
 def _unsaid(found: _Findings, produced: _Produced) -> None:
@@ -286,3 +299,10 @@ def _unsaid(found: _Findings, produced: _Produced) -> None:
 @cache
 def _is_compared(topic: str) -> bool:
     return topic in COMPARED or (topic.startswith("/raw/") and topic.endswith("/out"))
+
+
+@cache
+def _is_input(topic: str) -> bool:
+    """Whether the loop is driven by what is recorded here, or the result tells it."""
+    link = raw_link(topic)
+    return record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]

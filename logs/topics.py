@@ -62,6 +62,11 @@ class Definition:
     schema_encoding: str = ""
     schema: bytes = b""
 
+    @cached_property
+    def for_viewers(self) -> bool:
+        """Whether the topic was made for viewers: it holds nothing that the records do not."""
+        return is_view(self.topic)
+
 
 @dataclass(frozen=True)
 class Topic:

@@ -5,10 +5,14 @@ from pathlib import Path
 import pytest
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, write_two_segments
 
+from logs.disk import DiskFile
+from logs.encoding import encode
 from logs.reader import header, read, records, segment_files
 from logs.recorder import SyncRecorder
+from logs.segment import Entry, Segment
+from logs.topics import definition
 from uavctl.config.log import LogConfig
-from uavctl.data import Datagram, Event, Record, Setpoint
+from uavctl.data import Datagram, Event, Record, Setpoint, Severity
 from uavctl.errors import RecordingError
 
 
@@ -77,6 +81,27 @@ def test_missing_segment_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "flight-2.mcap").unlink()
     with pytest.raises(RecordingError, match="is a segment file gone"):
         list(read(path))
+
+
+@pytest.mark.parametrize("lacks", ["/view/estimate", "/uavctl/event"])
+def test_a_missing_message_is_noticed_also_one_for_viewers(lacks: str, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    event = encode(Event(at_ns=7, severity=Severity.INFO, code="code", text="text"))
+    messages = [
+        Entry(definition(topic), 1 + n, n, event) for n, topic in enumerate(["/uavctl/event", "/view/estimate"] * 9)
+    ]
+    at = next(n for n, one in enumerate(messages) if n > 5 and one.definition.topic == lacks)
+    for entries, good in ((messages, True), (messages[:at] + messages[at + 1 :], False)):
+        path.unlink(missing_ok=True)
+        segment = Segment(DiskFile(path), chunk_bytes=512)
+        for entry in entries:
+            segment.add(entry)
+        segment.finish()
+        if good:
+            assert [topic for topic, _, _ in read(path)] == ["/uavctl/event"] * 9
+        else:
+            with pytest.raises(RecordingError, match=f"message {at + 2} where {at + 1} should be"):
+                list(read(path))
 
 
 def test_other_recording_with_such_a_name_is_not_taken_in(tmp_path: Path) -> None:

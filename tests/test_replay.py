@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import msgspec
 import pytest
 from loopback_rig import Memory, lockstep, make_loop
 
+from logs.encoding import encode
 from logs.replay import replay
 from logs.replay_tlog import replay_tlog
 from logs.tlog import read_tlog
+from logs.topics import raw_link
 from uavctl.config import load_config
 from uavctl.data import Datagram, Decision, Event, Plan, Setpoint, StepInput
 from uavctl.loop import VEHICLE
@@ -45,6 +48,26 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None
     assert first.recorded == repr(nudged[0]) and first.replayed == repr(record.input[0])
     close = replay(changed, lambda sink: make_loop(load_config("paper"), sink), tolerance=1e-9)
     assert close.identical
+
+
+def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_are_others(flown: Memory) -> None:
+    written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
+    replayed = partial(replay, make_loop=lambda sink: make_loop(load_config("paper"), sink))
+    whole = replayed(flown.entries)
+    assert whole.identical and replayed(written) == whole
+    otherwise = [
+        (topic, at_ns, data if raw_link(topic) else json.dumps(json.loads(data)).encode())
+        for topic, at_ns, data in written
+    ]
+    assert otherwise != written and replayed(otherwise) == whole
+    at = next(i for i, (_, _, r) in enumerate(flown.entries) if isinstance(r, Decision) and r.tick == 57)
+    topic, at_ns, record = flown.entries[at]
+    assert isinstance(record, Decision)
+    changed = [*written]
+    changed[at] = (topic, at_ns, encode(msgspec.structs.replace(record, fresh=record.fresh + 1)))
+    result = replayed(changed)
+    assert result.first_difference is not None and result.first_difference.field == "fresh"
+    assert (result.decisions, result.compared, result.decisions_differing) == (whole.decisions, whole.compared, 1)
 
 
 def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory) -> None:

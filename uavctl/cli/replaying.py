@@ -9,13 +9,13 @@ from pathlib import Path
 import msgspec
 
 from logs.foreign import is_foreign, read_mcap
-from logs.reader import finished, header, read, records
+from logs.reader import finished, good_messages, header, records
 from logs.replay import MAKERS, ReplayResult
 from logs.replay import replay as replay_recording
 from logs.tlog import TlogPacket, read_tlog
 from logs.topics import RecorderNote
 from uavctl.cli.common import messages, warn
-from uavctl.cli.flying import cpu, versions
+from uavctl.cli.provenance import cpu, versions
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.config.load import parse
 from uavctl.data import Header
@@ -79,7 +79,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         controller, changed = recorded_flyer(flight, config).controller, ()
     whole = finished(flight)
     result = replay_recording(
-        read(flight),
+        ((one.definition.topic, one.at_ns, one.data) for one in good_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
         finished=whole,
