@@ -22,6 +22,7 @@ from mcap.reader import make_reader
 from logs.chunks import Message
 from logs.encoding import decode
 from logs.flat import Cell, Column, Kind, Tables
+from logs.made_folders import all_or_none
 from logs.outputs import check_free, unfinished
 from logs.reader import finished, good_messages, segment_files
 from logs.topics import HEADER, LIBRARY, is_view, record_type
@@ -94,7 +95,8 @@ def export_tables(
 ) -> Exported:
     """Write the tables of a recording into a folder.
 
-    The recording is read twice: first to see what columns its values need.
+    The recording is read twice: first to see what columns its values need. Where the export does not come to its end,
+    nothing new is left behind.
 
     Raises:
         RecordingError: It cannot be read, holds no record, or the files cannot be written.
@@ -106,9 +108,10 @@ def export_tables(
     if not columns:
         raise RecordingError(f"{flight}: no record of this version in it, so there is nothing to export")
     files = {name: folder / f"{file_stem(name)}.{kind.value}" for name in columns}
-    check_free(list(files.values()), force=force)
+    targets = list(files.values())
+    check_free(targets, force=force)
     rows: Counter[str] = Counter()
-    with unfinished(list(files.values())) as parts, ExitStack() as stack:
+    with all_or_none(targets), unfinished(targets) as parts, ExitStack() as stack:
         writers = {name: stack.enter_context(begin(parts[files[name]], columns[name])) for name in columns}
         for topic, at_ns, record in _decoded(watch(good_messages(flight), total, "writing")):
             for name, row in tables.rows(topic, at_ns, record):

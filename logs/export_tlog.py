@@ -14,6 +14,7 @@ import msgspec
 
 from logs.chunks import Message
 from logs.export import Watch, known_number, unwatched
+from logs.made_folders import all_or_none
 from logs.outputs import check_free, unfinished
 from logs.reader import good_messages, header
 from logs.tlog import MARKERS, frame_length
@@ -54,7 +55,7 @@ def export_tlog(
     check_free([file], force=force)
     packets: Counter[str] = Counter()
     raw = _Raw(_streams(first))
-    with unfinished([file]) as parts, parts[file].open("wb") as out:
+    with all_or_none([file]), unfinished([file]) as parts, parts[file].open("wb") as out:
         messages = watch(good_messages(flight), known_number(flight), "writing")
         for at_ns, topic, packet in _in_order(raw.packets(messages, link)):
             out.write(_STAMP.pack(began_us + (at_ns - first.started_ns) // 1000) + packet)

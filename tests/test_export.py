@@ -142,7 +142,7 @@ def test_columns_that_parquet_cannot_hold_are_named(tmp_path: Path) -> None:
     assert recorder.close().ok
     with pytest.raises(RecordingError, match="column step_ns: Parquet has no place"):
         export_tables(path, tmp_path / "out", TableFormat.PARQUET)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
     export_tables(path, tmp_path / "out", TableFormat.CSV)
 
 
@@ -237,7 +237,7 @@ def test_a_full_disk_leaves_nothing_behind(to: str, flown: Path, capsys: pytest.
     with small_files(4096):
         assert run(["log", "export", str(flown), "--to", to, "--out", str(out)]) == 1
     assert "cannot be written (File too large)" in capsys.readouterr().err.replace("\n", " ")
-    assert not out.exists() or list(out.iterdir()) == []
+    assert not out.exists()
 
 
 def test_after_an_error_what_was_there_is_still_there(flown: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from cyclopts import App, CycloptsError
 from rich.markup import escape
@@ -47,10 +47,17 @@ for _name, (_path, _help) in _COMMANDS.items():
 app.register_install_completion_command(add_to_startup=False)
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Run one command line; returns its exit code. Errors meant for a person come without a traceback."""
+def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -> int:
+    """Run one command line; returns its exit code. Errors meant for a person come without a traceback.
+
+    Args:
+        arguments: The words after the program's name.
+        imported: Called before the command runs, when its modules are there.
+    """
     try:
-        result = app(list(arguments), exit_on_error=False, print_error=False, result_action="return_value")
+        command, bound, _ = app.parse_args(list(arguments), exit_on_error=False, print_error=False)
+        imported()
+        result = command(*bound.args, **bound.kwargs)
     except CycloptsError as error:
         return _refuse(str(error), UsageError.exit_code)
     except UavctlError as error:

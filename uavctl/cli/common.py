@@ -6,13 +6,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Console, RenderableType
+from rich.markup import escape
+from rich.table import Table
 
-from sim.faults import problems
 from uavctl.config import Loaded, explain, load
 from uavctl.errors import ConfigError, DesignError
 
@@ -45,6 +47,8 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
+        from sim.faults import problems  # a replay, which has a configuration of its own, needs no simulator
+
         loaded = load(self.config, self.overrides)
         wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
         if wrong:
@@ -65,7 +69,17 @@ class Common:
 
 
 DEFAULTS = Common()
+Flight = Annotated[Path, Parameter(help="the recording")]
+Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
 POSITIVE = validators.Number(gt=0)
+
+
+def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
+    """A table of names and values; nothing in it is markup."""
+    table = Table(title=title, show_header=False, title_justify="left")
+    for name, value in rows:
+        table.add_row(escape(name), escape(str(value)))
+    return table
 
 
 def messages() -> Console:

@@ -9,7 +9,6 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
-from logs.disk import check_room
 from logs.recorder import Recorder
 from logs.summary import render
 from uavctl.build import build_design
@@ -29,9 +28,9 @@ from uavctl.cli.flying import (
     conclude,
     live_line,
     live_view_port,
+    new_recording,
     onlookers,
     put_header,
-    recording_path,
     stop_limit_s,
     stop_on_signals,
 )
@@ -96,9 +95,9 @@ def fly(
     with (
         sole_daemon(config.daemon.vehicle) as tenure,
         listening(control_folder(control), daemon_name(config)) as listener,
+        onlookers(view_port) as looking,
+        new_recording(out, config.name, config.log.free_bytes) as path,
     ):
-        path = recording_path(out, config.name)
-        check_room(path, config.log.free_bytes)
         with located(loaded):
             design = build_design(config)
             check_places(config, design, take_off_m, engagement.goal)
@@ -108,7 +107,6 @@ def fly(
             as_realtime(realtime) as collect,
             stop_on_signals() as stopped,
             connected(config) as connections,
-            onlookers(view_port) as looking,
         ):
             checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
             recorder = Recorder(path, config.log, onlookers=looking)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import shlex
 import signal
 import sys
@@ -10,7 +9,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Protocol
 
@@ -18,19 +16,20 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from logs.disk import check_room
 from logs.flight_data import FlightData
 from logs.journal import RecorderStatus
 from logs.live import live_view
+from logs.made_folders import no_empty_folders
 from logs.onlookers import Onlookers
 from logs.reader import read
 from logs.report import write_report
 from logs.summary import FlightSummary, summarise
 from logs.topics import HEADER, LIBRARY
 from logs.views import Views
-from uavctl import __version__
 from uavctl.cli.common import messages
 from uavctl.cli.prepare import Prepared
-from uavctl.code_id import decider_id
+from uavctl.cli.provenance import cpu, versions
 from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
@@ -45,7 +44,6 @@ Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer
 LivePort = Annotated[int | None, Parameter(help=f"TCP port of the live view; else {LIVE_PORT}")]
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
-_LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
 class Recording(Protocol):
@@ -97,6 +95,19 @@ def recording_path(out: Path | None, name: str) -> Path:
     return folder / "flight.mcap"
 
 
+@contextmanager
+def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
+    """File of a new recording, with room for it; folders that are made for it and stay empty are gone in the end.
+
+    Raises:
+        RecordingError: as `check_room` does.
+    """
+    path = recording_path(out, name)
+    with no_empty_folders([path]):
+        check_room(path, free_bytes)
+        yield path
+
+
 def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None:
     """Begin a recording with what is needed to decide alike."""
     config, design, library = prepared.config, prepared.design, prepared.library
@@ -116,21 +127,6 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
     if library is not None:
         record = PolicyLibrary(library_id=library.library_id, design_id=design.design_id, data=library.data)
         recorder.put(LIBRARY, started_ns, record)
-
-
-def versions() -> dict[str, str]:
-    """What decides alike must be of the same versions."""
-    found = {name: metadata.version(name) for name in _LIBRARIES}
-    return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
-
-
-def cpu() -> str:
-    """The CPU type: linear algebra kernels, and so the last bits, depend on it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def stop_limit_s(config: Config, *, takes_off: bool) -> float:

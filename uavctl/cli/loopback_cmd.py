@@ -16,7 +16,6 @@ import msgspec
 from cyclopts import Parameter
 from rich.progress import Progress
 
-from logs.disk import check_room
 from logs.onlookers import Onlookers
 from logs.recorder import Recorder, SyncRecorder
 from logs.summary import FlightSummary, render
@@ -33,9 +32,9 @@ from uavctl.cli.flying import (
     conclude,
     live_line,
     live_view_port,
+    new_recording,
     onlookers,
     put_header,
-    recording_path,
     stop_limit_s,
     stop_on_signals,
 )
@@ -88,16 +87,15 @@ def loopback(
         raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
     with located(loaded):
         design = build_design(config)
-    path = recording_path(out, config.name)
-    check_room(path, config.log.free_bytes)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
-    with located(loaded):
-        check_places(config, design, take_off_m, engagement.goal)
-        prepared = prepare(config, design)
-    if udp:
-        summary, verdict = _real_time(prepared, path, engagement, view_port)
-    else:
-        summary, verdict = lockstep(prepared, path, engagement)
+    with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
+        with located(loaded):
+            check_places(config, design, take_off_m, engagement.goal)
+            prepared = prepare(config, design)
+        if udp:
+            summary, verdict = _real_time(prepared, path, engagement, looking)
+        else:
+            summary, verdict = lockstep(prepared, path, engagement)
     common.show(summary, lambda: render(summary))
     tell_verdict(verdict)
     return 0 if summary.steps and not summary.recorder_dropped and not verdict else 1
@@ -166,15 +164,12 @@ def lockstep(
     return conclude(path, wall_s, status), engagement.verdict(loop)
 
 
-def _real_time(
-    prepared: Prepared, path: Path, engagement: Engagement, live_port: int | None
-) -> tuple[FlightSummary, str]:
+def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: Onlookers) -> tuple[FlightSummary, str]:
     config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(connected(config))
-        looking = stack.enter_context(onlookers(live_port))
         recorder = Recorder(path, config.log, onlookers=looking)
         try:
             put_header(recorder, prepared, monotonic_ns())

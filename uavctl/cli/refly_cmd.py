@@ -9,7 +9,6 @@ import msgspec
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from logs.disk import check_room
 from logs.reader import records
 from logs.summary import FlightSummary, count, render
 from uavctl.build import build_design
@@ -18,7 +17,7 @@ from uavctl.campaign.refly import Agreement, Reflight, agreement, reflight
 from uavctl.campaign.results import read_cells
 from uavctl.campaign.verdict import SMPC
 from uavctl.cli.engagement import Engagement
-from uavctl.cli.flying import recording_path
+from uavctl.cli.flying import new_recording
 from uavctl.cli.loopback_cmd import lockstep
 from uavctl.cli.prepare import prepare, ready_library
 from uavctl.data import Truth
@@ -53,11 +52,10 @@ def refly(folder: Path, which: str, out: Path | None) -> Reflown:
 def fly_again(flight: Reflight, out: Path | None) -> Reflown:
     """Fly a run, record it and compare it with what the campaign flew."""
     config = flight.config
-    path = recording_path(out, "refly")
-    check_room(path, config.log.free_bytes)
     as_flown = Engagement(config, take_off_m=None, goto=False)
-    summary, _ = lockstep(prepare(config, build_design(config)), path, as_flown, flight.script)
-    return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
+    with new_recording(out, "refly", config.log.free_bytes) as path:
+        summary, _ = lockstep(prepare(config, build_design(config)), path, as_flown, flight.script)
+        return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
 
 
 def picture(reflown: Reflown) -> RenderableType:

@@ -16,7 +16,6 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from logs.disk import check_room
 from logs.export import known_number
 from logs.flight_data import FlightData
 from logs.foreign import is_foreign
@@ -31,7 +30,7 @@ from logs.views import Views
 from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
 from uavctl.cli.common import Common, messages, warn
-from uavctl.cli.flying import conclude, put_header, recording_path
+from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.cli.replaying import check_first, other_versions
@@ -105,11 +104,9 @@ def whatif(
         now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
-    path = recording_path(out, loaded.config.name)
-    check_room(path, before.log.free_bytes)
     other = None if over == RECORDED else _relinked(history, on, seed)
     begun = time.perf_counter()
-    with _progress() as progress:
+    with new_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
         again = _reproduced(history, was, answers, _watch(progress, "reproducing the flight"))
         course, status = _recorded(
             history, now, answers, other, path, recorded, _watch(progress, "flying it otherwise")
