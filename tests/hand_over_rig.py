@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import msgspec
+from msgspec.structs import replace
 
 from uavctl.config.hand_over import HandOverConfig
 from uavctl.data import Command, Event, Order, VehicleStatus
@@ -49,7 +47,7 @@ class Rig:
         assert self.vehicle is not None
         mode = fields.get("mode", self.vehicle.mode)
         external = mode in ("OFFBOARD", "GUIDED")
-        self.vehicle = msgspec.structs.replace(self.vehicle, **{"external": external, **fields})
+        self.vehicle = replace(self.vehicle, **{"external": external, **fields})
 
     def is_in(self, *states: State) -> bool:
         return self.state in states
@@ -60,8 +58,8 @@ class Rig:
     def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> Told:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
-            self.vehicle = msgspec.structs.replace(self.vehicle, at_ns=at_ns)
-        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, heard=heard, commands=commands, **fields)  # type: ignore[arg-type]
+            self.vehicle = replace(self.vehicle, at_ns=at_ns)
+        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, heard=heard, commands=commands, **fields)
         told = self.hand_over.update(self.view)
         if told.ask is not None:
             self.asked.append((at_ns, told.ask))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 
@@ -348,5 +347,5 @@ def test_the_sequence_counts_modulo_256_across_kinds() -> None:
 
 def test_messages_are_frozen() -> None:
     (position,) = positions(GOOD)
-    with pytest.raises(dataclasses.FrozenInstanceError):
+    with pytest.raises(AttributeError):
         position.system = 3  # type: ignore[misc]  # the assignment is what must fail

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from hand_over_rig import ACCEPTED, DENIED, ENGAGE, FLY, NEUTRAL, NOTHING, NOW, TAKE_OFF, TICK_NS, Rig
+from msgspec.structs import replace
 
 from uavctl.config.hand_over import HandOverConfig
 from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, Order, Severity

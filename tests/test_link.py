@@ -104,6 +104,20 @@ def test_each_source_has_its_own_clock() -> None:
     assert link.stats(NOW).bad == {}
 
 
+def test_each_sources_new_clock_is_told_once() -> None:
+    link, cameras = make_link(), {17: Peer(17), 18: Peer(18)}
+    epochs_us, told = dict.fromkeys(cameras, 10**12), []
+    jumps = {50: 17, 100: 18, 150: 17}  # a new clock is believed with the fifth stamp
+    for n in range(200):
+        at_ns = NOW + n * 40 * MS
+        if n in jumps:
+            epochs_us[jumps[n]] += 10**10
+        for system, camera in cameras.items():
+            items = link.receive(camera.vision(epochs_us[system] + n * 40_000, x=1.0 + n / 1e3), at_ns)
+            told += [n for event in events(items) if event.code == "clock-resync"]
+    assert told == [54, 104, 154]
+
+
 def test_more_sources_than_a_flight_has_are_refused() -> None:
     link = make_link()
     taken = [len(samples(link.receive(Peer(system).vision(9), NOW))) for system in range(1, 41)]

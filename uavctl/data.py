@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import StrEnum
+from functools import cache
 from typing import Protocol
 
 import msgspec
@@ -235,6 +236,7 @@ class Datagram(Record, frozen=True, kw_only=True):
     data: bytes
 
 
+@cache
 def raw_topic(link: str, *, outgoing: bool) -> str:
     """Topic of a connection's raw bytes in one direction."""
     return f"/raw/{link}/{'out' if outgoing else 'in'}"

@@ -77,7 +77,7 @@ class ControlLoop:
 
     def __init__(self, config: Config, controller: Controller, sink: Sink, stopwatch: Callable[[], int]) -> None:
         self._controller = controller
-        self._sink = sink
+        self._put: Callable[[str, int, Record], None] = sink.put
         self._stopwatch = stopwatch
         self._links = make_links(config)
         self._relay = Relay(config.relay)
@@ -130,15 +130,16 @@ class ControlLoop:
         """
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         self.heard_vehicle = False
-        for item in self._links[link].receive(data, at_ns):
+        source = self._links[link]
+        for item in source.receive(data, at_ns):
             self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._put("/uavctl/event", at_ns, item)
             else:
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                self._relay.take(item, self._links[link].attitude)
-        return tuple(self._send(link, answer, at_ns) for answer in self._links[link].answers())
+                self._relay.take(item, source.attitude)
+        return tuple([self._send(link, answer, at_ns) for answer in source.answers()])
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
         """Take the word of a connection that it has dropped something unread."""
@@ -241,7 +242,7 @@ class ControlLoop:
         """What the vehicle is told: a setpoint, a request, or nothing."""
         at_ns = inp.at_ns
         told = self._hand_over.update(self._view(inp, out))
-        self.answers = tuple(_answered(inp.commands, out.events, told.events))
+        self.answers = tuple(_answered(inp.commands, out.events, told.events)) if inp.commands else ()
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
         link = self._links[VEHICLE]
@@ -298,9 +299,6 @@ class ControlLoop:
             self._next_stats_ns = at_ns + SECOND_NS
             for link in self._links.values():
                 self._put("/uavctl/link", at_ns, link.stats(at_ns))
-
-    def _put(self, topic: str, at_ns: int, record: Record) -> None:
-        self._sink.put(topic, at_ns, record)
 
 
 def _answered(

@@ -7,30 +7,27 @@ by reason.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Vec3
 from uavctl.frames import Convention, Quaternion, from_euler, rotate, unit
-from uavctl.mavlink.framing import BadBytes, RawFrame, scan
+from uavctl.mavlink.framing import BadBytes, Scan, scan
 from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Origin, Position, Text, TimeSync
 from uavctl.mavlink.state_readers import STATE_READERS
+from uavctl.mavlink.wire import Fields, Layout, text_of
 
 MAX_DATAGRAM_BYTES = 4096
-_PARSER = mavlink.MAVLink(None)  # takes whole frames only, of which it keeps nothing
 
 BAD_FIELD = "non-finite"
 BAD_FRAME = "frame-id"
-BAD_PAYLOAD = "payload"
 BAD_QUALITY = "quality"
 OWN_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no external position
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded:
+class Decoded(msgspec.Struct, frozen=True):
     """What some bytes held.
 
     Attributes:
@@ -41,7 +38,7 @@ class Decoded:
 
     messages: tuple[Message, ...]
     total: int
-    bad: Counter[str]
+    bad: dict[str, int]
 
 
 class _RefusedError(Exception):
@@ -55,9 +52,8 @@ def decode(data: bytes) -> Decoded:
         data: a datagram; longer ones than `MAX_DATAGRAM_BYTES` are dropped whole.
     """
     if len(data) > MAX_DATAGRAM_BYTES:
-        return Decoded((), 0, Counter({BadBytes.OVERSIZE: 1}))
-    found = scan(data, final=True)
-    return _decode_frames(found.frames, found.bad)
+        return Decoded((), 0, {BadBytes.OVERSIZE: 1})
+    return _decoded(scan(data, final=True))
 
 
 class StreamDecoder:
@@ -72,43 +68,42 @@ class StreamDecoder:
         data = self._rest + chunk
         found = scan(data, final=False, in_step=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.in_step
-        return _decode_frames(found.frames, found.bad)
+        return _decoded(found)
 
 
-def _decode_frames(frames: list[RawFrame], bad: Counter[str]) -> Decoded:
+def _decoded(found: Scan) -> Decoded:
     messages = []
-    for frame in frames:
-        reader = _READERS.get(frame.message_id)
-        if reader is None:
+    for frame in found.frames:
+        understood = _UNDERSTOOD.get(frame.message_id)
+        if understood is None:
             continue
+        layout, reader = understood
         try:
-            message = reader(_PARSER.decode(bytearray(frame.data)))
+            message = reader(layout.read(frame.data))
         except _RefusedError as refused:
-            bad[str(refused)] += 1
-        except mavlink.MAVError:
-            bad[BAD_PAYLOAD] += 1
+            found.skip(str(refused))
         else:
             if message is not None:
                 messages.append(message)
-    return Decoded(tuple(messages), len(frames), bad)
+    return Decoded(tuple(messages), len(found.frames), found.bad)
 
 
 def _finite(*values: float) -> bool:
     return all(map(math.isfinite, values))
 
 
-def _xyz(raw: mavlink.MAVLink_message) -> Vec3:
-    position = (float(raw.x), float(raw.y), float(raw.z))
+def _xyz(raw: Fields) -> Vec3:
+    position = (raw.x, raw.y, raw.z)
     if not _finite(*position):
         raise _RefusedError(BAD_FIELD)
     return position
 
 
-def _from_usec(raw: mavlink.MAVLink_message, usec: int, attitude: Quaternion | None, *, euler: bool) -> Position:
+def _from_usec(raw: Fields, usec: int, attitude: Quaternion | None, *, euler: bool) -> Position:
     return Position(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
-        name=raw.get_type(),
+        system=raw.src_system,
+        component=raw.src_component,
+        name=raw.msgname,
         stamp_us=usec or None,
         position_m=_xyz(raw),
         attitude=attitude,
@@ -116,12 +111,12 @@ def _from_usec(raw: mavlink.MAVLink_message, usec: int, attitude: Quaternion | N
     )
 
 
-def _with_angles(raw: mavlink.MAVLink_message) -> Position:
+def _with_angles(raw: Fields) -> Position:
     return _from_usec(raw, raw.usec, from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
 
 
-def _with_quaternion(raw: mavlink.MAVLink_message) -> Position:
-    return _from_usec(raw, raw.time_usec, unit(tuple(raw.q)), euler=False)
+def _with_quaternion(raw: Fields) -> Position:
+    return _from_usec(raw, raw.time_usec, unit(raw.q), euler=False)
 
 
 _ODOMETRY_AXES: dict[int, Convention] = {
@@ -133,7 +128,7 @@ _ODOMETRY_AXES: dict[int, Convention] = {
 _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
 
 
-def _odometry(raw: mavlink.MAVLink_message) -> Position:
+def _odometry(raw: Fields) -> Position:
     if raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT:
         raise _RefusedError(OWN_ESTIMATE)
     axes = _ODOMETRY_AXES.get(raw.frame_id)
@@ -142,18 +137,18 @@ def _odometry(raw: mavlink.MAVLink_message) -> Position:
     if raw.quality < 0:  # "odometry has failed"
         raise _RefusedError(BAD_QUALITY)
     return Position(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
-        name=raw.get_type(),
+        system=raw.src_system,
+        component=raw.src_component,
+        name=raw.msgname,
         stamp_us=raw.time_usec or None,
         position_m=_xyz(raw),
         velocity_mps=_odometry_velocity(raw),
         convention=axes,
-        attitude=unit(tuple(raw.q)) if raw.child_frame_id in _BODY_AXES else None,
+        attitude=unit(raw.q) if raw.child_frame_id in _BODY_AXES else None,
     )
 
 
-def _odometry_velocity(raw: mavlink.MAVLink_message) -> Vec3 | None:
+def _odometry_velocity(raw: Fields) -> Vec3 | None:
     """Velocity in the axes of the position; None if it is not given (NaN) or its axes are not known."""
     velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
     if not _finite(*velocity):
@@ -164,12 +159,12 @@ def _odometry_velocity(raw: mavlink.MAVLink_message) -> Vec3 | None:
     return velocity if raw.child_frame_id == raw.frame_id else None
 
 
-def _local_position(raw: mavlink.MAVLink_message) -> Position:
+def _local_position(raw: Fields) -> Position:
     velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
     return Position(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
-        name=raw.get_type(),
+        system=raw.src_system,
+        component=raw.src_component,
+        name=raw.msgname,
         stamp_us=raw.time_boot_ms * 1000,
         boot_ms=True,
         position_m=_xyz(raw),
@@ -178,10 +173,10 @@ def _local_position(raw: mavlink.MAVLink_message) -> Position:
     )
 
 
-def _heartbeat(raw: mavlink.MAVLink_message) -> Heartbeat:
+def _heartbeat(raw: Fields) -> Heartbeat:
     return Heartbeat(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
+        system=raw.src_system,
+        component=raw.src_component,
         vehicle_type=raw.type,
         autopilot=raw.autopilot,
         base_mode=raw.base_mode,
@@ -190,16 +185,16 @@ def _heartbeat(raw: mavlink.MAVLink_message) -> Heartbeat:
     )
 
 
-def _timesync(raw: mavlink.MAVLink_message) -> TimeSync:
-    return TimeSync(system=raw.get_srcSystem(), component=raw.get_srcComponent(), tc1_ns=raw.tc1, ts1_ns=raw.ts1)
+def _timesync(raw: Fields) -> TimeSync:
+    return TimeSync(system=raw.src_system, component=raw.src_component, tc1_ns=raw.tc1, ts1_ns=raw.ts1)
 
 
-def _landed(raw: mavlink.MAVLink_message) -> Landed:
+def _landed(raw: Fields) -> Landed:
     state = raw.landed_state
     undefined = state == mavlink.MAV_LANDED_STATE_UNDEFINED
     return Landed(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
+        system=raw.src_system,
+        component=raw.src_component,
         landed=None if undefined else state == mavlink.MAV_LANDED_STATE_ON_GROUND,
     )
 
@@ -207,32 +202,32 @@ def _landed(raw: mavlink.MAVLink_message) -> Landed:
 _NO_VOLTAGE_MV = 0xFFFF
 
 
-def _sys_status(raw: mavlink.MAVLink_message) -> Battery | None:
+def _sys_status(raw: Fields) -> Battery | None:
     return _battery(raw, [raw.voltage_battery])
 
 
-def _battery_status(raw: mavlink.MAVLink_message) -> Battery | None:
+def _battery_status(raw: Fields) -> Battery | None:
     return _battery(raw, raw.voltages) if raw.id == 0 else None
 
 
-def _battery(raw: mavlink.MAVLink_message, voltages_mv: list[int]) -> Battery | None:
+def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
     """Sum of the cells that are known (the first may stand for all of them)."""
     known = [voltage for voltage in voltages_mv if voltage != _NO_VOLTAGE_MV]
     if not known:
         return None
-    return Battery(system=raw.get_srcSystem(), component=raw.get_srcComponent(), voltage_v=sum(known) / 1000)
+    return Battery(system=raw.src_system, component=raw.src_component, voltage_v=sum(known) / 1000)
 
 
-def _text(raw: mavlink.MAVLink_message) -> Text:
+def _text(raw: Fields) -> Text:
     # Control characters would act on the terminal that shows them; PX4 ends its texts with a tab.
-    text = "".join(character if character.isprintable() else "?" for character in raw.text.rstrip())
-    return Text(system=raw.get_srcSystem(), component=raw.get_srcComponent(), severity=raw.severity, text=text)
+    text = "".join(character if character.isprintable() else "?" for character in text_of(raw.text).rstrip())
+    return Text(system=raw.src_system, component=raw.src_component, severity=raw.severity, text=text)
 
 
-def _ack(raw: mavlink.MAVLink_message) -> Ack:
+def _ack(raw: Fields) -> Ack:
     return Ack(
-        system=raw.get_srcSystem(),
-        component=raw.get_srcComponent(),
+        system=raw.src_system,
+        component=raw.src_component,
         command=raw.command,
         result=raw.result,
         target_system=raw.target_system,
@@ -240,11 +235,11 @@ def _ack(raw: mavlink.MAVLink_message) -> Ack:
     )
 
 
-def _origin(raw: mavlink.MAVLink_message) -> Origin:
-    return Origin(system=raw.get_srcSystem(), component=raw.get_srcComponent())
+def _origin(raw: Fields) -> Origin:
+    return Origin(system=raw.src_system, component=raw.src_component)
 
 
-_READERS: dict[int, Callable[[mavlink.MAVLink_message], Message | None]] = {
+_READERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: _with_angles,
     mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: _with_angles,
     mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: _with_quaternion,
@@ -260,3 +255,4 @@ _READERS: dict[int, Callable[[mavlink.MAVLink_message], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
     **STATE_READERS,
 }
+_UNDERSTOOD = {number: (Layout(mavlink.mavlink_map[number]), reader) for number, reader in _READERS.items()}

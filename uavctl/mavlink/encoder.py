@@ -7,16 +7,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Setpoint, Vec3
 from uavctl.frames import to_euler
 from uavctl.mavlink.relay import Pose
+from uavctl.mavlink.wire import Layout
 
 BOOT_MS_WRAP = 2**32  # time_boot_ms is unsigned, 32 bits: 49.7 days
 ACCEL_ONLY = 0x0C3F  # type_mask 3135: acceleration used; position, velocity, yaw and yaw rate ignored
 ACCEL_AND_YAW = 0x083F  # type_mask 2111: yaw is used too
+_COMMAND_LONG = Layout(mavlink.MAVLink_command_long_message)
+_HEARTBEAT = Layout(mavlink.MAVLink_heartbeat_message)
+_ODOMETRY = Layout(mavlink.MAVLink_odometry_message)
+_PARAM_REQUEST_READ = Layout(mavlink.MAVLink_param_request_read_message)
+_SET_GPS_GLOBAL_ORIGIN = Layout(mavlink.MAVLink_set_gps_global_origin_message)
+_SET_POSITION_TARGET_LOCAL_NED = Layout(mavlink.MAVLink_set_position_target_local_ned_message)
+_TIMESYNC = Layout(mavlink.MAVLink_timesync_message)
+_VISION_POSITION_ESTIMATE = Layout(mavlink.MAVLink_vision_position_estimate_message)
 _ABSURD_ACCEL_MPS2 = 1e3
 _INT64 = 2**63
 
@@ -26,20 +36,22 @@ class UnsendableError(ValueError):
 
 
 class Encoder:
-    """Messages to frames, numbered modulo 256 as one sequence.
-
-    `MAVLink.pack` leaves the number alone, so the encoder counts.
-    """
+    """Messages to frames, numbered modulo 256 as one sequence."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
-        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._address = (system_id, component_id)
+        self._number = 0
 
     def heartbeat(self) -> bytes:
         """HEARTBEAT of an onboard controller."""
         return self._pack(
-            mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-            )
+            _HEARTBEAT,
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+            mavlink.MAV_AUTOPILOT_INVALID,
+            0,
+            0,
+            mavlink.MAV_STATE_ACTIVE,
+            3,
         )
 
     def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
@@ -50,7 +62,7 @@ class Encoder:
         """
         if not all(-_INT64 <= value < _INT64 for value in (tc1_ns, ts1_ns)):
             raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
-        return self._pack(mavlink.MAVLink_timesync_message(tc1_ns, ts1_ns))
+        return self._pack(_TIMESYNC, tc1_ns, ts1_ns)
 
     def setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
         """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
@@ -59,61 +71,52 @@ class Encoder:
             UnsendableError: a value is not finite, or absurd.
         """
         yaw = setpoint.yaw_rad
-        sane = all(abs(value) <= _ABSURD_ACCEL_MPS2 for value in setpoint.accel_mps2)  # NaN is not
+        north, east, down = map(abs, setpoint.accel_mps2)
+        limit = _ABSURD_ACCEL_MPS2
+        sane = north <= limit and east <= limit and down <= limit  # NaN is not
         if not sane or not math.isfinite(yaw or 0.0):
             raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
         return self._pack(
-            mavlink.MAVLink_set_position_target_local_ned_message(
-                setpoint.at_ns // 1_000_000 % BOOT_MS_WRAP,
-                target_system,
-                target_component,
-                mavlink.MAV_FRAME_LOCAL_NED,
-                ACCEL_ONLY if yaw is None else ACCEL_AND_YAW,
-                *(0.0, 0.0, 0.0),
-                *(0.0, 0.0, 0.0),
-                *setpoint.accel_mps2,
-                yaw or 0.0,
-                0.0,
-            )
+            _SET_POSITION_TARGET_LOCAL_NED,
+            setpoint.at_ns // 1_000_000 % BOOT_MS_WRAP,
+            target_system,
+            target_component,
+            mavlink.MAV_FRAME_LOCAL_NED,
+            ACCEL_ONLY if yaw is None else ACCEL_AND_YAW,
+            *(0.0, 0.0, 0.0),
+            *(0.0, 0.0, 0.0),
+            *setpoint.accel_mps2,
+            yaw or 0.0,
+            0.0,
         )
 
     def command(self, command: int, parameters: Sequence[float], target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG; parameters that are not given are 0."""
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        return self._pack(mavlink.MAVLink_command_long_message(target_system, target_component, command, 0, *seven))
+        return self._pack(_COMMAND_LONG, target_system, target_component, command, 0, *seven)
 
     def origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
         """SET_GPS_GLOBAL_ORIGIN: latitude and longitude [deg], altitude above the sea [m] of local zero."""
         latitude, longitude, altitude = place_deg_m
         return self._pack(
-            mavlink.MAVLink_set_gps_global_origin_message(
-                target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
-            )
+            _SET_GPS_GLOBAL_ORIGIN, target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
         )
 
     def request_parameter(self, name: str, target_system: int, target_component: int) -> bytes:
         """PARAM_REQUEST_READ by name."""
-        return self._pack(
-            mavlink.MAVLink_param_request_read_message(target_system, target_component, name.encode(), -1)
-        )
+        return self._pack(_PARAM_REQUEST_READ, target_system, target_component, name.encode(), -1)
 
     def request_interval(self, message_id: int, interval_us: int, target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""
         wanted = (float(message_id), float(interval_us), *(0.0,) * 5)
         return self._pack(
-            mavlink.MAVLink_command_long_message(
-                target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
-            )
+            _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
         )
 
     def request_message(self, message_id: int, target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE: send this message once."""
         wanted = (float(message_id), *(0.0,) * 6)
-        return self._pack(
-            mavlink.MAVLink_command_long_message(
-                target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted
-            )
-        )
+        return self._pack(_COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted)
 
     def external_position(self, pose: Pose) -> bytes:
         """VISION_POSITION_ESTIMATE or ODOMETRY in local NED; covariances unknown.
@@ -127,26 +130,23 @@ class Encoder:
             raise UnsendableError(f"pose {values}, stamp {pose.usec} us: not finite, or no stamp")
         unknown = [math.nan, *([0.0] * 20)]
         if pose.body_mps is None:
-            return self._pack(
-                mavlink.MAVLink_vision_position_estimate_message(pose.usec, *pose.position_m, *angles, unknown)
-            )
+            return self._pack(_VISION_POSITION_ESTIMATE, pose.usec, *pose.position_m, *angles, unknown)
         return self._pack(
-            mavlink.MAVLink_odometry_message(
-                pose.usec,
-                mavlink.MAV_FRAME_LOCAL_FRD,
-                mavlink.MAV_FRAME_BODY_FRD,
-                *pose.position_m,
-                list(pose.attitude),
-                *pose.body_mps,
-                *(0.0,) * 3,
-                unknown,
-                unknown,
-                0,
-                mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
-            )
+            _ODOMETRY,
+            pose.usec,
+            mavlink.MAV_FRAME_LOCAL_FRD,
+            mavlink.MAV_FRAME_BODY_FRD,
+            *pose.position_m,
+            list(pose.attitude),
+            *pose.body_mps,
+            *(0.0,) * 3,
+            unknown,
+            unknown,
+            0,
+            mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
         )
 
-    def _pack(self, message: mavlink.MAVLink_message) -> bytes:
-        data = message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) % 256
+    def _pack(self, layout: Layout, *fields: Any) -> bytes:
+        data = layout.frame(self._address, self._number, *fields)
+        self._number = (self._number + 1) % 256
         return data

@@ -6,17 +6,17 @@ counted by reason, and the search goes on at the next byte that could begin one.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-_HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
+HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
 MAX_FAILED = 64  # tries in one datagram; a hostile one must not cost the loop its tick
+# A byte of each message's definition, that is summed up after the frame's own.
+_CRC_EXTRA = {number: bytes((kind.crc_extra,)) for number, kind in mavlink.mavlink_map.items()}
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
@@ -35,15 +35,14 @@ Verify = Callable[[bytes], str | None]
 """Takes a whole frame that has a signature; gives the reason not to take it, or None."""
 
 
-class RawFrame(NamedTuple):
+class RawFrame(msgspec.Struct, frozen=True):
     """One whole frame with a right checksum."""
 
     data: bytes
     message_id: int
 
 
-@dataclass
-class Scan:
+class Scan(msgspec.Struct):
     """What a scan found.
 
     Attributes:
@@ -53,13 +52,17 @@ class Scan:
         in_step: whether the last bytes seen were a frame, so that the next byte should begin one.
     """
 
-    frames: list[RawFrame] = field(default_factory=list)
-    bad: Counter[str] = field(default_factory=Counter)
+    frames: list[RawFrame] = []
+    bad: dict[str, int] = {}
     consumed: int = 0
     in_step: bool = True
 
+    def skip(self, reason: str) -> None:
+        """Count a skip."""
+        self.bad[reason] = self.bad.get(reason, 0) + 1
 
-class _Shape(NamedTuple):
+
+class _Shape(msgspec.Struct, frozen=True):
     """What the first bytes of a frame promise."""
 
     length: int
@@ -70,9 +73,9 @@ class _Shape(NamedTuple):
 def _shape(data: bytes, at: int) -> _Shape | None:
     """Shape of the frame at `at`; None while too few bytes are there to tell. `data[at]` is a magic byte."""
     if data[at] == mavlink.PROTOCOL_MARKER_V1:
-        if len(data) - at < _HEADER_V1:
+        if len(data) - at < HEADER_V1:
             return None
-        return _Shape(_HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
+        return _Shape(HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
     if len(data) - at < HEADER_V2:
         return None
     signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
@@ -85,17 +88,15 @@ def _is_foreign(data: bytes, at: int) -> bool:
     return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
 
 
-def _checksum(head: bytes, message_id: int) -> int:
-    """Checksum of a frame's first bytes, up to its payload's end."""
-    crc = mavlink.x25crc(head[1:])
-    crc.accumulate(bytes((mavlink.mavlink_map[message_id].crc_extra,)))
-    return int(crc.crc)
+def _checksum(body: bytes, message_id: int) -> int:
+    """Checksum of what follows a frame's first byte, up to its payload's end."""
+    return mavlink.x25crc(body + _CRC_EXTRA[message_id]).crc
 
 
 def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
     """Whether the checksum of a frame of a known id is right."""
     end = shape.length - shape.signature - CHECKSUM
-    return _checksum(frame[:end], shape.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
+    return _checksum(frame[1:end], shape.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
 def with_checksum(head: bytes) -> bytes:
@@ -105,7 +106,7 @@ def with_checksum(head: bytes) -> bytes:
         KeyError: the message id is unknown to the dialect.
     """
     message_id = int.from_bytes(head[7:HEADER_V2], "little")
-    return head + _checksum(head, message_id).to_bytes(CHECKSUM, "little")
+    return head + _checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
 
 
 def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | None = None) -> Scan:
@@ -130,7 +131,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
             break
         if end is None:
             if result.in_step:
-                result.bad[reason] += 1
+                result.skip(reason)
             failed += 1
             gives_up = final and failed > MAX_FAILED
             end = len(data) if gives_up else _next_magic(data, result.consumed + 1)
@@ -157,7 +158,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
         # Nothing but the length can be checked.
         if not _between_frames(data, result, end):
             return None, BadBytes.GARBAGE
-        result.bad[BadBytes.UNKNOWN] += 1
+        result.skip(BadBytes.UNKNOWN)
         return end, _TAKEN
     frame = data[at:end]
     if not _checksum_fits(frame, shape):
@@ -175,9 +176,9 @@ def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tup
     if refusal is not None:
         if not _between_frames(data, result, end):
             return None, refusal
-        result.bad[refusal] += 1
+        result.skip(refusal)
     elif shape.message_id not in mavlink.mavlink_map:
-        result.bad[BadBytes.UNKNOWN] += 1
+        result.skip(BadBytes.UNKNOWN)
     else:
         result.frames.append(RawFrame(frame, shape.message_id))
     return end, _TAKEN

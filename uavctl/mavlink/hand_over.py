@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import msgspec
 
 from uavctl.config.hand_over import HandOverConfig
@@ -25,8 +23,7 @@ _PROMISES = {
 HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
 
 
-@dataclass(frozen=True)
-class Told:
+class Told(msgspec.Struct, frozen=True):
     """What a tick makes of it.
 
     Attributes:

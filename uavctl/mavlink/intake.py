@@ -55,6 +55,7 @@ class PositionIntake:
         self._latest: ClockSync | None = None
         self._latest_address: Address | None = None
         self.samples = 0
+        self.resyncs = 0  # times that a source turned out to have a new clock
         self.attitude: Quaternion | None = None  # of the newest sample: body axes forward, right, down to NED
 
     @property
@@ -66,11 +67,6 @@ class PositionIntake:
     def clock_source(self) -> ClockSource:
         """Where that offset comes from."""
         return ClockSource.NONE if self._latest is None else self._latest.source
-
-    @property
-    def resyncs(self) -> int:
-        """How often a source turned out to have a new clock."""
-        return sum(clock.resyncs for clock in self._clocks.values())
 
     def trips(self, address: Address | None = None) -> RoundTrips | None:
         """Round trips to a peer that answers; without an address, to the newest sample's source."""
@@ -138,8 +134,9 @@ class PositionIntake:
             stamp_ns = clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
         elif message.stamp_us is not None:
             stamp_ns = message.stamp_us * 1000
-        trips = self._round_trips.get(address)
+        trips, resyncs = self._round_trips.get(address), clock.resyncs
         captured = clock.captured_ns(stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns))
+        self.resyncs += clock.resyncs - resyncs
         if not isinstance(captured, str):
             self._latest, self._latest_address = clock, address
         return captured

@@ -148,8 +148,8 @@ class Link:
             self._requests += 1
             self._open.append(at_ns)
             out.append(self._encoder.timesync(0, at_ns))
-        if VEHICLE in self._roles and self.vehicle is not None:
-            out.extend(self.request_stream(number, rate_hz) for number, rate_hz in self._streams.due(at_ns))
+        if VEHICLE in self._roles and self._vehicle.address is not None:
+            out += [self.request_stream(number, rate_hz) for number, rate_hz in self._streams.due(at_ns)]
         return tuple(out)
 
     def setpoint(self, setpoint: Setpoint) -> bytes:

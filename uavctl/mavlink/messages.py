@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import msgspec
 
 from uavctl.data import Vec3
 from uavctl.frames import Convention, Quaternion
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class Message(msgspec.Struct, frozen=True, kw_only=True):
     """Base of the messages that are understood; `system` and `component` sent it."""
 
     system: int
     component: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Position(Message):
+class Position(Message, frozen=True, kw_only=True):
     """A position, and perhaps a velocity, in the axes that the message declares.
 
     Attributes:
@@ -45,8 +43,7 @@ class Position(Message):
     euler: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Heartbeat(Message):
+class Heartbeat(Message, frozen=True, kw_only=True):
     """HEARTBEAT."""
 
     vehicle_type: int
@@ -56,38 +53,33 @@ class Heartbeat(Message):
     system_status: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimeSync(Message):
+class TimeSync(Message, frozen=True, kw_only=True):
     """TIMESYNC: a request if `tc1_ns` is 0, else an answer to the request of `ts1_ns`."""
 
     tc1_ns: int
     ts1_ns: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Landed(Message):
+class Landed(Message, frozen=True, kw_only=True):
     """EXTENDED_SYS_STATE; None while the vehicle does not know."""
 
     landed: bool | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Battery(Message):
+class Battery(Message, frozen=True, kw_only=True):
     """SYS_STATUS or BATTERY_STATUS with a voltage [V]."""
 
     voltage_v: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Text(Message):
+class Text(Message, frozen=True, kw_only=True):
     """STATUSTEXT; `severity` is MAV_SEVERITY, 0 the worst, 7 the least."""
 
     severity: int
     text: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ack(Message):
+class Ack(Message, frozen=True, kw_only=True):
     """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted; target 0 is for everybody."""
 
     command: int
@@ -96,20 +88,17 @@ class Ack(Message):
     target_component: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Origin(Message):
+class Origin(Message, frozen=True, kw_only=True):
     """GPS_GLOBAL_ORIGIN: the vehicle knows its place on the globe."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attitude(Message):
+class Attitude(Message, frozen=True, kw_only=True):
     """ATTITUDE: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
 
     angles_rad: Vec3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParamValue(Message):
+class ParamValue(Message, frozen=True, kw_only=True):
     """PARAM_VALUE; `cast` and `bytewise` are the two readings of the same four bytes.
 
     Attributes:
@@ -123,8 +112,7 @@ class ParamValue(Message):
     bytewise: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstimatorFlags(Message):
+class EstimatorFlags(Message, frozen=True, kw_only=True):
     """ESTIMATOR_STATUS or EKF_STATUS_REPORT: what the vehicle's own estimator trusts.
 
     Attributes:
@@ -134,8 +122,7 @@ class EstimatorFlags(Message):
     flags: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AutopilotVersion(Message):
+class AutopilotVersion(Message, frozen=True, kw_only=True):
     """AUTOPILOT_VERSION.
 
     Attributes:

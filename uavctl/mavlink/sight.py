@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
+
 from uavctl.config.hand_over import HandOverConfig
 from uavctl.data import Command, Order, VehicleStatus
 from uavctl.mavlink.messages import Ack, Text
@@ -18,7 +20,8 @@ GRACE_NS = 300_000_000
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
 LOW = 0.3  # share of the take-off height below which a climb that has ended was none
 LEAVING = frozenset({State.MODE, State.ARMING, State.CLIMBING, State.ENGAGING})
-ASKING = LEAVING | {State.RETURNING, State.LANDING}
+_UNDER_WAY = LEAVING | {State.RETURNING}  # here the operator's end of the flight asks for landing, too
+ASKING = _UNDER_WAY | {State.LANDING}
 CLOCK_NS = 5_000_000_000  # in which a vehicle that is found armed tells how long ago it started
 # A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
 SLOWEST, LATEST_S = 0.8, 1.0
@@ -32,8 +35,7 @@ _DISARMED = "the vehicle has disarmed itself"
 _LEFT = "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
 
 
-@dataclass(frozen=True, kw_only=True)
-class View:
+class View(msgspec.Struct, frozen=True, kw_only=True):
     """What the hand-over knows in a tick.
 
     Attributes:
@@ -102,8 +104,7 @@ class Progress:
         return self.granted_ns is not None and vehicle.at_ns <= self.granted_ns + GRACE_NS
 
 
-@dataclass(frozen=True)
-class Sight:
+class Sight(msgspec.Struct, frozen=True):
     """What is seen, and why, where that has to be told.
 
     Attributes:
@@ -149,8 +150,7 @@ def look(progress: Progress, view: View) -> Sight:
     vehicle, state = view.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not State.WAITING:
         return Sight(Seen.REBOOT, "the vehicle has started anew")
-    stops = view.stop or ordered(view, Order.LAND)
-    if view.land or (stops and state in LEAVING | {State.RETURNING}):
+    if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
         return Sight(Seen.LAND)
     there = Sight(Seen.SILENCE)
     if vehicle is not None and not silent(view.at_ns, vehicle):
