@@ -88,6 +88,30 @@ def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:
         assert repr(estimate(kalman, given, later_ns)) == repr(estimate(kalman, history, later_ns))
 
 
+def test_the_belief_of_the_capture_time_may_be_given_with_a_sample() -> None:
+    kalman, history = make()
+    rng = np.random.default_rng(5)
+    given = history
+    # Late and in order, at the instant of an input and of a boundary, and twice at one instant from two sources.
+    due = {
+        2: [(85, "left")],
+        3: [(150, "left"), (100, "left")],
+        5: [(200, "left"), (230, "right"), (230, "left"), (230, "west")],
+    }
+    for tick in range(3 * TICKS):
+        at_ns = START_NS + tick * TICK_NS
+        for since_ms, source in due.get(tick, ()):
+            one = sample(START_NS + since_ms * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0), source=source)
+            belief = belief_at(kalman, given, one.captured_ns)
+            history, _, _ = absorb(kalman, history, at_ns, (one,))
+            given, taken, _ = absorb(kalman, given, at_ns, (one,), belief)
+            assert taken == (one,)
+        u = rng.normal(size=1)
+        history, given = (set_input(kalman, known, at_ns, u) for known in (history, given))
+        later_ns = at_ns + TICK_NS // 2
+        assert repr(estimate(kalman, given, later_ns)) == repr(estimate(kalman, history, later_ns))
+
+
 def brute_force(
     samples: Sequence[PositionSample], inputs: Sequence[tuple[int, float]], at_ns: int, wind_std: float
 ) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 from flight_rig import DT_NS, HORIZON, MS, TICK_NS, TICKS, estimator_parameters, small_plant
+from msgspec import structs
 from scipy.integrate import quad
 
 from uavctl.flight.kalman import Belief, make_kalman
@@ -46,7 +47,7 @@ def test_the_half_width_counts_begun_ticks_and_is_open_after_two_horizons(reach:
     belief = Belief(at_ns=0, captured_ns=0, mean=np.zeros(4), cov=np.diag([0.0004, 0.0009, 1.0, 1.0]))
     variances, doubt_mps, far = np.array([0.0021, 0.0016]), np.array([0.7]), reach.far
     for age_ns, ticks in ((0, 0), (1, 1), (TICK_NS, 1), (TICK_NS + 1, 2)):
-        aged = replace(belief, captured_ns=-age_ns)
+        aged = structs.replace(belief, captured_ns=-age_ns)
         width = radius(reach, KALMAN, aged, variances, doubt_mps)
         want = [6.0 * 0.05 + 0.1 + 0.7e-9 * age_ns + far[ticks, 0], 6.0 * 0.05 + 0.7 + far[ticks, 1]]
         assert width == pytest.approx(want)
@@ -54,17 +55,17 @@ def test_the_half_width_counts_begun_ticks_and_is_open_after_two_horizons(reach:
         assert positions == pytest.approx(want[:1])
     open_ns = 2 * HORIZON * DT_NS
     for age_ns, finite in ((open_ns, True), (open_ns + 1, False)):
-        aged = replace(belief, captured_ns=-age_ns)
+        aged = structs.replace(belief, captured_ns=-age_ns)
         width = radius(reach, KALMAN, aged, variances, doubt_mps)
         assert np.isfinite(width).all() == finite
 
 
 def test_the_velocity_is_doubted_by_what_was_off_as_far_as_inputs_can_have_made_it(reach: Reach) -> None:
     belief = Belief(at_ns=0, captured_ns=0, mean=np.zeros(4), cov=np.eye(4))
-    step = replace(belief, captured_ns=-DT_NS)
+    step = structs.replace(belief, captured_ns=-DT_NS)
     assert doubt(reach, step, off(-0.01)) == pytest.approx([0.1])
     assert doubt(reach, step, off(9.0)) == pytest.approx([reach.far[TICKS, 1]])
-    assert doubt(reach, replace(belief, captured_ns=-4 * 10**9), off(9.0)) == pytest.approx([4.5])
+    assert doubt(reach, structs.replace(belief, captured_ns=-4 * 10**9), off(9.0)) == pytest.approx([4.5])
     assert doubt(reach, belief, off(9.0)).tolist() == [0.0]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import msgspec
+
 from uavctl.data import Command, ControlMode, Plan, Vec3
 from uavctl.flight.estimator import History
 from uavctl.flight.fallback import Fallback, FallbackParameters
@@ -77,8 +79,7 @@ class Controller:
         return self.dt_ns // self.tick_ns
 
 
-@dataclass(frozen=True, eq=False)
-class ControlState:
+class ControlState(msgspec.Struct, frozen=True, eq=False):
     """What one tick leaves to the next.
 
     Attributes:
@@ -99,7 +100,7 @@ class ControlState:
     decided_step: int | None = None
     plan: Plan | None = None
     fallback: Fallback | None = None
-    trust: Trust = field(default_factory=Trust)
+    trust: Trust = msgspec.field(default_factory=Trust)
     fresh: int = 0
     accel_mps2: Vec3 = ZERO
     mission: MissionState | None = None

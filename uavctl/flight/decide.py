@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3
 from uavctl.flight import fallback as fb
@@ -16,11 +16,11 @@ from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance, ask_for, over
 from uavctl.flight.orders import obey, told, unready
 from uavctl.flight.planning import ask
+from uavctl.smpc.answer import Outlook
 from uavctl.smpc.plant import Plant
 
 
-@dataclass(frozen=True)
-class Tick:
+class Tick(msgspec.Struct, frozen=True, eq=False):
     """Place of a tick on the Δt grid, and what it sees."""
 
     number: int  # step k
@@ -32,8 +32,7 @@ class Tick:
     age_steps: int | None
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
+class Choice(msgspec.Struct, frozen=True, eq=False):
     """What a tick decided."""
 
     state: ControlState
@@ -133,7 +132,8 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
     mission = obey(controller.mission, mission, state.order, base.mean, tick.boundary_ns)
     state = replace(state, mission=mission, order=None)
     target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
-    outlook = replace(outlook, late=min(tick.age_steps or 0, controller.late_steps))
+    late = min(tick.age_steps or 0, controller.late_steps)
+    outlook = Outlook(limits=outlook.limits, path=outlook.path, late=late)
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:
@@ -162,7 +162,7 @@ def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, c
     state = replace(state, plan=None, fresh=0 if state.fallback is None else state.fresh)
     if later.ended:
         reason = "no vehicle is heard, and the time to hold is over: its own failsafe is left to act"
-        due = fallback if fallback.final else replace(fallback, end=End.LAND)
+        due = fallback if fallback.final else Fallback(mode=fallback.mode, since_ns=fallback.since_ns, end=End.LAND)
         return Choice(replace(state, fallback=due), reason, mute=True)
     return Choice(replace(state, fallback=later), "no vehicle is heard; the fallback's time runs on")
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from operator import attrgetter
 
-import numpy as np
+import msgspec
+from msgspec.structs import replace
 
 from uavctl.data import Estimate, PositionSample
 from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, first_belief, predicted, updated
@@ -22,9 +23,11 @@ TOO_OLD = "sample-too-old"
 # Order of what happens at one instant; a sample sees the input before its change, which is the same state.
 _SAMPLE, _INPUT, _MARK = 0, 1, 2
 
+Key = tuple[int, int, str, int]  # time, kind, source, capture time as stamped
+_KEY = attrgetter("key")
 
-@dataclass(frozen=True, eq=False)
-class Node:
+
+class Node(msgspec.Struct, frozen=True, eq=False):
     """What is known after an entry: the belief (None before the first sample) and the input that acts.
 
     The input is None while others fly the vehicle.
@@ -34,18 +37,16 @@ class Node:
     input: Array | None
 
 
-@dataclass(frozen=True, eq=False)
-class Entry:
+class Entry(msgspec.Struct, frozen=True, eq=False):
     """One happening: a sample, an input change, or neither (a boundary, where a belief is kept)."""
 
-    key: tuple[int, int, str, int]  # time, kind, source, capture time as stamped
+    key: Key
     sample: PositionSample | None
     input: Array | None  # of an input change; None: others fly from here on
     after: Node
 
 
-@dataclass(frozen=True, eq=False)
-class History:
+class History(msgspec.Struct, frozen=True, eq=False):
     """State of the filter; immutable.
 
     Attributes:
@@ -81,8 +82,18 @@ def begin(kalman: Kalman, origin_ns: int, at_ns: int) -> History:
     )
 
 
+def move_on(kalman: Kalman, history: History, at_ns: int) -> History:
+    """Move the window up to `at_ns`, and keep a belief at a boundary that has come."""
+    horizon_ns = max(history.horizon_ns, _horizon_ns(kalman, at_ns))
+    boundary_ns = at_ns - (at_ns - history.origin_ns) % kalman.propagation.dt_ns
+    mark = (boundary_ns, _MARK, "", boundary_ns)
+    if boundary_ns > horizon_ns and (not history.entries or history.entries[-1].key < mark):
+        history = _inserted(kalman, history, Entry(key=mark, sample=None, input=None, after=history.newest), None)
+    return _trimmed(history, horizon_ns)
+
+
 def absorb(
-    kalman: Kalman, history: History, at_ns: int, samples: Sequence[PositionSample]
+    kalman: Kalman, history: History, at_ns: int, samples: Sequence[PositionSample], belief: Belief | None = None
 ) -> tuple[History, tuple[PositionSample, ...], tuple[str, ...]]:
     """Move the window up to `at_ns` and take samples of any age and order.
 
@@ -91,32 +102,25 @@ def absorb(
         history: State before.
         at_ns: Time now [ns]; no sample may be captured or received later.
         samples: Valid samples (see `uavctl.flight.samples`).
+        belief: What `belief_at` gives at the first one's capture time, if that has been asked.
 
     Returns:
         The new state, the samples that were taken, and the reason for each one that was refused.
     """
-    horizon_ns = max(history.horizon_ns, _horizon_ns(kalman, at_ns))
-    known = {entry.key[2:] for entry in history.entries} if samples else set()
+    history = move_on(kalman, history, at_ns)
     taken: list[PositionSample] = []
     refused: list[str] = []
-    new: list[Entry] = []
     for sample in samples:
-        identity = (sample.source, sample.captured_ns)
-        key = (captured_ns(sample), _SAMPLE, *identity)
-        if key[0] <= horizon_ns:
+        key = (captured_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
+        if key[0] <= history.horizon_ns:
             refused.append(TOO_OLD)
-        elif identity in known:
+        elif any(entry.key[3] == key[3] and entry.key[2] == key[2] for entry in history.entries):
             refused.append(DUPLICATE)
         else:
-            known.add(identity)
             taken.append(sample)
-            new.append(Entry(key=key, sample=sample, input=None, after=history.anchor))
-    dt_ns = kalman.propagation.dt_ns
-    boundary_ns = at_ns - (at_ns - history.origin_ns) % dt_ns
-    mark = (boundary_ns, _MARK, "", boundary_ns)
-    if boundary_ns > horizon_ns and (not history.entries or history.entries[-1].key < mark):
-        new.append(Entry(key=mark, sample=None, input=None, after=history.anchor))
-    history = _trimmed(_inserted(kalman, history, new), horizon_ns)
+            new = Entry(key=key, sample=sample, input=None, after=history.anchor)
+            history = _inserted(kalman, history, new, belief)
+        belief = None  # the next one's is another
     return history, tuple(taken), tuple(refused)
 
 
@@ -131,11 +135,11 @@ def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, bel
         belief: What `belief_at` gives at `at_ns`, if that has been asked.
     """
     before = history.newest.input
-    if before is u or (before is not None and u is not None and np.array_equal(before, u)):
+    if before is u or (before is not None and u is not None and before.tolist() == u.tolist()):
         return history
     after = Node(belief=belief or belief_at(kalman, history, at_ns), input=u)
     entry = Entry(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=after)
-    place = bisect_right(history.entries, entry.key, key=lambda one: one.key)
+    place = bisect_right(history.entries, entry.key, key=_KEY)
     marks = (replace(mark, after=after) for mark in history.entries[place:])  # of the same instant
     return replace(history, entries=(*history.entries[:place], entry, *marks))
 
@@ -157,7 +161,7 @@ def estimated(kalman: Kalman, belief: Belief) -> Estimate:
         captured_ns=belief.captured_ns,
         mean=tuple(belief.mean[:n_x].tolist()),
         cov=tuple(map(tuple, belief.cov[:n_x, :n_x].tolist())),
-        bias=tuple(np.clip(belief.mean[n_x : kalman.n_x], -largest, largest).tolist()),
+        bias=tuple(belief.mean[n_x : kalman.n_x].clip(-largest, largest).tolist()),
     )
 
 
@@ -187,39 +191,45 @@ def coasted(kalman: Kalman, history: History, belief: Belief, at_ns: int) -> Bel
 
 def _known(history: History, at_ns: int) -> Node:
     """What was known after all that had happened by `at_ns`."""
-    place = bisect_right(history.entries, at_ns, key=lambda entry: entry.key[0])
-    return history.entries[place - 1].after if place else history.anchor
+    for entry in reversed(history.entries):  # one of the newest, as a rule
+        if entry.key[0] <= at_ns:
+            return entry.after
+    return history.anchor
 
 
 def _horizon_ns(kalman: Kalman, at_ns: int) -> int:
     return at_ns - round(kalman.parameters.window_s * 1e9)
 
 
-def _inserted(kalman: Kalman, history: History, new: list[Entry]) -> History:
-    """Sort entries in and recompute the belief of each from the earliest new one on."""
-    if not new:
-        return history
-    earliest = min(entry.key for entry in new)
-    place = bisect_right(history.entries, earliest, key=lambda entry: entry.key)
-    node = history.entries[place - 1].after if place else history.anchor
-    entries = list(history.entries[:place])
-    for entry in sorted((*history.entries[place:], *new), key=lambda entry: entry.key):
+def _inserted(kalman: Kalman, history: History, new: Entry, belief: Belief | None) -> History:
+    """Sort an entry in and recompute the beliefs from there on; its own prediction may have been asked before."""
+    entries = history.entries
+    place = bisect_right(entries, new.key, key=_KEY)
+    node = entries[place - 1].after if place else history.anchor
+    later = entries[place:]
+    if later and later[0].key[0] == new.key[0]:
+        belief = None  # it may be that of the later one
+    node = _after(kalman, history.origin_ns, node, new, belief)
+    changed = [replace(new, after=node)]
+    for entry in later:
         node = _after(kalman, history.origin_ns, node, entry)
-        entries.append(replace(entry, after=node))
-    return replace(history, entries=tuple(entries))
+        changed.append(replace(entry, after=node))
+    return replace(history, entries=(*entries[:place], *changed))
 
 
 def _trimmed(history: History, horizon_ns: int) -> History:
     """Move the anchor up to the horizon."""
-    place = bisect_right(history.entries, horizon_ns, key=lambda entry: entry.key[0])
-    anchor = _known(history, horizon_ns)
-    return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[place:])
+    past = 0
+    while past < len(history.entries) and history.entries[past].key[0] <= horizon_ns:
+        past += 1
+    anchor = history.entries[past - 1].after if past else history.anchor
+    return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[past:])
 
 
-def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry) -> Node:
-    belief = node.belief
-    if belief is not None:
-        belief = predicted(kalman, origin_ns, belief, node.input, entry.key[0])
+def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry, belief: Belief | None = None) -> Node:
+    """What is known after an entry; `belief` is the prediction for it, if that has been asked."""
+    if belief is None and node.belief is not None:
+        belief = predicted(kalman, origin_ns, node.belief, node.input, entry.key[0])
     if entry.sample is not None:
         belief = first_belief(kalman, entry.sample) if belief is None else updated(kalman, belief, entry.sample)
     return Node(belief=belief, input=entry.input if entry.key[1] == _INPUT else node.input)

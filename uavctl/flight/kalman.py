@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,8 +75,7 @@ class Kalman:
     parameters: EstimatorParameters
 
 
-@dataclass(frozen=True, eq=False)
-class Belief:
+class Belief(msgspec.Struct, frozen=True, eq=False):
     """Gaussian of z = (x, w) at `at_ns`, with the capture time of the newest sample in it."""
 
     at_ns: int
@@ -118,12 +118,12 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
     now_ns, mean, cov = belief.at_ns, belief.mean, belief.cov
     if now_ns >= at_ns:
         return belief
-    dt_ns, n_x = kalman.propagation.dt_ns, kalman.n_x
+    propagation, n_x = kalman.propagation, kalman.n_x
     acting = np.zeros(kalman.n_u) if u is None else u
     while now_ns < at_ns:
-        boundary_ns = now_ns - (now_ns - origin_ns) % dt_ns + dt_ns
+        boundary_ns = now_ns - (now_ns - origin_ns) % propagation.dt_ns + propagation.dt_ns
         stop_ns = min(at_ns, boundary_ns)
-        f, g = kalman.propagation.over(stop_ns - now_ns)
+        f, g = propagation.over(stop_ns - now_ns)
         mean = f @ mean + g @ acting
         cov = _symmetric(f @ cov @ f.T)
         if stop_ns == boundary_ns:
@@ -197,4 +197,6 @@ def _of_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
 
 
 def _symmetric(matrix: Array) -> Array:
-    return (matrix + matrix.T) * 0.5
+    both: Array = matrix + matrix.T
+    both *= 0.5
+    return both

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import msgspec
 from scipy.special import betainc, betaincinv, ndtri
 
 from uavctl.data import LinkEstimate
@@ -36,8 +37,7 @@ class LinkEstimateParameters:
         return float(0.5 ** (1.0 / self.half_life_steps))
 
 
-@dataclass(frozen=True)
-class LinkBelief:
+class LinkBelief(msgspec.Struct, frozen=True):
     """What one boundary leaves to the next: forgotten counts.
 
     Attributes:

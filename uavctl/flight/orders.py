@@ -7,7 +7,8 @@ mission flies to. Of several that wait the last one counts.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from uavctl.data import (
     ORDER_ACCEPTED,
@@ -34,7 +35,7 @@ def take_orders(state: ControlState, inp: StepInput, controller: Controller) -> 
 
     Those that are not for the core (ENGAGE and the like) are left to who hands over.
     """
-    answers = []
+    answers: list[Event] = []
     for command in inp.commands:
         if command.order not in _OURS:
             continue

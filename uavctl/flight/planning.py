@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import msgspec
 import numpy as np
 
 from uavctl.data import Estimate, Matrix, Plan, SolveStatus, Vector
@@ -14,8 +13,7 @@ from uavctl.smpc.answer import Answer, Outlook, Solver
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
 
 
-@dataclass(frozen=True)
-class Asked:
+class Asked(msgspec.Struct, frozen=True):
     """How a solve ended; `plan` is there only if it may fly."""
 
     status: SolveStatus

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.data import PositionSample, StepInput, VehicleStatus
-from uavctl.flight.estimator import History, absorb, begin, belief_at
-from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, captured_ns, shown_by
+from uavctl.flight.estimator import History, absorb, begin, belief_at, move_on
+from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
 from uavctl.flight.stuck import FROZEN, Watches, observe, stuck
 
@@ -25,8 +26,7 @@ STAMP_TOLERANCE_NS = 20_000_000
 _FRESH_PART = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Trust:
+class Trust(msgspec.Struct, frozen=True, eq=False):
     """What is known of the sources.
 
     Attributes:
@@ -37,11 +37,10 @@ class Trust:
 
     suspect: Suspect | None = None
     doubt_mps: Array | None = None
-    watches: Watches = field(default_factory=dict)
+    watches: Watches = msgspec.field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class Intake:
+class Intake(msgspec.Struct, frozen=True, eq=False):
     """What came of a tick's samples.
 
     Attributes:
@@ -80,24 +79,19 @@ def take(
         horizon: H, the steps that a plan bridges.
         fresh: Fresh samples in a row, before.
     """
-    reasons = [refusal(sample, inp.at_ns, kalman.parameters) for sample in inp.samples]
-    valid = [sample for sample, reason in zip(inp.samples, reasons, strict=True) if reason is None]
     newest_ns = history.captured_ns
-    history, trust, taken, refused = _believe(kalman, reach, history, trust, inp, valid)
-    dt_ns = kalman.propagation.dt_ns
-    late_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
-    for at_ns in sorted(map(captured_ns, taken)):
-        if newest_ns is None or at_ns > newest_ns:
-            boundary_ns = at_ns - 1 - (at_ns - 1 - history.origin_ns) % dt_ns  # the last one before the capture
-            in_row = newest_ns is not None and boundary_ns - newest_ns < horizon * dt_ns
-            fresh = (fresh + 1 if in_row else 1) if inp.at_ns - at_ns <= late_ns else 0
-            newest_ns = at_ns
+    history = move_on(kalman, history, inp.at_ns)
+    accepted = 0
+    refused: tuple[str, ...] = ()
+    if inp.samples:
+        history, trust, taken, refused = _believe(kalman, reach, history, trust, inp)
+        accepted, fresh = len(taken), _fresh_in_row(kalman, history, newest_ns, inp.at_ns, taken, horizon, fresh)
     return Intake(
         history=history,
         trust=trust,
         moved=trust.suspect is not None and trust.suspect.moved(reach.parameters),
-        accepted=len(taken),
-        refused=(*(reason for reason in reasons if reason is not None), *refused),
+        accepted=accepted,
+        refused=refused,
         fresh=fresh,
     )
 
@@ -108,32 +102,63 @@ def forget(kalman: Kalman, intake: Intake, at_ns: int) -> Intake:
     return replace(intake, history=history, trust=Trust(), moved=False, fresh=0)
 
 
+def _fresh_in_row(
+    kalman: Kalman,
+    history: History,
+    newest_ns: int | None,
+    now_ns: int,
+    taken: Sequence[PositionSample],
+    horizon: int,
+    fresh: int,
+) -> int:
+    """Fresh samples in a row with those of a tick at `now_ns`, before which the newest was captured at `newest_ns`."""
+    dt_ns = kalman.propagation.dt_ns
+    late_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
+    for at_ns in sorted(map(captured_ns, taken)):
+        if newest_ns is None or at_ns > newest_ns:
+            boundary_ns = at_ns - 1 - (at_ns - 1 - history.origin_ns) % dt_ns  # the last one before the capture
+            in_row = newest_ns is not None and boundary_ns - newest_ns < horizon * dt_ns
+            fresh = (fresh + 1 if in_row else 1) if now_ns - at_ns <= late_ns else 0
+            newest_ns = at_ns
+    return fresh
+
+
 def _believe(
-    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput, valid: Sequence[PositionSample]
-) -> tuple[History, Trust, list[PositionSample], list[str]]:
+    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput
+) -> tuple[History, Trust, list[PositionSample], tuple[str, ...]]:
     """Give samples to the estimator in the order of their capture, each after it is held against what is known."""
+    reasons = [refusal(sample, inp.at_ns, kalman.parameters) for sample in inp.samples]
+    valid = [sample for sample, reason in zip(inp.samples, reasons, strict=True) if reason is None]
+    refused = [reason for reason in reasons if reason is not None]
     taken: list[PositionSample] = []
-    refused: list[str] = []
-    history, _, _ = absorb(kalman, history, inp.at_ns, ())
     for sample in sorted(valid, key=captured_ns):
-        trust, reason = _distrust(kalman, reach, history, trust, inp, sample)
-        if reason is not None:
-            refused.append(reason)
-            continue
-        history, one, why = absorb(kalman, history, inp.at_ns, (sample,))
+        at_ns = captured_ns(sample)
+        belief = belief_at(kalman, history, at_ns) if at_ns > history.horizon_ns else None
+        if belief is not None:  # else it is the first one, or too old
+            trust, reason = _distrust(kalman, reach, history, trust, inp, sample, belief)
+            if reason is not None:
+                refused.append(reason)
+                continue
+        history, one, why = absorb(kalman, history, inp.at_ns, (sample,), belief)
         taken.extend(one)
         refused.extend(why)
-    return history, trust, taken, refused
+    return history, trust, taken, tuple(refused)
 
 
 def _distrust(
-    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput, sample: PositionSample
+    kalman: Kalman,
+    reach: Reach,
+    history: History,
+    trust: Trust,
+    inp: StepInput,
+    sample: PositionSample,
+    belief: Belief,
 ) -> tuple[Trust, str | None]:
-    """What is known of the sources with one more sample, and why it is not believed (None if it is)."""
+    """What is known of the sources with one more sample, and why it is not believed (None if it is).
+
+    `belief` is the prediction for the sample's capture time.
+    """
     at_ns = captured_ns(sample)
-    belief = belief_at(kalman, history, at_ns) if at_ns > history.horizon_ns else None
-    if belief is None:
-        return trust, None  # the first one, or too old
     values, variances = shown_by(kalman, sample)
     off = values - belief.mean[kalman.shown[: len(values)]]
     n_axes = len(kalman.axes)

@@ -7,10 +7,9 @@ Tick n is at n * tick on the grid, step k = n // (Δt / tick). What a boundary d
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, replace
-
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.data import (
     ControlMode,
@@ -53,8 +52,7 @@ _SOURCES = {
 _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
-@dataclass(frozen=True)
-class StepOutput:
+class StepOutput(msgspec.Struct, frozen=True):
     """What a tick gives to the outside.
 
     Attributes:
@@ -95,7 +93,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     origin_ns = inp.at_ns - inp.tick * controller.tick_ns
     history = state.history or begin(controller.kalman, origin_ns, inp.at_ns)
     intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
-    lost = intake.moved and state.mode in _NOT_FLOWN
+    before = state.mode
+    lost = intake.moved and before in _NOT_FLOWN
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
     tick = place(state, inp, intake.history, controller)
@@ -111,7 +110,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         fresh=0 if stale else intake.fresh,
     )
     choice = choose(begun, tick, inp, controller)
-    setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, tick, inp.at_ns, controller)
+    mode = choice.state.mode
+    setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, mode, tick, inp.at_ns, controller)
     acting = None if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
     alarms = state.link_alarms if link is None else _alarms(link, state.link_alarms)
@@ -129,7 +129,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         at_ns=inp.at_ns,
         step=tick.number,
         boundary=tick.boundary,
-        mode=choice.state.mode,
+        mode=mode,
         age_steps=tick.age_steps,
         news=choice.news,
         plan_seq=None if plan is None else plan.seq,
@@ -152,11 +152,11 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         events=(
             *answers,
             *((_restarted(inp.at_ns),) if lost else ()),
-            *_events(state.mode, choice, inp, intake.refused, controller.names),
+            *_events(before, mode, choice, inp, intake.refused, controller.names),
             *_link_events(alarms, state.link_alarms, link),
         ),
         link=link,
-        land=choice.state.mode is ControlMode.LAND and state.mode is not ControlMode.LAND,
+        land=mode is ControlMode.LAND and before is not ControlMode.LAND,
     )
 
 
@@ -197,16 +197,16 @@ def _link_events(alarms: tuple[str, ...], told: tuple[str, ...], link: LinkEstim
 
 
 def _setpoint(
-    state: ControlState, tick: Tick, at_ns: int, controller: Controller
+    state: ControlState, mode: ControlMode, tick: Tick, at_ns: int, controller: Controller
 ) -> tuple[Setpoint | None, Array | None]:
     """The setpoint after the last gate, and the input (n_u,) that it is."""
-    source = _SOURCES.get(state.mode)
+    source = _SOURCES.get(mode)
     if source is None or tick.estimate is None:
         return None, None
     want = ZERO
     if state.fallback is not None:
         want = fb.acceleration(state.fallback, velocity(tick.estimate, controller.plant), controller.fallback)
-        if not (state.fallback.final and state.mode is ControlMode.HOLD):  # what is kept after the end is zero itself
+        if not (state.fallback.final and mode is ControlMode.HOLD):  # what is kept after the end is zero itself
             want = _beside(tick.estimate.bias, want, controller.plant)
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
@@ -239,11 +239,17 @@ _ENTERED = {
 
 
 def _events(
-    before: ControlMode, choice: Choice, inp: StepInput, refused: tuple[str, ...], names: Names
+    before: ControlMode, mode: ControlMode, choice: Choice, inp: StepInput, refused: tuple[str, ...], names: Names
 ) -> tuple[Event, ...]:
     events = [
-        Event(at_ns=inp.at_ns, severity=Severity.WARNING, code=code, text="the sample counts as lost", count=count)
-        for code, count in sorted(Counter(refused).items())
+        Event(
+            at_ns=inp.at_ns,
+            severity=Severity.WARNING,
+            code=code,
+            text="the sample counts as lost",
+            count=refused.count(code),
+        )
+        for code in sorted(set(refused))
     ]
     if inp.missed_ticks:
         text = "ticks were missed; they are not made up for"
@@ -256,7 +262,6 @@ def _events(
     if choice.plan is not None and choice.plan.gave_way:
         text = tell_all(names, choice.plan.gave_way)
         events.append(Event(at_ns=inp.at_ns, severity=Severity.WARNING, code="gave-way", text=text))
-    mode = choice.state.mode
     if mode is not before:
         severity, code = _ENTERED[mode]
         if choice.state.fallback is not None and choice.state.fallback.end >= End.STOP:

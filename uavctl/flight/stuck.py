@@ -14,9 +14,10 @@ The resolution is the smallest change that the source has shown.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.data import PositionSample, Vec3
 from uavctl.flight.estimator import History, belief_at, coasted
@@ -33,8 +34,7 @@ _SMOOTH = 0.1  # weight of a sample in the mean of what was news
 _SOURCES = 8  # that are watched at once
 
 
-@dataclass(frozen=True, eq=False)
-class Watch:
+class Watch(msgspec.Struct, frozen=True, eq=False):
     """What a source has said.
 
     Attributes:

@@ -10,9 +10,9 @@ by calls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
@@ -27,8 +27,7 @@ Array = NDArray[np.float64]
 _ZERO = 1e-11
 
 
-@dataclass(frozen=True, eq=False)
-class Numbers:
+class Numbers(msgspec.Struct, frozen=True, eq=False):
     """One question in the numbers of all components' QPs, one after another.
 
     Attributes:
@@ -50,8 +49,7 @@ class Numbers:
     below: Array
 
 
-@dataclass(frozen=True, eq=False)
-class FrozenAnswer:
+class FrozenAnswer(msgspec.Struct, frozen=True, eq=False):
     """What the frozen policies say, before it is certified.
 
     Attributes:

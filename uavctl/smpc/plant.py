@@ -48,6 +48,8 @@ class Plant:
     position_index: tuple[int, ...]
     velocity_index: tuple[int, ...]
     accel_per_input: Array
+    _accel_map: Array = field(init=False, repr=False)
+    _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
     _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
     _generator: Array = field(init=False, repr=False)  # in these units
 
@@ -55,6 +57,9 @@ class Plant:
         for name in ("a", "b", "e", "w", "accel_per_input"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         _check(self)
+        accel = self.accel_per_input
+        object.__setattr__(self, "_accel_map", _frozen(np.diag(accel)) if accel.ndim == 1 else accel)
+        object.__setattr__(self, "_columns", tuple(AXES.index(axis) for axis in self.axes))
         object.__setattr__(self, "_units", _frozen(balanced_units(self.a, self.b, self.e)))
         object.__setattr__(self, "_generator", _frozen(_logarithm(self) / self.dt_s))
 
@@ -93,20 +98,21 @@ class Plant:
     @property
     def accel_map(self) -> Array:
         """Acceleration setpoint per unit of each input (n_axes, n_u) [m/s² per unit]."""
-        return np.diag(self.accel_per_input) if self.accel_per_input.ndim == 1 else self.accel_per_input
+        return self._accel_map
 
     def to_accel(self, u: Array) -> Vec3:
         """Acceleration setpoint [m/s²] of an input (n_u,); 0 in the axes that the plant has not."""
-        accel = dict(zip(self.axes, (self.accel_map @ u).tolist(), strict=True))
-        north, east, down = (accel.get(axis, 0.0) for axis in AXES)
-        return north, east, down
+        accel = [0.0, 0.0, 0.0]
+        for column, value in zip(self._columns, (self._accel_map @ u).tolist(), strict=True):
+            accel[column] = value
+        return accel[0], accel[1], accel[2]
 
     def to_input(self, accel: Vec3) -> Array:
         """Input (n_u,) of an acceleration setpoint [m/s²]: the smallest of those nearest to it.
 
         Only where each axis has its own input is it the one input that asks for this acceleration.
         """
-        wanted: Array = np.array([accel[AXES.index(axis)] for axis in self.axes])
+        wanted: Array = np.array([accel[column] for column in self._columns])
         if self.accel_per_input.ndim == 1:
             return wanted / self.accel_per_input
         nearest: Array = np.linalg.pinv(self.accel_per_input) @ wanted
