@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from logs import page
 from logs.compare import Comparison
 from logs.compare_side import Loaded
-from logs.compare_words import difference, label, likeness, measured, parameter
+from logs.compare_words import difference, for_people, label, likeness, measured, parameter
 from logs.design_view import AXIS_NUMBER, Floats
 from logs.flight_data import FlightData
 from logs.outputs import spare_recording, write_whole
@@ -174,7 +174,7 @@ def _figures_of(found: Comparison, others: Sequence[int]) -> str:
     columns = ["figure", "A"]
     columns += [text for name in names.values() for text in (name, f"{name} − A", f"{name} / A")]
     rows = []
-    for one in found.figures:
+    for one in map(for_people, found.figures):
         cells = [measured(one.values[0])]
         for place in others:
             cells += [measured(one.values[place]), difference(one.differences[place - 1])]

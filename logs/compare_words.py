@@ -33,6 +33,17 @@ def parameter(value: object) -> str:
     return value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
+def for_people(figure: Figure) -> Figure:
+    """A figure in the unit that people read it in: a share that is far below one in percent."""
+    if figure.key != "largest_gap":
+        return figure
+    values, differences = (
+        tuple(None if value is None else 100.0 * value for value in some)
+        for some in (figure.values, figure.differences)
+    )
+    return msgspec.structs.replace(figure, unit="%", values=values, differences=differences)
+
+
 def measured(value: Value) -> str:
     """A figure: four digits, and no exponent where people count without one."""
     if value is None:

@@ -113,7 +113,7 @@ def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, ti
     with canvas(key, 2.3) as one:
         ax = one.axes(title, "time [s]", y_label)
         shade_fallback(ax, flight)
-        _draw_limits(ax, flight, index, sign)
+        draw_limits(ax, flight, index, sign)
         estimate_s, estimate = thin(
             flight.seconds([e.at_ns for e in flight.estimates]),
             np.array([sign * e.mean[index] for e in flight.estimates]),
@@ -138,7 +138,7 @@ def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     ax.step(*thin(ends_s, values), where="post", color=colour("target"), lw=1.1, ls=DOTTED)
 
 
-def _draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
+def draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     """Limits of a state, and the reserve that each plan keeps from them at its far end."""
     box = flight.design.state_box
     plans = list(flight.flown_plans.values())

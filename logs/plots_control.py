@@ -12,9 +12,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from numpy.typing import NDArray
 
 from logs.design_view import Floats
+from logs.digits import duration
 from logs.flight_data import FALLBACK, FlightData
 from logs.plots import DASHED, draw_path, shade_fallback, span, thin
-from logs.summary import decision_times_us, duration, input_outside
+from logs.summary import decision_times_us, input_outside
 from logs.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, ramp, standalone, strokes
 
 WIDE_IN = 8.6

@@ -9,7 +9,7 @@ from logs.flight_data import FlightData
 from logs.page import Mark, Section
 from logs.statistics import LEVEL, Share
 from logs.verdict_clock import ClockVerdict, plain
-from logs.verdict_model import AxisVerdict, LeadVerdict
+from logs.verdict_model import AxisVerdict, LeadVerdict, ModelOutcome, ModelVerdict
 from logs.verdict_risk import LimitRisk
 from logs.verdicts import Judged, Verdicts
 
@@ -27,16 +27,13 @@ def verdict_sections(flight: FlightData, judged: Judged) -> Iterator[Section]:
 
 def verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
     """One line for each verdict."""
-    model = "not known" if verdicts.model is None else _word(verdicts.model.refuted, bool(verdicts.model.axes))
-    if verdicts.model is not None and verdicts.model.cautious:
-        model = "cautious: errors were smaller than foretold"
     risk = verdicts.risk
     known = bool(risk.limits[0].measured.trials) and risk.limits[0].promised is not None
     link = verdicts.link
     return [
         ("Promised risk", _word(risk.refuted, known)),
         ("Promised link", _word(link.refuted, bool(link.news.trials) and link.promised_news is not None)),
-        ("Model of the vehicle", model),
+        ("Model of the vehicle", _model_word(verdicts.model)),
     ]
 
 
@@ -44,6 +41,26 @@ def _word(refuted: bool, judged: bool) -> str:
     if not judged:
         return "too little to judge"
     return "refuted by this flight" if refuted else "nothing in this flight speaks against it"
+
+
+def _model_word(model: ModelVerdict | None) -> str:
+    if model is None:
+        return "not known"
+    if model.outcome is ModelOutcome.CAUTIOUS:
+        return "cautious: errors were smaller than foretold"
+    return _word(model.refuted, model.outcome is not ModelOutcome.UNKNOWN) + _departure(model)
+
+
+def _departure(model: ModelVerdict) -> str:
+    """What refutes a model, in a word each."""
+    found = [
+        *(["larger than foretold"] if any(one.larger for one in model.axes) else ()),
+        *(["off on average"] if any(one.mean_refuted for one in model.axes) else ()),
+        *(["telling of the next"] if any(one.telling for one in model.axes) else ()),
+    ]
+    if any(one.too_few for one in model.leads):
+        return ": too few positions were where they were foretold"
+    return f": errors were {', '.join(found)}" if found else ""
 
 
 def _risk(verdicts: Verdicts) -> Section:
@@ -111,7 +128,7 @@ def _model(flight: FlightData, judged: Judged) -> Section:
         "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
         "minus what those before it foretell; if the model is right, errors are as large as foretold (1 ×), zero on "
         "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is foretold for "
-        "the inputs that were then flown."
+        "the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side."
     )
     legend = (_ESTIMATE, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()
     return Section(title, note, "".join(body), legend)
@@ -121,10 +138,10 @@ def _axis_row(one: AxisVerdict) -> tuple[str, ...]:
     return (
         one.axis,
         f"{1e3 * one.rms_m:.3g}",
-        f"{one.variance**0.5:.2f}{_mark(one.variance_refuted)}",
+        f"{one.variance**0.5:.2f}{_mark(one.larger, one.smaller)}",
         f"{one.variance_low**0.5:.2f} … {one.variance_high**0.5:.2f}",
         f"{round(one.mean, 2) + 0.0:+.2f}{_mark(one.mean_refuted)}".replace("-", "−"),
-        f"{_p(one.whiteness_p)}{_mark(one.whiteness_refuted)}",
+        f"{_p(one.whiteness_p)}{_mark(one.telling, one.whiteness_refuted)}",
     )
 
 
@@ -132,13 +149,13 @@ def _lead_row(one: LeadVerdict) -> tuple[str, ...]:
     return (
         f"{one.lead_s:.3g} s",
         f"{one.inside.hits} of {one.inside.trials}",
-        f"{_percent(one.inside.rate)}{_mark(one.refuted)}",
+        f"{_percent(one.inside.rate)}{_mark(one.too_few, one.refuted)}",
         _interval(one.inside),
     )
 
 
-def _mark(refuted: bool) -> str:
-    return " ✗" if refuted else ""
+def _mark(refuted: bool, cautious: bool = False) -> str:
+    return " ✗" if refuted else " ○" if cautious else ""
 
 
 def _clocks(flight: FlightData, verdicts: Verdicts) -> Section:

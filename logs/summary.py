@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from logs.design_view import Floats
+from logs.digits import duration, number, percent_above
 from logs.flight_data import FALLBACK, FLOWN, FlightData
 from logs.moving_limits import limits_at
 from uavctl.data import ControlMode, Matrix, SolveStatus, Vector
@@ -151,7 +152,7 @@ def _methods(s: FlightSummary) -> str:
     """How plans were found, and how far from the optimum the worst is certified to be."""
     if not s.methods:
         return "none"
-    certified = "" if s.largest_gap is None else f"; certified gap at most {max(s.largest_gap, 0.0):.1e} of the cost"
+    certified = "" if s.largest_gap is None else f"; certified gap at most {percent_above(s.largest_gap)} of the cost"
     return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
 
 
@@ -257,18 +258,6 @@ def _times(times: Spread) -> str:
     if times.p50 is None or times.p99 is None or times.max is None:
         return "not measured"
     return f"median {duration(times.p50)}, 99 % {duration(times.p99)}, largest {duration(times.max)}"
-
-
-def duration(value_us: float) -> str:
-    """A duration [µs] with a unit that suits it."""
-    if value_us < 999.5:
-        return f"{value_us:.3g} µs"
-    return f"{value_us / 1e3:.3g} ms" if value_us < 999.5e3 else f"{value_us / 1e6:.3g} s"
-
-
-def number(value: float, decimals: int = 3) -> str:
-    """A number for people: no more decimals than they need, no exponent below a million."""
-    return f"{round(value, decimals):g}"
 
 
 def count(amount: int, noun: str) -> str:

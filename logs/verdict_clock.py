@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 
 from logs.design_view import AXIS_NUMBER, Floats
+from logs.digits import duration
 from logs.flight_data import FlightData
 from logs.statistics import normal_reach
-from logs.summary import duration
 from uavctl.data import LinkStats, PositionSample, Truth
 
 _FEWEST = 3

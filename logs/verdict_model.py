@@ -1,8 +1,12 @@
-"""Verdict on the model: are the errors of its forecasts as large as it says, and nothing more to learn from them?"""
+"""Verdict on the model: are the errors of its forecasts as large as it says, and nothing more to learn from them?
+
+A model can be wrong on the safe side: one that foretells larger errors than were measured is cautious, not refuted.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import StrEnum
 
 import msgspec
 import numpy as np
@@ -21,11 +25,21 @@ from logs.statistics import (
     variance_bounds,
     variance_p,
 )
+from logs.verdict_spectrum import BANDS, band_powers, power_bounds
 
 LAGS = 20
 FEWEST = 30  # errors of an axis below which nothing is said
 PROMISED_INSIDE = 0.95
 _TESTS_PER_AXIS = 3  # mean, spread, whiteness
+
+
+class ModelOutcome(StrEnum):
+    """What a flight says of the model."""
+
+    HOLDS = "holds"  # nothing speaks against it
+    CAUTIOUS = "cautious"  # errors were smaller than foretold, and that explains all else
+    REFUTED = "refuted"  # errors were larger than foretold, off on average, or told of the next by more than that
+    UNKNOWN = "unknown"  # too few positions to say
 
 
 class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,9 +59,28 @@ class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
     correlation_bound: float  # each is below this with `level`, all of them together
     ljung_box: float
     whiteness_p: float
+    power: tuple[float, ...]  # mean squares of the errors by frequency, from slow to quick; 1 promised
+    power_bound: tuple[float, ...]  # they are below these with `level`, if true errors are at most the foretold ones
     mean_refuted: bool
     variance_refuted: bool
     whiteness_refuted: bool
+
+    @property
+    def smaller(self) -> bool:
+        """Errors were smaller than foretold; if not white, by their size alone, without the other tests."""
+        seldom = self.variance_refuted or (self.whiteness_refuted and self.variance_p < 1.0 - LEVEL)
+        return seldom and self.variance < 1.0
+
+    @property
+    def larger(self) -> bool:
+        """Errors were larger than foretold, at all frequencies together or at some."""
+        return self.variance_refuted and self.variance > 1.0
+
+    @property
+    def telling(self) -> bool:
+        """Errors tell of the next, and too large a foretold noise cannot be why."""
+        stronger = any(power > bound for power, bound in zip(self.power, self.power_bound, strict=True))
+        return self.whiteness_refuted and not (self.smaller and not stronger)
 
 
 class LeadVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,12 +92,17 @@ class LeadVerdict(msgspec.Struct, frozen=True, kw_only=True):
     inside: Share
     refuted: bool
 
+    @property
+    def too_few(self) -> bool:
+        """Fewer positions were inside than promised."""
+        return self.refuted and self.inside.rate < self.promised
+
 
 class ModelVerdict(msgspec.Struct, frozen=True, kw_only=True):
     """The model against what was flown."""
 
-    refuted: bool
-    cautious: bool  # refuted, but only by errors that are smaller than foretold
+    outcome: ModelOutcome
+    refuted: bool  # the outcome is
     text: str
     axes: tuple[AxisVerdict, ...]
     leads: tuple[LeadVerdict, ...]
@@ -86,17 +124,24 @@ def judge_innovations(found: Innovations, axes: tuple[str, ...], dt_s: float) ->
         if enough
     )
     leads = _leads(found, len(axes), dt_s)
-    larger = any(
-        one.mean_refuted or one.whiteness_refuted or (one.variance_refuted and one.variance > 1.0) for one in judged
-    ) or any(one.refuted and one.inside.rate < one.promised for one in leads)
-    refuted = larger or any(one.variance_refuted for one in judged) or any(one.refuted for one in leads)
+    outcome = _outcome(judged, leads)
     return ModelVerdict(
-        refuted=refuted,
-        cautious=refuted and not larger,
-        text=_text(judged, leads, len(found.error_m)),
+        outcome=outcome,
+        refuted=outcome is ModelOutcome.REFUTED,
+        text=_text(outcome, judged, leads, len(found.error_m)),
         axes=judged,
         leads=leads,
     )
+
+
+def _outcome(axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...]) -> ModelOutcome:
+    if not axes:
+        return ModelOutcome.UNKNOWN
+    if any(one.larger or one.mean_refuted or one.telling for one in axes) or any(one.too_few for one in leads):
+        return ModelOutcome.REFUTED
+    if any(one.smaller for one in axes) or any(one.refuted for one in leads):
+        return ModelOutcome.CAUTIOUS
+    return ModelOutcome.HOLDS
 
 
 def judge_axis(axis: str, normalised: Floats, error_m: Floats, tests: int) -> AxisVerdict:
@@ -114,6 +159,7 @@ def judge_axis(axis: str, normalised: Floats, error_m: Floats, tests: int) -> Ax
     q, white_p = ljung_box(correlation, n)
     mean_p, spread_p = two_sided_normal(mean * n**0.5), variance_p(variance * n, n)
     low, high = variance_bounds(n, tests)
+    power, counts = band_powers(normalised)
     least = (1.0 - LEVEL) / tests
     return AxisVerdict(
         axis=axis,
@@ -130,6 +176,8 @@ def judge_axis(axis: str, normalised: Floats, error_m: Floats, tests: int) -> Ax
         correlation_bound=normal_reach(LAGS) / n**0.5,
         ljung_box=q,
         whiteness_p=white_p,
+        power=tuple(power.tolist()),
+        power_bound=tuple(power_bounds(counts, tests // _TESTS_PER_AXIS * BANDS).tolist()),
         mean_refuted=mean_p < least,
         variance_refuted=spread_p < least,
         whiteness_refuted=white_p < least,
@@ -152,29 +200,46 @@ def _leads(found: Innovations, axes: int, dt_s: float) -> tuple[LeadVerdict, ...
     return tuple(verdicts)
 
 
-def _text(axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...], count: int) -> str:
+def _text(outcome: ModelOutcome, axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...], count: int) -> str:
     if not axes:
         return f"{count} forecasts of a position in flown time are too few to judge the model; {FEWEST} are the least."
-    return " ".join((_errors_text(axes, count), _leads_text(leads)))
-
-
-def _errors_text(axes: tuple[AxisVerdict, ...], count: int) -> str:
-    large = _times([one for one in axes if one.variance_refuted and one.variance > 1.0])
-    small = _times([one for one in axes if one.variance_refuted and one.variance < 1.0])
-    tells = _each([one for one in axes if one.whiteness_refuted], lambda one: one.correlation[0])
-    off = _each([one for one in axes if one.mean_refuted], lambda one: one.mean)
-    found = [
-        *([f"errors are larger than foretold ({large}), so back-offs are too small"] if large else ()),
-        *([f"errors are smaller than foretold ({small}), so it is cautious there"] if small else ()),
-        *([f"an error tells of the next (correlation {tells})"] if tells else ()),
-        *([f"the errors are {off} deviations off on average"] if off else ()),
-    ]
-    if not found:
-        return (
-            f"Over {count} positions the errors of the forecast are as large as foretold, centred and white: nothing "
-            "speaks against the model."
+    over = f"Over {count} positions"
+    found = "; ".join(_departures(axes))
+    if outcome is ModelOutcome.REFUTED:
+        told = f"{over} the model is not the vehicle" + (f": {found}." if found else " some time ahead.")
+    elif outcome is ModelOutcome.CAUTIOUS:
+        told = f"{over} the model is cautious" + (f": {found}." if found else " some time ahead.")
+    else:
+        told = (
+            f"{over} the errors of the forecast are as large as foretold, centred and white: nothing speaks against "
+            "the model."
         )
-    return f"Over {count} positions the model is not the vehicle: {'; '.join(found)}."
+    return f"{told} {_leads_text(leads)}"
+
+
+def _departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
+    """What departs from the model, and what that means."""
+    large = _times([one for one in axes if one.larger])
+    small = _times([one for one in axes if one.smaller])
+    tells = _each([one for one in axes if one.telling], lambda one: one.correlation[0])
+    mild = _each([one for one in axes if one.whiteness_refuted and not one.telling], lambda one: one.correlation[0])
+    off = _each([one for one in axes if one.mean_refuted], lambda one: one.mean)
+    told = (
+        (large, f"errors are larger than foretold ({large}), so back-offs are too small"),
+        (small, f"errors are smaller than foretold ({small}), so back-offs are larger there than they need be"),
+        (
+            tells,
+            f"an error tells of the next (correlation {tells}), by more than caution explains: lag, drag, gain or "
+            "times of capture may be wrong",
+        ),
+        (
+            mild,
+            f"an error tells a little of the next (correlation {mild}), as it does where a noise is foretold larger "
+            "than it is: slow or quick, errors were not stronger than foretold by more than chance",
+        ),
+        (off, f"the errors are {off} deviations off on average"),
+    )
+    return [text for axes_named, text in told if axes_named]
 
 
 def _times(axes: list[AxisVerdict]) -> str:

@@ -6,9 +6,10 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from logs.digits import duration, number
 from logs.flight_data import FALLBACK, FLOWN, FlightData
 from logs.moving_limits import box_at
-from logs.summary import Ending, FlightSummary, count, duration, input_outside, number, position_error_m, state_outside
+from logs.summary import Ending, FlightSummary, count, input_outside, position_error_m, state_outside
 from uavctl.data import ControlMode
 from uavctl.naming import severity, tell, worst
 

@@ -12,8 +12,9 @@ from rich.console import Console
 from synthetic_flight import Item, fly, header
 from synthetic_scene import paper, room
 
+from logs.digits import number, percent_above
 from logs.flight_data import FALLBACK, FlightData
-from logs.summary import FlightSummary, Spread, number, render, spread, summarise
+from logs.summary import FlightSummary, Spread, render, spread, summarise
 from uavctl.data import ControlMode, Decision, Estimate, Plan, Record, SolveStatus, StepInput, Timing, Truth
 from uavctl.errors import RecordingError
 
@@ -323,3 +324,26 @@ def test_the_end_is_in_the_table() -> None:
 @pytest.mark.parametrize(("value", "text"), [(40.0, "40"), (0.2271, "0.227"), (1234.5, "1234.5"), (360000.0, "360000")])
 def test_numbers_for_people(value: float, text: str) -> None:
     assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (2.6e-5, "0.003 %"),
+        (1e-5, "0.001 %"),
+        (3e-5, "0.003 %"),
+        (1.1e-3, "0.11 %"),
+        (0.5, "50 %"),
+        (0.0, "0.001 %"),
+        (-1e-9, "0.001 %"),
+    ],
+)
+def test_a_bound_in_percent_is_never_rounded_below_itself(share: float, text: str) -> None:
+    assert percent_above(share) == text
+    assert 1e-2 * float(text.removesuffix(" %")) >= share * (1.0 - 1e-9)
+
+
+def test_the_certified_gap_is_said_without_an_exponent() -> None:
+    s = msgspec.structs.replace(figures(decision(0)), methods={"frozen": 3}, largest_gap=2.6e-5)
+    assert "3 frozen; certified gap at most 0.003 % of the cost" in shown(s)
+    assert msgspec.json.decode(msgspec.json.encode(s))["largest_gap"] == 2.6e-5

@@ -51,17 +51,17 @@ def test_errors_that_tell_of_the_next_are_found() -> None:
     assert all(one.whiteness_refuted for one in verdict.axes)
     assert [one.correlation[0] for one in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
     assert len(verdict.axes[0].correlation) == LAGS
-    assert verdict.refuted and not verdict.cautious
+    assert verdict.refuted
     assert "an error tells of the next" in verdict.text
 
 
-@pytest.mark.parametrize(("scale", "cautious", "told"), [(1.3, False, "too small"), (0.7, True, "cautious")])
-def test_errors_of_another_size_are_found(scale: float, cautious: bool, told: str) -> None:
+@pytest.mark.parametrize(("scale", "outcome", "told"), [(1.3, "refuted", "too small"), (0.7, "cautious", "cautious")])
+def test_errors_of_another_size_are_found(scale: float, outcome: str, told: str) -> None:
     values = scale * np.random.default_rng(2).standard_normal((800, 3))
     verdict = judge_innovations(errors(values), AXES, 0.2)
     assert all(one.variance_refuted for one in verdict.axes)
     assert [one.variance for one in verdict.axes] == pytest.approx([scale**2] * 3, rel=0.2)
-    assert (verdict.refuted, verdict.cautious) == (True, cautious)
+    assert (verdict.outcome, verdict.refuted) == (outcome, outcome == "refuted")
     assert told in verdict.text
 
 

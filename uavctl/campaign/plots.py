@@ -12,11 +12,12 @@ from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
 
 from logs.page import Mark
-from logs.plots import DASHED, DOTTED
+from logs.plots import DASHED
 from logs.plots_control import WIDE_IN
 from logs.svg import WIDTH_IN, Drawing, canvas, colour
 from uavctl.campaign.intervals import Pair
 from uavctl.campaign.results import Results
+from uavctl.campaign.rows import draw_rows, left_in, lower, offset, rows_in
 from uavctl.campaign.statistics import CellSummary
 from uavctl.campaign.verdict import Comparison, Verdict
 
@@ -28,8 +29,8 @@ _FARTHEST_PERCENT = 1e6  # what is beyond stands there
 # A controller that diverges would press all others together: beyond this times the least, it leaves the frame.
 _TALLEST = 1e5
 _TITLE_WIDTH = 48
+_TITLE_LINE_IN = 0.18
 _LABEL_WIDTH = 16  # characters of a link's name in a line
-_LETTER_IN = 0.08  # of the page's font, the widest that browsers take for it
 _LOOKS = tuple(
     (role, kind)
     for kind in ("planned", "dashed")
@@ -150,13 +151,13 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
     links = list(dict.fromkeys(cell.link for cell in cells))
     who = list(dict.fromkeys(cell.controller for cell in cells))
     labels = [fill(link, _LABEL_WIDTH) for link in links]
-    with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
-        ax = one.axes(quantity.title, quantity.label, "", _left_in(labels))
+    with canvas(name, 0.9 + rows_in(labels, len(who))) as one:
+        ax = one.axes(quantity.title, quantity.label, "", left_in(labels))
         floor = _scale(ax, quantity, cells, ax.set_xscale)
         for place, controller in enumerate(who):
             role, kind, marker = looks.of(controller)
             mine = [cell for cell in cells if cell.controller == controller]
-            rows = np.array([links.index(cell.link) + _offset(place, len(who)) for cell in mine])
+            rows = np.array([links.index(cell.link) + offset(place, len(who)) for cell in mine])
             value, low, high = _figures(quantity, mine)
             face = colour(role) if kind == "planned" else colour("card")
             ax.hlines(rows, np.maximum(low, floor), high, color=colour(role), lw=1.6)
@@ -164,7 +165,7 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
             ax.plot(value[there], rows[there], ls="", marker=marker, ms=4.2, color=colour(role), mfc=face)
             ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=colour(role))
         _promise(ax.axvline, quantity, cells)
-        _rows(ax, labels)
+        draw_rows(ax, labels)
     return Drawing(name, one.svg, f"{quantity.title} of each controller by link")
 
 
@@ -176,18 +177,21 @@ def differences(verdicts: Sequence[Verdict], looks: Looks, title: str, key: str)
     labels = [fill(verdict.group[0], _LABEL_WIDTH) for verdict in shown]
     who = list(dict.fromkeys(one.baseline.controller for verdict in shown for one in verdict.comparisons))
     name = f"difference-{key}"
-    with canvas(name, 0.9 + sum(_row_in(label, len(who)) for label in labels)) as one:
-        ax = one.axes(fill(title, _TITLE_WIDTH), "what the baseline costs more [%]", "", _left_in(labels))
+    heading = fill(title, _TITLE_WIDTH)
+    more_in = _TITLE_LINE_IN * heading.count("\n")
+    with canvas(name, 0.9 + rows_in(labels, len(who)) + more_in) as one:
+        ax = one.axes(heading, "what the baseline costs more [%]", "", left_in(labels))
+        lower(ax, more_in)
         ax.set_xscale("symlog", linthresh=_LINEAR_PERCENT, linscale=0.8)
         ax.axvline(0.0, color=colour("ink"), lw=0.9)
         for row, verdict in enumerate(shown):
             for comparison in verdict.comparisons:
-                place = row + _offset(who.index(comparison.baseline.controller), len(who))
+                place = row + offset(who.index(comparison.baseline.controller), len(who))
                 _difference(ax, comparison, place, looks)
         ax.xaxis.set_major_locator(SymmetricalLogLocator(base=10.0, linthresh=_LINEAR_PERCENT, subs=(1.0, 3.0)))
         ax.xaxis.set_major_formatter(FuncFormatter(_plain))
         ax.xaxis.set_minor_formatter(NullFormatter())
-        _rows(ax, labels)
+        draw_rows(ax, labels)
     return Drawing(name, one.svg, f"{title}: what each baseline costs more, by link, with its interval")
 
 
@@ -269,29 +273,6 @@ def _promise(draw: Callable[..., object], quantity: Quantity, cells: Sequence[Ce
     promised = {quantity.promised(cell) for cell in cells} - {None}
     for share in promised:
         draw(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
-
-
-def _offset(place: int, count: int) -> float:
-    """Within a row, from -0.36 to 0.36."""
-    return 0.0 if count == 1 else 0.72 * (place / (count - 1) - 0.5)
-
-
-def _row_in(label: str, count: int) -> float:
-    """Height of a row [in]."""
-    return max(0.13 * count + 0.08, 0.15 * (label.count("\n") + 1) + 0.06)
-
-
-def _left_in(labels: Sequence[str]) -> float:
-    """Room for the names of links beside the axis [in]."""
-    return 0.2 + _LETTER_IN * max(len(line) for label in labels for line in label.splitlines())
-
-
-def _rows(ax: Axes, labels: Sequence[str]) -> None:
-    ax.set_yticks(range(len(labels)), labels)
-    ax.set_ylim(len(labels) - 0.5, -0.5)
-    ax.grid(visible=False, axis="y")
-    for row in range(1, len(labels)):
-        ax.axhline(row - 0.5, color=colour("grid"), lw=0.6, ls=DOTTED)
 
 
 def _plain(value: float, _place: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,7 +26,7 @@ from uavctl.errors import DesignError, UsageError
 from uavctl.identify.fit import FITS
 from uavctl.identify.page import write_page
 from uavctl.identify.recorded import History, from_records, from_tlog
-from uavctl.identify.result import Identification, Identified, identify
+from uavctl.identify.result import Identification, identify
 
 
 def identify_command(
@@ -49,11 +50,12 @@ def identify_command(
         found = identify(history, config, advance)
     doubts = (*found.result.warnings, *_design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
+    found = dataclasses.replace(found, result=result)
     page = target.with_suffix(".html")
     write_whole(target, dump_config(found.config))
     write_whole(page, write_page(found, history.seen, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
-    common.show(document, lambda: _picture(result, found, target, page))
+    common.show(document, lambda: _picture(found, target, page))
     return 0
 
 
@@ -90,7 +92,8 @@ def _progress(steps: int) -> Iterator[Callable[[], None]]:
         yield lambda: progress.advance(task)
 
 
-def _picture(result: Identified, found: Identification, target: Path, page: Path) -> RenderableType:
+def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
+    result = found.result
     plant = Table(title=f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions")
     for column in (
         "axis",

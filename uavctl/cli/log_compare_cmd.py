@@ -14,7 +14,7 @@ from rich.text import Text
 from logs.compare import Comparison, compare
 from logs.compare_page import write_page
 from logs.compare_side import Side, load_all
-from logs.compare_words import difference, label, likeness, measured, parameter
+from logs.compare_words import difference, for_people, label, likeness, measured, parameter
 from uavctl.cli.common import Common, messages
 from uavctl.cli.wide_table import Column, WideTable
 
@@ -72,7 +72,7 @@ def _parameters(found: Comparison) -> Table:
 
 
 def _figures(found: Comparison) -> WideTable:
-    rows = found.figures
+    rows = list(map(for_people, found.figures))
     first, *others = (one.name for one in found.recordings)
     groups = [[Column(first, [measured(row.values[0]) for row in rows])]]
     for place, name in enumerate(others):

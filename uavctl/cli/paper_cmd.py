@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from logs.digits import percent_above
 from uavctl.build import build_design, build_spec
 from uavctl.cli.common import Common, located, messages
 from uavctl.cli.prepare import ready_library
@@ -172,7 +173,7 @@ def _costs(result: VariantResult) -> str:
     spread = ", ".join(f"{std:.2f}" for std in result.settled_std)
     return (
         f"τ = {result.tau}: summed cost {result.mean_cost:.0f} ± {result.cost_stderr:.0f} (standard error), settled "
-        f"standard deviations {spread}, largest certified gap {result.largest_gap:.1e}"
+        f"standard deviations {spread}, largest certified gap {percent_above(result.largest_gap)} of the cost"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
@@ -33,10 +33,16 @@ def write_page(found: Identification, seen: Seen, source: str) -> str:
         *(
             f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {AHEAD_S:g} s is predicted."
             for one in result.response
+            if not _is_told(one.axis, result.warnings)
         ),
-        *result.warnings,
+        *(f"{warning}." for warning in result.warnings),
     ]
     return page("Identified plant and link", source, story, _sections(found, seen))
+
+
+def _is_told(axis: str, warnings: Sequence[str]) -> bool:
+    """Whether a warning says already how little of an axis' motion is predicted."""
+    return any(warning.startswith(f"{axis}: only ") for warning in warnings)
 
 
 def _sections(found: Identification, seen: Seen) -> Iterator[Section]:

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from logs.flight_data import FlightData
 from logs.page import Mark, Section, grid, page, table
+from logs.plots import DASHED, DOTTED, draw_limits
 from logs.summary import FlightSummary, rows
 from logs.svg import Drawing, canvas, colour
 from uavctl.whatif.compare import WhatIf
@@ -20,14 +21,19 @@ _NOT_FLOWN = ("Decision time", "Clock", "Tick lateness")  # of the computer, whi
 _MARKS = (
     Mark("line", RECORDED, "recorded"),
     Mark("line", MIGHT, "what-if"),
-    Mark("dashed", "target", "target"),
+    Mark("dotted", "target", "target"),
+    Mark("dashed", "limit", "limit"),
+    Mark("band", "limit", "reserve kept"),
 )
 _WORTH = (
     "The recorded flight flown again with nothing changed tells whether this version decides as the one that flew. "
     "How far the model goes wrong within a second is what the what-if column cannot know: the same happens to it, "
     "counted as disturbance."
 )
-_MOTION = "Positions, by the true states if they were recorded, else by the controllers' estimates."
+_MOTION = (
+    "Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits and the "
+    "band along them, the largest reserve that the plan of the moment kept, are those of the what-if."
+)
 _AGE = "Age of the newest position at each decision: a link that loses more, or later positions, is higher."
 
 
@@ -78,17 +84,20 @@ def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterato
     index = recorded.design.position_index
     axes = [_axis(recorded, other, place, name) for place, name in zip(index, recorded.design.axes, strict=True)]
     yield Section("Motion", _MOTION, grid(axes), _MARKS)
-    yield Section("Link", _AGE, grid([_ages(recorded, other)]), _MARKS[:2])
+    horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
+    yield Section("Link", _AGE, grid([_ages(recorded, other)]), (*_MARKS[:2], horizon))
 
 
 def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Drawing:
     with canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(name, "time [s]", "position [m]")
+        draw_limits(ax, other, place, 1.0)
         for flight, role in ((recorded, RECORDED), (other, MIGHT)):
             steps = flight.steps
             ax.plot(steps.t_s, steps.state[:, place], color=colour(role))
-        ax.plot(other.steps.t_s, other.steps.target[:, place], color=colour("target"), linestyle="--", linewidth=1.0)
-    return Drawing(f"motion-{name}", drawn.svg, f"position {name} of the recorded flight and of the other over time")
+        ax.plot(other.steps.t_s, other.steps.target[:, place], color=colour("target"), ls=DOTTED, lw=1.1)
+    label = f"position {name} of the recorded flight and of the other over time, against the limits of the other"
+    return Drawing(f"motion-{name}", drawn.svg, label)
 
 
 def _ages(recorded: FlightData, other: FlightData) -> Drawing:
@@ -98,4 +107,5 @@ def _ages(recorded: FlightData, other: FlightData) -> Drawing:
             steps = flight.steps
             ages = np.array([np.nan if d.age_steps is None else d.age_steps for d in steps.decisions])
             ax.plot(steps.t_s, ages, color=colour(role), drawstyle="steps-post")
-    return Drawing("ages", drawn.svg, "age of the newest position at each decision of both flights")
+        ax.axhline(other.design.horizon, color=colour("limit"), lw=1.2, ls=DASHED)
+    return Drawing("ages", drawn.svg, "age of the newest position at each decision of both flights, and the horizon")

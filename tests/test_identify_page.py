@@ -1,0 +1,101 @@
+"""The page of an identification says each thing once, and all that the terminal says."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uavctl.cli import identify_cmd
+from uavctl.config import load_config
+from uavctl.errors import DesignError
+from uavctl.identify.history import Asked, Seen
+from uavctl.identify.link_fit import fit_link
+from uavctl.identify.page import write_page
+from uavctl.identify.recorded import History
+from uavctl.identify.result import AxisResponse, Identification, Identified
+
+AXES = ("north", "east", "down")
+HARDLY = "down: only 26 % of the motion of the next second is predicted"
+
+
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the sentences at the page's head are read."""
+    monkeypatch.setattr("uavctl.identify.page._sections", lambda *_: iter(()))
+
+
+def seen() -> Seen:
+    times_s = np.arange(0.0, 20.0, 0.2)
+    return Seen(times_s, np.zeros(len(times_s)), np.zeros((len(times_s), 3)))
+
+
+def response(axis: str, r2: float) -> AxisResponse:
+    return AxisResponse(
+        axis=axis,
+        lag_s=0.25,
+        drag_1ps=0.0,
+        gain=1.0,
+        wind_std_mps2=0.1,
+        position_std_m=0.003,
+        lag_std_s=0.02,
+        drag_std_1ps=0.02,
+        gain_std=0.02,
+        dead_time_s=0.0,
+        dead_time_lag_s=0.25,
+        residual_std_m=0.01,
+        r2=r2,
+    )
+
+
+def found(*warnings: str) -> Identification:
+    """An identification whose last axis is hardly predicted."""
+    result = Identified(
+        flown_s=20.0,
+        positions=100,
+        plant={},
+        response=tuple(response(axis, r2) for axis, r2 in zip(AXES, (0.95, 0.9, 0.26), strict=True)),
+        residual_std=(0.01,) * 3,
+        r2=(0.95, 0.9, 0.26),
+        link={},
+        warnings=warnings,
+    )
+    return Identification(result, load_config("room"), fit_link(seen(), np.ones(99, dtype=np.int64)), ())
+
+
+def sentences(page: str) -> list[str]:
+    return [unescape(text) for text in re.findall(r"<li>(.*?)</li>", page)]
+
+
+def test_what_is_predicted_of_an_axis_is_said_once() -> None:
+    said = sentences(write_page(found(HARDLY), seen(), "flight"))
+    assert [sum(one.startswith(f"{axis}:") for one in said) for axis in AXES] == [1, 1, 1]
+    assert f"{HARDLY}." in said
+
+
+def test_another_warning_takes_no_axis_its_line() -> None:
+    uncertain = "down: the lag of 0.25 s is uncertain; fly more changes of direction"
+    said = sentences(write_page(found(uncertain), seen(), "flight"))
+    assert sum("of the motion of the next 1 s is predicted" in one for one in said) == 3
+    assert said.count(f"{uncertain}.") == 1
+
+
+def test_what_speaks_against_a_design_is_on_the_page_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*_: object) -> None:
+        raise DesignError("here", "the gain is too high", "take another")
+
+    asked = Asked(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
+    history = History(asked, seen(), np.zeros(0, dtype=np.int64))
+    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room")))
+    monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
+    monkeypatch.setattr(identify_cmd, "build_design", refused)
+    assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
+    said = sentences((tmp_path / "identified.html").read_text(encoding="utf-8"))
+    shown = " ".join(capsys.readouterr().out.split())
+    for text in (HARDLY, "the gain is too high"):
+        assert sum(text in one for one in said) == shown.count(text) == 1
