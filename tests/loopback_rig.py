@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeVar
+
+import msgspec
 
 from logs.flight_data import FlightData
 from sim.world import World
@@ -10,6 +13,7 @@ from uavctl.build import build_controller, build_design
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, Record, Sink
+from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design import Design
 from uavctl.smpc.design_record import design_record
@@ -35,13 +39,27 @@ def make_loop(config: Config, sink: Sink, design: Design | None = None, library:
     return ControlLoop(config, build_controller(config, design, library), sink, lambda: 0)
 
 
+def shared(config: Config, library: Library | None = None) -> tuple[Design, Controller]:
+    """Design and controller, made once for flights that differ in length and simulator alone.
+
+    A flight leaves nothing in its controller; a replay, which makes one of its own, would find out.
+    """
+    return _made(msgspec.structs.replace(config, sim=load_config("paper").sim, duration_s=1.0), library)
+
+
+@lru_cache(maxsize=8)
+def _made(config: Config, library: Library | None) -> tuple[Design, Controller]:
+    design = build_design(config)
+    return design, build_controller(config, design, library)
+
+
 def lockstep(name: str, duration_s: float, *overrides: str, library: Library | None = None) -> Memory:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
-    design = build_design(config)
+    design, controller = shared(config, library)
     memory = Memory()
     memory.put("/uavctl/header", 0, header(config, design))
-    loop = make_loop(config, memory, design, library)
+    loop = ControlLoop(config, controller, memory, lambda: 0)
     World(config, loop, on_truth=lambda truth: memory.put("/sim/truth", truth.at_ns, truth)).run(duration_s)
     return memory
 

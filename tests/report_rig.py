@@ -88,6 +88,14 @@ def unwritten() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def unpaged() -> Iterator[None]:
+    """Flights without a page, as fixture `no_page` has it, for what a module's tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uavctl.cli.flying.write_report", lambda *_: None)
+        yield
+
+
 def words_of(flight: FlightData) -> Walk:
     """The page without its figures."""
     with unwritten():

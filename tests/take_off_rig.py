@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from loopback_rig import Memory, header, make_loop
+from loopback_rig import Memory, header, shared
 from sim_rig import decode
 
 from sim.peers import Peers
 from sim.personality import PERSONALITIES
-from uavctl.build import build_design
 from uavctl.config import load_config
 from uavctl.data import Command, Datagram, Event, Order, Setpoint
+from uavctl.loop import ControlLoop
 from uavctl.mavlink.mode import State
 
 TICK_NS, SECOND = 50_000_000, 1_000_000_000
@@ -26,9 +26,9 @@ class Flight:
     def __init__(self, autopilot: str, *overrides: str) -> None:
         self.config = load_config("room", [*ON_THE_FLOOR, f"sim.autopilot={autopilot}", *overrides])
         self.memory = Memory()
-        design = build_design(self.config)
+        design, controller = shared(self.config)
         self.memory.put("/uavctl/header", 0, header(self.config, design))
-        self.loop = make_loop(self.config, self.memory, design)
+        self.loop = ControlLoop(self.config, controller, self.memory, lambda: 0)
         self.peers = Peers(self.config, 0, airborne=False)
         self.tick = 0
         self.hears: Callable[[bytes], bool] = lambda data: True  # whether the vehicle hears a datagram of ours

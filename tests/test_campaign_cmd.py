@@ -85,11 +85,11 @@ if __name__ == "__main__":
 """
 
 
-def started(spec: Path, folder: Path) -> subprocess.Popen[str]:
+def started(spec: Path, folder: Path, workers: int) -> subprocess.Popen[str]:
     """A campaign in a process group of its own that has kept one task, and goes on once nobody speaks to it."""
     script = folder.parent / "held.py"
     script.write_text(HELD, encoding="utf-8")
-    line = [sys.executable, str(script), "campaign", str(spec), "--workers", "2", "--out", str(folder)]
+    line = [sys.executable, str(script), "campaign", str(spec), "--workers", str(workers), "--out", str(folder)]
     pipe = subprocess.PIPE
     process = subprocess.Popen(line, start_new_session=True, text=True, stdin=pipe, stdout=pipe, stderr=pipe)
     assert process.stdout is not None and process.stdout.readline() == "kept\n"
@@ -128,7 +128,7 @@ def test_a_dask_cluster_gives_the_same(spec: Path, flown: Path, tmp_path: Path, 
 
 def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
-    process = started(spec, folder)
+    process = started(spec, folder, workers=1)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate(timeout=LIMIT_S)
     kept = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")}
@@ -142,7 +142,7 @@ def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, 
 
 def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> None:
     folder = tmp_path / "stopped"
-    process = started(spec, folder)
+    process = started(spec, folder, workers=2)
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1 and "interrupted" in told and "Traceback" not in told

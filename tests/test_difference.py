@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from loopback_rig import Memory, lockstep, make_loop
+from report_rig import unpaged
 
 from logs.difference import Places, leaves
 from logs.reader import records, segment_files
@@ -169,7 +170,8 @@ SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log.segm
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rotated")
-    assert run(["loopback", *SMALL, "--duration", "25", "--out", str(folder), "--json"]) == 0
+    with unpaged():
+        assert run(["loopback", *SMALL, "--duration", "25", "--out", str(folder), "--json"]) == 0
     assert len(segment_files(folder / "flight.mcap")) > 2
     return folder
 

@@ -43,6 +43,12 @@ def _library() -> None:
     library_for(build_design(load_config("room")))
 
 
+@pytest.fixture
+def control() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as folder:  # short: a socket's path has 107 bytes
+        yield folder
+
+
 def free_port() -> int:
     with socket.socket(type=socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
@@ -104,17 +110,16 @@ def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target
 
 @pytest.mark.fault(35)
 def test_a_second_daemon_is_refused_before_it_makes_anything(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, control: str
 ) -> None:
     monkeypatch.delattr("uavctl.cli.fly_cmd.build_design")
     url = f"udpin://127.0.0.1:{free_port()}"
-    with tempfile.TemporaryDirectory(prefix="uavctl-") as control:  # short: a socket's path has 107 bytes
-        words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
-        with sole_daemon(url):
-            assert run(words) == 1
-        assert "flies this vehicle already" in " ".join(capsys.readouterr().err.split())
-        with listening(Path(control), daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
-            assert run(words) == 1
+    words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
+    with sole_daemon(url):
+        assert run(words) == 1
+    assert "flies this vehicle already" in " ".join(capsys.readouterr().err.split())
+    with listening(Path(control), daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
+        assert run(words) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.rglob("*.mcap")) and not lock_path(url).exists()
 
@@ -158,17 +163,20 @@ def test_the_recording_replays_identically(flown: Flown) -> None:
     assert result.decisions > 200
 
 
-@pytest.mark.parametrize("options", [[], ["--duration", "0.2"]])
-def test_sigterm_and_a_duration_close_the_recording_even_when_nothing_was_heard(
-    tmp_path: Path, options: list[str]
-) -> None:
-    with daemon(free_port(), tmp_path, *options) as process:
-        if not options:
-            process.send_signal(signal.SIGTERM)
+def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
+    with daemon(free_port(), tmp_path) as process:
+        process.send_signal(signal.SIGTERM)
         process.communicate(timeout=LIMIT_S)
         assert process.returncode == 1  # ran, but flew nothing
-    decisions = list(records(tmp_path / "flight.mcap", Decision))
-    assert decisions[-1].mode is ControlMode.STOPPED
+    assert [*records(tmp_path / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_duration_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path, control: str) -> None:
+    url = f"udpin://127.0.0.1:{free_port()}"
+    places = ["--out", str(tmp_path / "flight"), "--control", control]
+    assert run(["fly", "--vehicle", url, "--mocap", url, "--duration", "0.2", *places]) == 1  # ran, but flew nothing
+    assert [*records(tmp_path / "flight" / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
 
 
 def test_the_pilot_engages_and_nobody_else(flown: Flown) -> None:
@@ -177,20 +185,24 @@ def test_the_pilot_engages_and_nobody_else(flown: Flown) -> None:
     assert hand_overs[0].startswith("waiting -> engaged")
 
 
-def test_without_room_on_the_disk_nothing_is_flown(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "uavctl", "fly", "--set", f"log.free_bytes={2**60}", "--out", str(tmp_path / "f")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT_S)
-    assert done.returncode == 1
-    assert "log.free_bytes" in done.stderr and "make room" in done.stderr
+def test_without_room_on_the_disk_nothing_is_flown(
+    tmp_path: Path, control: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = f"udpin://127.0.0.1:{free_port()}"
+    places = ["--out", str(tmp_path / "f"), "--control", control]
+    assert run(["fly", "--vehicle", url, "--mocap", url, "--set", f"log.free_bytes={2**60}", *places]) == 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert "log.free_bytes" in told and "make room" in told
     assert not list(tmp_path.rglob("*.mcap"))
 
 
-def test_a_port_in_use_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_a_port_in_use_is_refused_with_what_to_do(
+    tmp_path: Path, control: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{taken.getsockname()[1]}"
-        command = [sys.executable, "-m", "uavctl", "fly", "--vehicle", url, "--out", str(tmp_path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT_S)
-    assert done.returncode == 2
-    assert url in done.stderr and "Traceback" not in done.stderr
+        assert run(["fly", "--vehicle", url, "--out", str(tmp_path), "--control", control]) == 2
+    told = capsys.readouterr().err
+    assert url in told and "Traceback" not in told
     assert not list(tmp_path.iterdir())

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from hand_over_rig import ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, STAND_BY, TAKE_OFF, Rig
 from hand_over_rig import TICK_NS as RIG_TICK_NS
 from loopback_rig import Memory, make_loop
+from msgspec.structs import replace
 
 from logs.replay import replay
 from sim.peers import Peers

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from loopback_rig import lockstep, make_loop
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own
+from report_rig import unpaged
 
 from logs.chunks import Message
 from logs.info import info
@@ -37,7 +38,8 @@ LIBRARY = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flights") / "one"
-    assert run(["loopback", "--config", "paper", "--duration", "12", "--seed", "3", "--out", str(out), "--json"]) == 0
+    with unpaged():
+        assert run(["loopback", "--config", "paper", "--duration", "12", "--seed", "3", "--out", str(out)]) == 0
     return out / "flight.mcap"
 
 
@@ -177,6 +179,7 @@ def test_a_recorded_library_that_does_not_fit_is_told(
         assert words in told and "the version that recorded it" in told
 
 
+@pytest.mark.usefixtures("no_page")
 def test_without_the_method_no_library_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--config", "paper", "--duration", "4", "--set", "solver.method=exact", "--out", str(tmp_path / "f"))
     document(capsys, "loopback", *options)

@@ -138,7 +138,7 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     assert air.tap.spoken_by_now() == spoken
 
 
-def test_the_service_manager_hears_of_the_flight_from_its_ticks(air: Scene) -> None:
+def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
@@ -154,30 +154,23 @@ def test_the_service_manager_hears_of_the_flight_from_its_ticks(air: Scene) -> N
 
         with ended(air.fly("f", environ=environ)) as process:
             hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in one for one in heard))
+            process.send_signal(signal.SIGSTOP)
+            manager.settimeout(1.0)
+            with pytest.raises(TimeoutError):
+                for _ in range(100):  # what was on its way
+                    manager.recv(4096)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", 0.5)
+                code, _, hanging = air.ctl("hold")
+            assert code == 1 and "the control loop may hang" in hanging
+            process.send_signal(signal.SIGCONT)
+            manager.settimeout(LIMIT_S)
             process.send_signal(signal.SIGINT)
             hear(lambda: heard[-1] == "STOPPING=1")
             _, told = process.communicate(timeout=LIMIT_S)
     assert heard[0] == "READY=1"
     lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
     assert lines[0] in told  # the health line of a daemon without a terminal
-
-
-def test_a_hanging_loop_gives_no_sign_of_life(air: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", 0.5)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(air.folder / "notify"))
-        manager.settimeout(LIMIT_S)
-        environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
-        with ended(air.fly("f", environ=environ)) as process:
-            while manager.recv(4096) != b"WATCHDOG=1":
-                pass
-            process.send_signal(signal.SIGSTOP)
-            manager.settimeout(1.0)
-            with pytest.raises(TimeoutError):
-                for _ in range(100):  # what was on its way
-                    manager.recv(4096)
-            code, _, told = air.ctl("hold")
-            assert code == 1 and "the control loop may hang" in told
 
 
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import msgspec
@@ -40,9 +43,18 @@ DEPTH = Depth(
 )
 
 
-def test_the_document_has_every_figure_and_both_designs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(["paper", "--runs", "5", "--json", "--out", str(tmp_path / "new" / "folder")]) == 0
-    found = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The document of five runs."""
+    out = io.StringIO()
+    with redirect_stdout(out):
+        folder = tmp_path_factory.mktemp("paper") / "new" / "folder"
+        assert command(["paper", "--runs", "5", "--json", "--out", str(folder)]) == 0
+    told: dict[str, Any] = json.loads(out.getvalue())
+    return told
+
+
+def test_the_document_has_every_figure_and_both_designs(found: dict[str, Any]) -> None:
     assert found.keys() >= WANTED
     assert [variant["tau"] for variant in found["variants"]] == [4, 3]
     printed = found["variants"][0]
@@ -55,9 +67,8 @@ def test_the_document_has_every_figure_and_both_designs(tmp_path: Path, capsys: 
         assert ElementTree.parse(name).getroot().tag.endswith("svg")
 
 
-def test_both_designs_meet_the_same_losses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command(["paper", "--runs", "5", "--json", "--out", str(tmp_path)])
-    four, three = json.loads(capsys.readouterr().out)["variants"]
+def test_both_designs_meet_the_same_losses(found: dict[str, Any]) -> None:
+    four, three = found["variants"]
     assert four["age_distribution"] == three["age_distribution"]
     assert four["mean_cost"] != three["mean_cost"]
     assert four["mean_cost"] == pytest.approx(three["mean_cost"], rel=0.01)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from loopback_rig import Memory, flight, lockstep
 from sim_rig import ARM, TAKE_OFF, Bench
+from soak_mission import LINK
 from udp_rig import assert_in_order, fly_over_udp
 
 from logs.reader import records
@@ -24,20 +25,17 @@ from uavctl.errors import ConfigError
 
 QUADROTOR = "sim.plant=quadrotor"
 GUSTS = ["sim.wind.velocity_mps=[0.4, 0.5, 0.0]", "sim.wind.gust_wind_mps=3.0"]
-ROUGH = [
-    "link.delay_s=0.02", "link.jitter_s=0.1", "link.model=gilbert-elliott", "link.loss=0.05",
-    "link.burst_enter=0.08", "link.burst_leave=0.5", "link.burst_loss=0.9", "solver.method=exact",  # no library to grow
-]  # fmt: skip
 
 # High above the floor, on which it would land if the machine stood still while it was told to go down.
 HIGH = [
     "sets.state_lower=[-3.0, -1.5, -inf, -2.5, -1.5, -inf, -100.0, -1.0, -inf]",
     "sim.start_position_m=[-2.4, -1.9, -50.0]", "target.position_m=[1.5, 1.0, -50.5]",
+    "solver.method=exact",  # no library to grow
 ]  # fmt: skip
 
 
 def rough(autopilot: str, seconds: float, *more: str) -> Memory:
-    return lockstep("room", seconds, QUADROTOR, *GUSTS, *ROUGH, f"sim.autopilot={autopilot}", *more)
+    return lockstep("room", seconds, QUADROTOR, *GUSTS, *LINK, f"sim.autopilot={autopilot}", *more)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -58,7 +56,7 @@ def test_preset_room_flies_it_with_gusts_bursts_and_delay_bit_for_bit(autopilot:
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
 def test_over_udp_preset_room_flies_it_in_real_time(autopilot: str, mode: str, tmp_path: Path) -> None:
-    settings = [QUADROTOR, *GUSTS, *ROUGH, *HIGH, f"sim.autopilot={autopilot}"]
+    settings = [QUADROTOR, *GUSTS, *LINK, *HIGH, f"sim.autopilot={autopilot}"]
     more = [word for setting in settings for word in ("--set", setting)]
 
     def on_its_way(truths: list[Truth]) -> bool:

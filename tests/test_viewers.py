@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from report_rig import unpaged
 from rerun.chunk import McapReader
 from view_rig import protobuf
 
@@ -39,7 +40,8 @@ DRAWN = {
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("viewers")
     # What `make fly` types, but for its length.
-    assert run(["loopback", "--udp", "--config", "room", "--duration", "8", "--out", str(out), "--json"]) == 0
+    with unpaged():
+        assert run(["loopback", "--udp", "--config", "room", "--duration", "8", "--out", str(out), "--json"]) == 0
     return out / "flight.mcap"
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from report_rig import unpaged, unwritten
 
 from logs.reader import header
 from uavctl.cli.app import run
@@ -26,11 +28,17 @@ def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
-    assert (
-        run(["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)])
-        == 0
-    )
+    words = ["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)]
+    with unpaged():
+        assert run(words) == 0
     return folder / "flight.mcap"
+
+
+@pytest.fixture
+def no_figures() -> Iterator[None]:
+    """For flights whose pages nobody reads."""
+    with unpaged(), unwritten():
+        yield
 
 
 def document(capsys: pytest.CaptureFixture[str], flown: Path, out: Path, *more: str) -> dict[str, Any]:
@@ -40,6 +48,7 @@ def document(capsys: pytest.CaptureFixture[str], flown: Path, out: Path, *more: 
     return found
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_nothing_changed_reproduces_the_flight(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, flown, tmp_path)
     assert found["reproduction"] == {"identical": True, "decisions": 200, "largest_state": 0.0, "largest_input": 0.0}
@@ -64,6 +73,7 @@ def test_another_cost_is_recorded_reported_and_replays(
     assert code == 0 and json.loads(text)["identical"]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_people_get_the_worth_of_it_first_and_then_the_figures(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,6 +87,7 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
     assert "lqg" in text and "Decision time" not in text
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_the_design_may_believe_in_another_link_than_the_one_flown(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,6 +102,7 @@ def test_the_design_may_believe_in_another_link_than_the_one_flown(
     assert found["what_if"]["lost"] > 10 and found["what_if"]["max_age"] > found["recorded"]["max_age"]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = load_config("paper", ["plant.b=[[0.25, 0.0], [0.45, 0.0], [0.0, 0.25], [0.0, 0.45]]"])
     model = tmp_path / "identified.toml"
@@ -142,6 +154,7 @@ def test_other_files_are_told(flown: Path, tmp_path: Path, capsys: pytest.Captur
     assert code in (1, 2) and str(text) in " ".join(errors.split())
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_torn_recording_is_flown_to_its_end(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     torn = tmp_path / "torn.mcap"
     data = flown.read_bytes()

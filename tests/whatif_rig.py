@@ -5,10 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from loopback_rig import Memory, header, lockstep
+from loopback_rig import Memory, header, lockstep, shared
 
 from sim.vehicle import linear_model
-from uavctl.build import build_controller, build_design
 from uavctl.config import Config, load_config
 from uavctl.data import Record, Truth
 from uavctl.whatif.fly import Course, OtherLink, fly
@@ -42,9 +41,10 @@ def history(case: Case) -> History:
 
 def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, Course]:
     config, memory = config_of(case, *changes), Memory()
-    memory.put("/uavctl/header", 0, header(config, build_design(config)))
+    design, controller = shared(config)
+    memory.put("/uavctl/header", 0, header(config, design))
     model = linear_model(config_of(case).plant)
-    course = fly(history(case), config, build_controller(config), model, memory, lambda: 0, other)
+    course = fly(history(case), config, controller, model, memory, lambda: 0, other)
     return memory, course
 
 

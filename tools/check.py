@@ -28,7 +28,9 @@ PAGES = {
     ROOT / "docs" / "hand-over.md": hand_over_page,
 }
 BIN = Path(sys.executable).parent
-_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # two test processes on two cores
+# Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
+# bytecode were kept.
+_PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 class StageError(Exception):
@@ -51,7 +53,7 @@ def run(command: Sequence[str | Path], *, cwd: Path = ROOT, extra: Mapping[str, 
     done = subprocess.run(
         words,
         cwd=cwd,
-        env={**os.environ, **_THREADS, **(extra or {})},
+        env={**os.environ, **_PROCESSES, **(extra or {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -95,7 +97,7 @@ def check_tests(cache: str) -> None:
     A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_THREADS, "UAVCTL_CACHE": cache}, check=False)
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": cache}, check=False)
     if done.returncode != 0:
         raise StageError(f"pytest: exit code {done.returncode}")
 
