@@ -59,6 +59,7 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
         ("sim", "uavctl.smpc", "The simulator knows nothing of the controller"),
         ("sim", "uavctl.loop", "The simulator knows nothing of the controller"),
         ("uavctl.daemon", "logs", "The daemon sees a sink, never the recordings"),
+        ("uavctl.cli.replaying", "logs.report", "A replay does not wait for what draws pages"),
     ],
 )
 def test_one_planted_import_breaks_its_contract(
