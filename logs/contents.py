@@ -72,15 +72,13 @@ class Contents:
             else:
                 at = self._define(content, at, channels)
 
-    def records(self, content: bytes, offset: int, order: Order) -> list[Message]:
+    def records(self, content: bytes, offset: int, order: Order) -> Iterator[Message]:
         """The same without those for viewers, which are half of a recording: what a replay's time goes to.
 
         Raises:
             RecordingError: a message is missing.
         """
         channels: dict[int, Definition] = {}
-        found: list[Message] = []
-        following = order.following
         at = 0
         size = len(content)
         while at < size:
@@ -88,16 +86,13 @@ class Contents:
                 at = self._define(content, at, channels)
                 continue
             _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-            if sequence != following and following is not None:
-                order.following = following
+            if sequence != order.following and order.following is not None:
                 raise order.broken(sequence)
-            following = sequence + 1
+            order.following = sequence + 1
             begin, at = at + _MESSAGE.size, at + _RECORD.size + length
             definition = channels[channel]
             if not definition.for_viewers:
-                found.append(Message(definition, sequence, at_ns, content[begin:at], offset))
-        order.following = following
-        return found
+                yield Message(definition, sequence, at_ns, content[begin:at], offset)
 
     def _define(self, content: bytes, at: int, channels: dict[int, Definition]) -> int:
         """Take a channel or schema; the place after it."""

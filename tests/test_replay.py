@@ -17,6 +17,7 @@ from logs.tlog import read_tlog
 from logs.topics import raw_link
 from uavctl.config import load_config
 from uavctl.data import Datagram, Decision, Event, Plan, Setpoint, StepInput
+from uavctl.errors import RecordingError
 from uavctl.loop import VEHICLE
 
 DATA = Path(__file__).parent / "data"
@@ -68,6 +69,12 @@ def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_a
     result = replayed(changed)
     assert result.first_difference is not None and result.first_difference.field == "fresh"
     assert (result.decisions, result.compared, result.decisions_differing) == (whole.decisions, whole.compared, 1)
+
+
+def test_a_topic_that_nobody_knows_is_told(flown: Memory) -> None:
+    written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
+    with pytest.raises(RecordingError, match="topic /uavctl/later is not known to this version"):
+        replay([*written, ("/uavctl/later", 7, b"{}")], lambda sink: make_loop(load_config("paper"), sink))
 
 
 def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory) -> None:
