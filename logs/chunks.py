@@ -19,7 +19,7 @@ from logs.contents import Contents, Message, Order
 from logs.segment import MAGIC
 from uavctl.errors import RecordingError
 
-__all__ = ["Damage", "End", "Message", "Order", "is_finished", "scan"]
+__all__ = ["Damage", "End", "Message", "Order", "last_chunk", "scan"]
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
@@ -27,6 +27,7 @@ _CHUNK_FIELDS = _CHUNK.size - _RECORD.size
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
+_CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
 _IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
 
 
@@ -84,8 +85,11 @@ def scan(path: Path, order: Order | None = None) -> Iterator[Message | Damage | 
         raise RecordingError(f"{path}: {error.strerror}") from error
 
 
-def is_finished(path: Path) -> bool:
-    """Whether a file ends with an index and footer that are whole; its chunks are not looked at.
+def last_chunk(path: Path) -> list[Message] | None:
+    """Messages of a file's last chunk as its index tells; the others are not looked at.
+
+    Returns:
+        None if the file does not end with an index and footer that are whole; nothing if the chunk is not.
 
     Raises:
         RecordingError: the file cannot be read.
@@ -93,11 +97,25 @@ def is_finished(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             if path.stat().st_size == 0:
-                return False
+                return None
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                return _data_end(data) is not None
+                end = _data_end(data)
+                return None if end is None else _last_chunk(data, end + _DATA_END.size)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def _last_chunk(data: Buffer, at: int) -> list[Message]:
+    """The same, by the summary at `at`, whose checksum is right."""
+    offset = length = 0
+    while data[at] != Opcode.FOOTER:
+        if data[at] == Opcode.CHUNK_INDEX:
+            *_, offset, length = _CHUNK_INDEX.unpack_from(data, at)
+        at += _RECORD.size + _RECORD.unpack_from(data, at)[1]
+    try:
+        return list(Contents().messages(_chunk(data, offset, length), offset)) if length else []
+    except _BadRecordError:
+        return []
 
 
 def _scan(path: Path, data: Buffer, order: Order | None) -> Iterator[Message | Damage | End]:

@@ -18,7 +18,7 @@ from logs.disk import OutputFile, RoomWatch, later_segments
 from logs.encoding import encode, encode_message
 from logs.onlookers import Onlookers
 from logs.rotation import Rotation
-from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote
+from logs.topics import GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote
 from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Record
 from uavctl.errors import RecordingError
@@ -169,7 +169,7 @@ class Journal:
         waits = bool(self.queue or self.views_due or files.unwritten)
         if waits and files.is_full:
             files.because = f"goes on after {files.name}"
-            self._finish_file("goes on in the next file")
+            self._finish_file(GOES_ON)
         if files.is_open:
             return True
         if not waits or not files.may_begin or (self._room.resting and not self.closed):

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from logs.chunks import Damage, End, Message, Order, is_finished, scan
+from logs.chunks import Damage, End, Message, Order, last_chunk, scan
 from logs.disk import later_segments
 from logs.encoding import decode
-from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote, record_type
+from logs.topics import GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote, record_type
 from uavctl.data import Header, Record
 from uavctl.errors import RecordingError
 
@@ -70,12 +70,41 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
 
 
 def finished(path: Path) -> bool:
-    """Whether every file of a recording was closed in order.
+    """Whether every file of a recording was closed in order, and none is missing after the last.
 
     Raises:
         RecordingError: there is no such recording.
     """
-    return all(map(is_finished, segment_files(path)))
+    return not lacks_end(path)
+
+
+def lacks_end(path: Path) -> str:
+    """Why a recording's end is not there, in words; nothing if it is.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    files = segment_files(path)
+    if any(last_chunk(file) is None for file in files):
+        return "the recording is torn"
+    note = last_note(path)
+    if note is None or note.text != GOES_ON:
+        return ""
+    return f"the recording goes on after {files[-1].name}, in a file that is missing"
+
+
+def last_note(path: Path) -> RecorderNote | None:
+    """What the recorder, or who restored the recording, said last; None where a file was not closed in order.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    for message in reversed(last_chunk(segment_files(path)[-1]) or []):
+        if message.definition.topic == RECORDER:
+            note = decode(RECORDER, message.data, message.at_ns)
+            assert isinstance(note, RecorderNote)  # the topic's type
+            return note
+    return None
 
 
 def records(path: Path, kind: type[R]) -> Iterator[R]:

@@ -12,7 +12,7 @@ from logs.disk import DiskFile
 from logs.encoding import encode
 from logs.reader import walk
 from logs.segment import Entry, Segment
-from logs.topics import RECORDER, RecorderNote, definition
+from logs.topics import RECORDER, RECOVERED, RecorderNote, definition
 from uavctl.errors import RecordingError
 
 CHUNK_BYTES = 16384
@@ -140,5 +140,5 @@ def _note(src: Path, result: RecoverResult, at_ns: int) -> RecorderNote:
         dropped=0,
         refused=0,
         failures=0,
-        text=f"recovered from {src.name}: {result.messages_lost} messages and {result.lost_bytes} bytes lost",
+        text=f"{RECOVERED}{src.name}: {result.messages_lost} messages and {result.lost_bytes} bytes lost",
     )

@@ -38,6 +38,8 @@ from uavctl.data import (
 HEADER = "/uavctl/header"
 LIBRARY = "/uavctl/library"
 RECORDER = "/uavctl/recorder"
+GOES_ON = "goes on in the next file"  # what the recorder notes last in a file that was full
+RECOVERED = "recovered from "  # how what a recovery notes last begins, where something was lost
 
 
 class RecorderNote(Record, frozen=True, kw_only=True):

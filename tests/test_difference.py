@@ -13,7 +13,7 @@ from loopback_rig import Memory, lockstep, make_loop
 from report_rig import unpaged
 
 from logs.difference import Places, leaves
-from logs.reader import records, segment_files
+from logs.reader import finished, records, segment_files
 from logs.replay import MAKERS, ReplayResult, replay
 from uavctl.build import build_plant
 from uavctl.cli.app import run
@@ -204,6 +204,39 @@ def test_a_recording_without_its_first_file_is_refused(
         (tmp_path / file.name).write_bytes(file.read_bytes())
     assert run(["log", "replay", str(tmp_path / "flight.mcap")]) == 1
     assert "is missing, and a recording can be replayed from its beginning only" in capsys.readouterr().err
+
+
+def test_a_recording_without_its_last_file_is_alike_up_to_there_and_says_so(
+    rotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = tmp_path / "flight.mcap"
+    for file in segment_files(rotated / "flight.mcap")[:-1]:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    last = segment_files(flight)[-1].name
+    assert not finished(flight) and finished(rotated / "flight.mcap")
+    assert run(["log", "replay", str(flight), "--json"]) == 0
+    told = capsys.readouterr()
+    assert 100 < json.loads(told.out)["decisions"] < 250
+    assert f"the recording goes on after {last}, in a file that is missing: compared up to there\n" in told.err
+
+
+def test_a_hole_in_a_recovered_recording_is_told(
+    rotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray((rotated / "flight.mcap").read_bytes())
+    data[data.index(b"/uavctl/decision", len(data) // 2)] ^= 1
+    (tmp_path / "flight.mcap").write_bytes(data)
+    for file in segment_files(rotated / "flight.mcap")[1:]:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    whole = tmp_path / "whole.mcap"
+    assert run(["log", "recover", str(tmp_path / "flight.mcap"), str(whole)]) == 3
+    capsys.readouterr()
+    assert run(["log", "replay", str(whole)]) == 1
+    told = capsys.readouterr()
+    assert "recovered from flight.mcap: " in told.err
+    assert ": where messages are missing, what came after cannot be compared\n" in told.err
+    for heading in ("from [s]", "at [s]"):
+        assert heading in told.out
 
 
 def test_a_changed_configuration_is_shown_with_what_it_changes(

@@ -234,5 +234,9 @@ def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: p
         assert abs(one["lag_s"] - 0.28) < 4.0 * one["lag_std_s"]
     page = Path(told["report"]).read_text(encoding="utf-8")
     assert page.count("<svg") == 11
+    assert run(["identify", str(tmp_path / "flight.mcap")]) == 0
+    told_in_words = capsys.readouterr().out
+    for heading in ("lag [s]", "drag [1/s]", "wind [m/s²]", "residual [mm]"):
+        assert heading in told_in_words
     assert run(["identify", str(tmp_path / "flight.mcap"), "--config", "paper"]) == 2
     assert run(["identify", str(tmp_path / "nothing.mcap")]) == 1

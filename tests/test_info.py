@@ -242,4 +242,4 @@ def test_the_page_of_a_torn_recording_that_lost_records_comes_with_a_warning(
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(path.read_bytes()[:-3000])
     assert run(["log", "report", str(torn)]) == 0
-    assert capsys.readouterr().err == "the recording is torn: shown up to its end\n"
+    assert capsys.readouterr().err == "the recording is torn: shown up to there\n"

@@ -16,7 +16,7 @@ from rich.text import Text
 from logs.chunks import Message
 from logs.export import Exported, TableFormat, Watch, export_tables
 from logs.export_tlog import ExportedTlog, export_tlog
-from logs.reader import finished
+from logs.reader import lacks_end
 from logs.summary import count
 from uavctl.cli.common import Common, messages, warn
 from uavctl.errors import UsageError
@@ -52,8 +52,8 @@ def export(
         Common(json=json).show(exported, lambda: _tables_picture(exported, folder))
         for topic, number in exported.unknown.items():
             warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
-    if not finished(flight):
-        warn("the recording is torn: exported up to its end")
+    if cut := lacks_end(flight):
+        warn(f"{cut}: exported up to there")
     return 0
 
 

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from logs.outputs import spare_recording, write_whole
-from logs.reader import header, read
+from logs.reader import header, lacks_end, read
 from logs.tlog import read_tlog
 from uavctl.build import build_design
 from uavctl.cli.common import DEFAULTS, Common, messages, warn
@@ -72,6 +72,8 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config
+    if cut := lacks_end(flight):
+        warn(f"{cut}: identified from what comes before")
     return from_records(read(flight), config), config
 
 
@@ -105,7 +107,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
         "residual [mm]",
         "R²",
     ):
-        plant.add_column(column, justify="left" if column == "axis" else "right")
+        plant.add_column(escape(column), justify="left" if column == "axis" else "right")
     for one in result.response:
         plant.add_row(
             one.axis,

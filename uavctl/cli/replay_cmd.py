@@ -56,8 +56,10 @@ def replay(
     if result.dropped:
         text = f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
         warn(text)
-    if not replayed.finished:
-        warn("the recording is torn: compared up to its end")
+    if replayed.recovered:
+        warn(f"{replayed.recovered}: where messages are missing, what came after cannot be compared")
+    if replayed.lacks_end:
+        warn(f"{replayed.lacks_end}: compared up to there")
     document = {
         **msgspec.structs.asdict(result),
         "changed": replayed.changed,

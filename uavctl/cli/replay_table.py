@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from logs.difference import Chosen, Context, Course, Difference
+from uavctl.cli.common import two_columns
 from uavctl.cli.replaying import Replayed
 
 MOST_FIELDS = 12
@@ -26,7 +27,7 @@ def replay_table(replayed: Replayed) -> RenderableType:
     ]
     first = result.first_difference
     if first is None:
-        return _two_columns("Replay", rows)
+        return two_columns("Replay", rows)
     rows += _difference("first difference", first)
     if first.stage:
         rows.append(("in question", first.stage))
@@ -41,7 +42,7 @@ def replay_table(replayed: Replayed) -> RenderableType:
         rows.append(("decisions that differ", f"{result.decisions_differing} of {since} from then on"))
         if decision != first:
             rows += _difference("the first of them", decision)
-    return Group(_two_columns("Replay", rows), _course(result.course))
+    return Group(two_columns("Replay", rows), _course(result.course))
 
 
 def _difference(title: str, one: Difference) -> Iterator[tuple[str, object]]:
@@ -92,7 +93,7 @@ def _course(course: tuple[Course, ...]) -> Table:
         title += f" ({MOST_FIELDS} of {len(course)} fields, all with --json)"
     table = Table("field", title=title, title_justify="left")
     for name in ("from [s]", "records that differ", "largest", "at [s]"):
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right")
     for one in course[:MOST_FIELDS]:
         unit = f" {one.unit}" if one.unit else ""
         entry = f" ({one.entry})" if one.entry else ""
@@ -100,16 +101,9 @@ def _course(course: tuple[Course, ...]) -> Table:
             escape(f"{one.topic} {one.field or '(a record on one side only)'}"),
             f"{one.first_s:.3f}",
             f"{one.differing} of {one.records}",
-            "-" if one.largest is None else f"{one.largest:.3g}{unit}{entry}",
+            "-" if one.largest is None else escape(f"{one.largest:.3g}{unit}{entry}"),
             "-" if one.largest_s is None else f"{one.largest_s:.3f}",
         )
-    return table
-
-
-def _two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
-    table = Table(title=title, show_header=False, title_justify="left")
-    for name, value in rows:
-        table.add_row(escape(name), escape(str(value)))
     return table
 
 

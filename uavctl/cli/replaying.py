@@ -9,11 +9,11 @@ from pathlib import Path
 import msgspec
 
 from logs.foreign import is_foreign, read_mcap
-from logs.reader import finished, good_messages, header, records
+from logs.reader import good_messages, header, lacks_end, last_note, records
 from logs.replay import MAKERS, ReplayResult
 from logs.replay import replay as replay_recording
 from logs.tlog import TlogPacket, read_tlog
-from logs.topics import RecorderNote
+from logs.topics import RECOVERED, RecorderNote
 from uavctl.cli.common import messages, warn
 from uavctl.cli.provenance import cpu, versions
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
@@ -37,13 +37,15 @@ class Replayed:
 
     Attributes:
         result: What it found.
-        finished: Whether the recording was closed in order.
+        lacks_end: Why the recording's end is not there, in words; nothing if it is.
+        recovered: From what, and what was lost, in words; nothing if all is there.
         changed: What was asked to be different.
         other_versions: What decides the last bits, and is not here what the recording was made with.
     """
 
     result: ReplayResult
-    finished: bool
+    lacks_end: str
+    recovered: str
     changed: tuple[Changed, ...]
     other_versions: tuple[str, ...]
 
@@ -77,15 +79,16 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         config = loaded.config
     else:
         controller, changed = recorded_flyer(flight, config).controller, ()
-    whole = finished(flight)
+    cut, note = lacks_end(flight), last_note(flight)
+    recovered = note.text if note is not None and note.text.startswith(RECOVERED) else ""
     result = replay_recording(
         ((one.definition.topic, one.at_ns, one.data) for one in good_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
-        finished=whole,
+        finished=not cut and not recovered,
         ignored=MAKERS if overrides else frozenset(),
     )
-    return Replayed(result, whole, changed, tuple(other_versions(recorded)))
+    return Replayed(result, cut, recovered, changed, tuple(other_versions(recorded)))
 
 
 def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from logs.flight_data import FlightData
 from logs.outputs import spare_recording, write_whole
-from logs.reader import finished, read
+from logs.reader import lacks_end, read
 from logs.report import picture, write_report
 from logs.report_verdicts import verdict_rows
 from logs.summary import render, summarise
@@ -37,8 +37,8 @@ def report(
     if svg is not None:
         write_whole(svg, picture(data))
     write_report(data, summary, page, judged)
-    if not finished(flight):
-        warn("the recording is torn: shown up to its end")
+    if cut := lacks_end(flight):
+        warn(f"{cut}: shown up to there")
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
     Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
     return 0

@@ -22,7 +22,7 @@ from logs.foreign import is_foreign
 from logs.journal import RecorderStatus
 from logs.onlookers import Onlookers
 from logs.outputs import write_whole
-from logs.reader import finished, header, read
+from logs.reader import header, lacks_end, read
 from logs.recorder import SyncRecorder
 from logs.summary import count, summarise
 from logs.topics import HEADER, RecorderNote
@@ -150,8 +150,8 @@ def _warn(flight: Path, recorded: Header, history: History) -> None:
     lost = max((one.dropped + one.refused for _, _, one in history.entries if isinstance(one, RecorderNote)), default=0)
     if lost:
         texts.append(f"{count(lost, 'record')} missing in the recording")
-    if not finished(flight):
-        texts.append("the recording is torn: flown up to its end")
+    if cut := lacks_end(flight):
+        texts.append(f"{cut}: flown up to there")
     for text in texts:
         warn(text)
 
