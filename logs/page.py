@@ -51,6 +51,11 @@ details .card{border:0;padding:0;margin-top:.4rem}
 summary{cursor:pointer;font-weight:600}
 pre{overflow-x:auto;font:.8125rem/1.5 ui-monospace,Menlo,Consolas,monospace}
 .narrow{display:none}
+@media (min-width:44.01rem),print{
+.dense{font-size:.78rem}
+.dense th,.dense td{padding-right:.45rem;overflow-wrap:break-word}
+.dense td:first-child:not(.number),.dense td:last-child:not(.number){min-width:0}
+.dense .number{white-space:normal}}
 @media (max-width:44rem){
 main{padding:1.25rem .75rem 2rem}
 .grid{grid-template-columns:minmax(0,1fr)}
@@ -72,6 +77,7 @@ text-align:right;white-space:normal}
 h2,.note,.legend{break-after:avoid}.note,.legend,tr{break-inside:avoid}.grid{break-before:avoid}
 details::details-content{content-visibility:visible;block-size:auto}
 .many{font-size:.82em;min-width:0!important}.many th,.many td{padding-right:.5rem}
+.card{overflow:visible}.dense{font-size:.56rem}.dense th,.dense td{padding-right:.25rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;columns:2;column-gap:2rem}
 figure,.card,details{border-color:#ccc}}
 """

@@ -145,7 +145,7 @@ def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> No
     process = started(spec, folder, workers=2)
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 1 and "interrupted" in told and "Traceback" not in told
+    assert process.returncode == 130 and "interrupted" in told and "Traceback" not in told
     assert told.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
     assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
 
@@ -157,7 +157,7 @@ def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(campaign_cmd, "cells_of", interrupted)
-    assert run(["campaign", str(spec), "--out", str(tmp_path / "none")]) == 1
+    assert run(["campaign", str(spec), "--out", str(tmp_path / "none")]) == 130
     assert "interrupted before the first run" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 

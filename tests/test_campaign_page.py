@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,15 @@ import numpy as np
 import pytest
 from campaign_results import cell, runs, write
 
+from uavctl.campaign.intervals import Difference
+from uavctl.campaign.legend import legend
 from uavctl.campaign.page import write_report
+from uavctl.campaign.plots import Looks
 from uavctl.campaign.results import read_results
 from uavctl.campaign.statistics import summarise
+from uavctl.campaign.story import story
 from uavctl.campaign.verdict import Verdict, brief, grouped, in_words, verdicts, word_of
+from uavctl.campaign.view import View
 from uavctl.errors import UavctlError
 
 N = 60
@@ -85,6 +91,44 @@ def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(t
 def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
     assert in_words(found)[0].endswith("(states 5 %, inputs 10 %): its caution is what costs.")
+
+
+def test_a_rate_above_the_allowance_is_never_told_as_within_it(tmp_path: Path) -> None:
+    # 3 runs with 14 of 50 steps on average; every interval reaches below 10 %.
+    rows = runs(1, (SMPC[:3] * 0.9).tolist(), input_violations=[42, 0, 0])
+    found = judged(tmp_path, rows, runs(0, SMPC[:3].tolist()))
+    one = found.comparisons[0]
+    rate, interval = one.baseline.input_violation_rate, one.baseline.input_violation_ci
+    assert rate is not None and interval is not None and interval[0] <= 0.1 < rate
+    safer = replace(one, inputs=Difference(mean=-rate, low=-rate, high=-rate, runs=3))
+    (sentence,) = in_words(replace(found, comparisons=(safer,)))
+    assert sentence.endswith(
+        "inputs in 28 % of steps (SMPC 0 %). That is more than the 10 % allowed for inputs, which may still be chance "
+        "at so few runs."
+    )
+
+
+def test_a_rate_at_the_allowance_is_within_it(tmp_path: Path) -> None:
+    cells = [cell(0, "ours", "smpc", promised_u=1.0 - 0.9), cell(1, "theirs")]  # below 0.1 by rounding
+    rows = [*runs(0, SMPC.tolist()), *runs(1, (SMPC * 0.9).tolist(), input_violations=[10, 0] * (N // 2))]
+    results = read_results(write(tmp_path, cells, rows))
+    (found,) = verdicts(results, grouped(summarise(tmp_path)))
+    (sentence,) = in_words(found)
+    assert "inputs in 10 % of steps" in sentence and sentence.endswith("its caution is what costs.")
+
+
+@pytest.mark.parametrize(
+    ("hits", "said"),
+    [
+        ([2, 2, 2], "None of the 1 cell with a promise broke state limits more often than it allows."),
+        ([30, 0, 0], "1 cell of 1 broke state limits more often than the design allows, which may still be chance"),
+        ([30] * 60, "1 cell of 1 broke state limits more often than the design allows. The most was 60 %"),
+    ],
+)
+def test_the_promise_is_told_by_what_was_measured(hits: list[int], said: str, tmp_path: Path) -> None:
+    rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
+    folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
+    assert said in " ".join(story(View.of(read_results(folder))))
 
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
@@ -193,3 +237,27 @@ def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (folder / "report.html").mkdir()
     with pytest.raises(UavctlError, match="cannot be written"):
         write_report(folder)
+
+
+def test_the_reason_of_a_refused_cell_is_a_row_over_all_columns(grid: Path) -> None:
+    html = (grid / "report.html").read_text(encoding="utf-8")
+    assert html.count('<tr><td colspan="13">2 far: no design; tau: nothing is fast enough</td></tr>') == 1
+    assert "min-width:97" not in html  # no table is set wider than the paper
+
+
+def test_numbers_below_the_axis_of_differences_do_not_touch(tmp_path: Path) -> None:
+    rows = [*runs(0, SMPC.tolist()), *runs(1, (SMPC * 0.9).tolist()), *runs(2, (SMPC * 40.0).tolist())]
+    folder = write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "less"), cell(2, "more")], rows)
+    html = write_report(folder).read_text(encoding="utf-8")
+    (drawn,) = re.findall(r'<figure id="difference-s0-0".*?</figure>', html, re.DOTALL)
+    shown = re.findall(r">([−-]?[0-9]+k?)</text>", drawn)
+    assert "1000" in shown and "3000" not in shown
+
+
+def test_a_legend_has_the_markers_of_its_figure() -> None:
+    looks = Looks(tuple(f"controller {place}" for place in range(12)))
+    entries = {name: look for look, name in looks.entries(looks.controllers)}
+    assert len({(look.role, look.marker, look.full) for look in entries.values()}) == 12
+    drawn = re.findall(r"<li>.*?</li>", legend(looks.entries(looks.controllers)))
+    assert len({re.sub(r"controller \d+", "", one) for one in drawn}) == 12
+    assert all(f"var(--{look.role})" in one for look, one in zip(entries.values(), drawn, strict=True))

@@ -7,10 +7,11 @@ from html import escape
 from pathlib import Path
 
 from logs import page
-from logs.page import Mark, Section
+from logs.page import Section
 from logs.summary import count
 from uavctl.campaign import plots
 from uavctl.campaign.intervals import Pair
+from uavctl.campaign.legend import legend
 from uavctl.campaign.results import Results, read_results
 from uavctl.campaign.statistics import CellSummary
 from uavctl.campaign.story import story
@@ -21,8 +22,7 @@ from uavctl.errors import UavctlError
 PAGE = "report.html"
 _SPECIFICATION = "campaign.toml"
 _SHOWN_FAILURES = 50
-_COLUMN_REM = 7.5  # least width of a table's column on average
-_PROMISED = Mark("dashed", "limit", "allowed by the SMPC's design")
+_PROMISED = "allowed by the SMPC's design"
 _HOW_SURE = (
     "Intervals are at 95 %. The steps of a run are not independent, so the interval of a rate of steps is a bootstrap "
     "over runs (with fewer than 20 runs concerned: the exact interval of the share of such runs, times what a run of "
@@ -132,8 +132,8 @@ def _scene_section(view: View, scene: tuple[str, str], cells: Sequence[CellSumma
     if drawings:
         note = "" if key != "s0" else _HOW_SURE + " An arrow stands at the upper end of the interval of a rate of zero."
         flown = {cell.controller for cell in cells if cell.cost is not None}
-        marks = (*(mark for mark in view.looks.marks() if mark.text in flown), _PROMISED)
-        yield Section(f"Costs and limits{_suffix(view, scene)}", note, page.grid(drawings), marks)
+        body = legend(view.looks.entries(flown), limit=_PROMISED) + page.grid(drawings)
+        yield Section(f"Costs and limits{_suffix(view, scene)}", note, body)
 
 
 def _difference_section(view: View) -> Section:
@@ -149,10 +149,9 @@ def _difference_section(view: View) -> Section:
     if not drawings:
         return Section(_DIFFERENCE, "", page.paragraph("There is nothing to compare."))
     who = {one.baseline.controller for one in compared}
-    marks = [mark for mark in view.looks.marks() if mark.text in who]
-    if any(not one.as_safe for one in compared):
-        marks.append(Mark("cross", "ink", "the SMPC breaks limits more often"))
-    return Section(_DIFFERENCE, _DIFFERENCES, page.grid(drawings), tuple(marks))
+    cross = "" if all(one.as_safe for one in compared) else "the SMPC breaks limits more often"
+    body = legend(view.looks.entries(who), cross=cross) + page.grid(drawings)
+    return Section(_DIFFERENCE, _DIFFERENCES, body)
 
 
 def _suffix(view: View, scene: tuple[str, str]) -> str:
@@ -165,8 +164,8 @@ def _age_section(view: View) -> Section:
     note = "Every controller meets the same losses, so the ages are those of the link."
     if not any(cell.ages for cell in view.cells):
         return Section("Age of information", "", page.paragraph("No run ended in order."))
-    body = page.wide_or_narrow(*plots.ages(view.cells, view.results))
-    return Section("Age of information", note, body, plots.age_marks(view.cells))
+    figures = page.wide_or_narrow(*plots.ages(view.cells, view.results))
+    return Section("Age of information", note, legend(plots.age_entries(view.cells)) + figures)
 
 
 _COLUMNS = (
@@ -178,8 +177,9 @@ _COLUMNS = (
 def _cells_section(view: View) -> Section:
     tables = []
     for group, cells in view.groups.items():
-        rows = [_row(cell) for cell in cells]
-        body = _table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1})
+        rows = [_row(cell) for cell in cells if not cell.refused]
+        refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
+        body = _table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused)
         tables.append(f"<details><summary>{escape(view.place(group))}</summary>{body}</details>")
     note = (
         "States and inputs outside: share of steps. Runs with any: share of runs with a state outside. No plan left: "
@@ -189,8 +189,6 @@ def _cells_section(view: View) -> Section:
 
 
 def _row(cell: CellSummary) -> tuple[str, ...]:
-    if cell.refused:
-        return (str(cell.index), f"{cell.controller}: no design; {cell.refused}", *["–"] * (len(_COLUMNS) - 2))
     planned = cell.decisions > 0
     return (
         str(cell.index),
@@ -208,13 +206,18 @@ def _row(cell: CellSummary) -> tuple[str, ...]:
 
 
 def _mean(value: float | None, interval: Pair | None) -> str:
-    return "–" if value is None or interval is None else f"{value:.5g} ({interval[0]:.5g} to {interval[1]:.5g})"
+    return "–" if value is None or interval is None else f"{value:.5g} {_whole(interval, 5)}"
 
 
 def _rate(value: float | None, interval: Pair | None) -> str:
     if value is None or interval is None:
         return "–"
-    return f"{percent(value)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g})"
+    return f"{percent(value)} {_whole((100 * interval[0], 100 * interval[1]), 3)}"
+
+
+def _whole(interval: Pair, digits: int) -> str:
+    """An interval that no line breaks."""
+    return f"({interval[0]:.{digits}g} to {interval[1]:.{digits}g})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _failures_section(view: View) -> Section:
@@ -230,10 +233,13 @@ def _failures_section(view: View) -> Section:
     return Section("Runs that failed", note, body)
 
 
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int]) -> str:
-    """A table of many columns, which is moved sideways on a phone rather than squeezed."""
-    text = page.table(columns, rows, numbers)
-    return text.replace("<table ", f'<table style="min-width:{_COLUMN_REM * len(columns)}rem" ', 1)
+def _table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int], remarks: Iterable[str] = ()
+) -> str:
+    """A table of many columns, set small to be seen in full, with remarks as rows of their own below."""
+    text = page.table(columns, rows, numbers).replace('class="many"', 'class="many dense"', 1)
+    below = "".join(f'<tr><td colspan="{len(columns)}">{escape(remark)}</td></tr>' for remark in remarks)
+    return text.replace("</tbody>", f"{below}</tbody>", 1)
 
 
 def _again_section(view: View) -> Section:

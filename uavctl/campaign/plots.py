@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from logs.page import Mark
 from logs.plots import DASHED
 from logs.plots_control import WIDE_IN
 from logs.svg import WIDTH_IN, Drawing, canvas, colour
 from uavctl.campaign.intervals import Pair
+from uavctl.campaign.legend import Look
 from uavctl.campaign.results import Results
 from uavctl.campaign.rows import draw_rows, left_in, lower, offset, rows_in
 from uavctl.campaign.statistics import CellSummary
+from uavctl.campaign.ticks import LINEAR_PERCENT, plain, spread_ticks
 from uavctl.campaign.verdict import Comparison, Verdict
 
 # Beyond this ratio of the largest to the smallest, a logarithmic axis.
 _WIDE = 4.0
 _NUMERIC_AT_LEAST = 3  # links with a plain loss, for a line over it
-_LINEAR_PERCENT = 3.0  # of the axis of differences; logarithmic beyond
 _FARTHEST_PERCENT = 1e6  # what is beyond stands there
 # A controller that diverges would press all others together: beyond this times the least, it leaves the frame.
 _TALLEST = 1e5
 _TITLE_WIDTH = 48
 _TITLE_LINE_IN = 0.18
 _LABEL_WIDTH = 16  # characters of a link's name in a line
-_LOOKS = tuple(
-    (role, kind)
-    for kind in ("planned", "dashed")
-    for role in ("estimate", "sample", "target", "plan", "truth", "muted")
-)
-_LINE = {"planned": "-", "dashed": DASHED}
+_ROLES = ("estimate", "sample", "target", "plan", "truth", "muted")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
+# A colour comes again with the next marker, hollow.
+_LOOKS = tuple(
+    Look(role, _MARKERS[(place + turn) % len(_MARKERS)], turn == 0)
+    for turn in range(2)
+    for place, role in enumerate(_ROLES)
+)
 
 
 @dataclass(frozen=True)
@@ -46,15 +47,13 @@ class Looks:
 
     controllers: tuple[str, ...]
 
-    def of(self, controller: str) -> tuple[str, str, str]:
-        """Colour's role, kind of line, marker."""
-        place = self.controllers.index(controller)
-        role, kind = _LOOKS[place % len(_LOOKS)]
-        return role, kind, _MARKERS[place % len(_MARKERS)]
+    def of(self, controller: str) -> Look:
+        """How one is drawn."""
+        return _LOOKS[self.controllers.index(controller) % len(_LOOKS)]
 
-    def marks(self) -> tuple[Mark, ...]:
-        """The legend."""
-        return tuple(Mark(kind, role, name) for name in self.controllers for role, kind, _ in (self.of(name),))
+    def entries(self, shown: Collection[str]) -> Iterator[tuple[Look, str]]:
+        """The legend of those that are shown."""
+        return ((self.of(name), name) for name in self.controllers if name in shown)
 
 
 @dataclass(frozen=True)
@@ -131,17 +130,18 @@ def _over_loss(
         ax = one.axes(quantity.title, "positions lost [%]", quantity.label)
         floor = _scale(ax, quantity, cells, ax.set_yscale)
         for controller in dict.fromkeys(cell.controller for cell in cells):
-            role, kind, marker = looks.of(controller)
+            look = looks.of(controller)
+            paint, face = _paint(look)
             mine = sorted((cell for cell in cells if cell.controller == controller), key=lambda c: losses[c.link])
             x = np.array([100.0 * losses[cell.link] for cell in mine])
             value, low, high = _figures(quantity, mine)
-            ax.fill_between(x, np.maximum(low, floor), high, color=colour(role), alpha=0.16, lw=0)
-            ax.plot(
-                x, np.where(value > floor, value, np.nan), ls=_LINE[kind], marker=marker, ms=3.8, color=colour(role)
-            )
+            ax.fill_between(x, np.maximum(low, floor), high, color=paint, alpha=0.16, lw=0)
+            there = np.where(value > floor, value, np.nan)
+            ax.plot(x, there, marker=look.marker, ms=3.8, color=paint, mfc=face)
             none = value <= floor
-            ax.plot(x[none], high[none], ls="", marker=CARETDOWNBASE, ms=5, color=colour(role))
-        _promise(ax.axhline, quantity, cells)
+            ax.plot(x[none], high[none], ls="", marker=CARETDOWNBASE, ms=5, color=paint, mfc=face)
+        for share in {quantity.promised(cell) for cell in cells} - {None}:
+            ax.axhline(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
     return Drawing(name, one.svg, f"{quantity.title} of each controller over the loss of the link")
 
 
@@ -155,16 +155,16 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
         ax = one.axes(quantity.title, quantity.label, "", left_in(labels))
         floor = _scale(ax, quantity, cells, ax.set_xscale)
         for place, controller in enumerate(who):
-            role, kind, marker = looks.of(controller)
+            look = looks.of(controller)
+            paint, face = _paint(look)
             mine = [cell for cell in cells if cell.controller == controller]
             rows = np.array([links.index(cell.link) + offset(place, len(who)) for cell in mine])
             value, low, high = _figures(quantity, mine)
-            face = colour(role) if kind == "planned" else colour("card")
-            ax.hlines(rows, np.maximum(low, floor), high, color=colour(role), lw=1.6)
+            ax.hlines(rows, np.maximum(low, floor), high, color=paint, lw=1.6)
             there = value > floor
-            ax.plot(value[there], rows[there], ls="", marker=marker, ms=4.2, color=colour(role), mfc=face)
-            ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=colour(role))
-        _promise(ax.axvline, quantity, cells)
+            ax.plot(value[there], rows[there], ls="", marker=look.marker, ms=4.2, color=paint, mfc=face)
+            ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=paint, mfc=face)
+        _promise(ax, quantity, cells, links)
         draw_rows(ax, labels)
     return Drawing(name, one.svg, f"{quantity.title} of each controller by link")
 
@@ -182,28 +182,29 @@ def differences(verdicts: Sequence[Verdict], looks: Looks, title: str, key: str)
     with canvas(name, 0.9 + rows_in(labels, len(who)) + more_in) as one:
         ax = one.axes(heading, "what the baseline costs more [%]", "", left_in(labels))
         lower(ax, more_in)
-        ax.set_xscale("symlog", linthresh=_LINEAR_PERCENT, linscale=0.8)
+        ax.set_xscale("symlog", linthresh=LINEAR_PERCENT, linscale=0.8)
         ax.axvline(0.0, color=colour("ink"), lw=0.9)
         for row, verdict in enumerate(shown):
             for comparison in verdict.comparisons:
                 place = row + offset(who.index(comparison.baseline.controller), len(who))
                 _difference(ax, comparison, place, looks)
-        ax.xaxis.set_major_locator(SymmetricalLogLocator(base=10.0, linthresh=_LINEAR_PERCENT, subs=(1.0, 3.0)))
-        ax.xaxis.set_major_formatter(FuncFormatter(_plain))
+        spread_ticks(ax)
+        ax.xaxis.set_major_formatter(FuncFormatter(plain))
         ax.xaxis.set_minor_formatter(NullFormatter())
         draw_rows(ax, labels)
     return Drawing(name, one.svg, f"{title}: what each baseline costs more, by link, with its interval")
 
 
 def _difference(ax: Axes, one: Comparison, place: float, looks: Looks) -> None:
-    """A full dot where the SMPC breaks no limit more often, else a cross."""
+    """The baseline's marker where the SMPC breaks no limit more often, else a cross."""
     if one.share is None:
         return
     mean, low, high = np.clip(100.0 * np.array(one.share), -_FARTHEST_PERCENT, _FARTHEST_PERCENT)
-    role, _, marker = looks.of(one.baseline.controller)
-    ax.hlines(place, low, high, color=colour(role), lw=1.6)
-    marker, width = (marker, 1.0) if one.as_safe else ("x", 1.8)
-    ax.plot(mean, place, ls="", marker=marker, ms=4.4, mew=width, color=colour(role))
+    look = looks.of(one.baseline.controller)
+    paint, face = _paint(look)
+    ax.hlines(place, low, high, color=paint, lw=1.6)
+    marker, width = (look.marker, 1.0) if one.as_safe else ("x", 1.8)
+    ax.plot(mean, place, ls="", marker=marker, ms=4.4, mew=width, color=paint, mfc=face)
 
 
 def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawing]:
@@ -224,22 +225,26 @@ def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawi
 
 def _tails(ax: Axes, histograms: list[list[int]]) -> None:
     for place, counts in enumerate(histograms):
-        role, kind = _LOOKS[place % len(_LOOKS)]
+        look = _LOOKS[place % len(_LOOKS)]
+        paint, face = _paint(look)
         tail = 100.0 * np.cumsum(np.array(counts, dtype=np.float64)[::-1])[::-1] / max(1, sum(counts))
         shown = np.flatnonzero(tail)
-        ax.plot(shown, tail[shown], ls=_LINE[kind], marker=_MARKERS[place % len(_MARKERS)], ms=3.4, color=colour(role))
+        ax.plot(shown, tail[shown], marker=look.marker, ms=3.4, color=paint, mfc=face)
     ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(FuncFormatter(_plain))
+    ax.yaxis.set_major_formatter(FuncFormatter(plain))
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     ax.set_xlim(left=-0.3)
 
 
-def age_marks(cells: Sequence[CellSummary]) -> tuple[Mark, ...]:
+def age_entries(cells: Sequence[CellSummary]) -> Iterator[tuple[Look, str]]:
     """Its legend."""
     links = dict.fromkeys(cell.link for cell in cells if cell.ages)
-    return tuple(
-        Mark(kind, role, link) for place, link in enumerate(links) for role, kind in (_LOOKS[place % len(_LOOKS)],)
-    )
+    return ((_LOOKS[place % len(_LOOKS)], link) for place, link in enumerate(links))
+
+
+def _paint(look: Look) -> tuple[str, str]:
+    """Colours of the line and of the marker's inside."""
+    return colour(look.role), colour(look.role if look.full else "card")
 
 
 def _figures(quantity: Quantity, cells: Sequence[CellSummary]) -> np.ndarray:
@@ -257,10 +262,10 @@ def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale
     axis = ax.yaxis if set_scale == ax.set_yscale else ax.xaxis
     if high.max() < _WIDE * least and (value > 0.0).all():
         axis.set_major_locator(MaxNLocator(5))
-        axis.set_major_formatter(FuncFormatter(_plain))
+        axis.set_major_formatter(FuncFormatter(plain))
         return -np.inf
     set_scale("log")
-    axis.set_major_formatter(FuncFormatter(_plain))
+    axis.set_major_formatter(FuncFormatter(plain))
     axis.set_minor_formatter(NullFormatter())
     if high.max() > _TALLEST * least and quantity.scale == 1.0:
         (ax.set_ylim if axis is ax.yaxis else ax.set_xlim)(0.5 * least, _TALLEST * least)
@@ -269,14 +274,8 @@ def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale
     return 0.0
 
 
-def _promise(draw: Callable[..., object], quantity: Quantity, cells: Sequence[CellSummary]) -> None:
-    promised = {quantity.promised(cell) for cell in cells} - {None}
-    for share in promised:
-        draw(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
-
-
-def _plain(value: float, _place: int) -> str:
-    for least, suffix in ((1e6, "M"), (1e4, "k")):
-        if abs(value) >= least:
-            return f"{value / (1e6 if suffix == 'M' else 1e3):.6g}{suffix}"
-    return f"{value:.4g}"
+def _promise(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], links: Sequence[str]) -> None:
+    """What is allowed, beside the link that it is allowed for."""
+    for share, row in {(quantity.promised(cell), links.index(cell.link)) for cell in cells}:
+        if share is not None:
+            ax.vlines(quantity.scale * share, row - 0.5, row + 0.5, color=colour("limit"), lw=1.3, ls=DASHED)

@@ -170,13 +170,19 @@ def _unused(one: Comparison) -> str:
     state, inputs = one.baseline.violation_ci, one.baseline.input_violation_ci
     if one.cheaper < 0 or not one.safer or promised is None or allowed is None or state is None or inputs is None:
         return ""
-    over = [
-        f"{what} ({percent(share)})"
-        for what, share, interval in (("states", promised, state), ("inputs", allowed, inputs))
-        if interval[0] > share
+    rates = (one.baseline.violation_rate or 0.0, one.baseline.input_violation_rate or 0.0)
+    judged = tuple(zip(("states", "inputs"), rates, (state[0], inputs[0]), (promised, allowed), strict=True))
+    over = [f"{what} ({percent(share)})" for what, _, least, share in judged if least > share]
+    perhaps = [
+        f"the {percent(share)} allowed for {what}"
+        for what, rate, least, share in judged
+        if least <= share and exceeds(rate, share)
     ]
-    if over:
-        return f" That is more than the SMPC's design allows for {' and '.join(over)}."
+    sentences = [f" That is more than the SMPC's design allows for {' and '.join(over)}."] if over else []
+    if perhaps:
+        sentences.append(f" That is more than {' and '.join(perhaps)}, which may still be chance at so few runs.")
+    if sentences:
+        return "".join(sentences)
     within = f"states {percent(promised)}, inputs {percent(allowed)}"
     return f" That is within what the SMPC's design allows ({within}): its caution is what costs."
 
@@ -206,6 +212,11 @@ def _signed(one: Comparison, verb: str = "", *, interval: bool = True) -> str:
 def _short(value: float) -> str:
     """Three digits, without an exponent below a million."""
     return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}" if value < 1e6 else f"{value:.1e}"
+
+
+def exceeds(rate: float, allowed: float) -> bool:
+    """Whether a measured rate is above what is allowed, which is 1 - delta and so off by rounding."""
+    return rate > allowed * (1.0 + 1e-9)
 
 
 def percent(share: float | None) -> str:

@@ -33,7 +33,7 @@ from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.statistics import CellSummary, summarise
 from uavctl.campaign.store import Store
 from uavctl.campaign.tasks import Columns, Task, tasks_of
-from uavctl.cli import refly_cmd
+from uavctl.cli import INTERRUPTED, refly_cmd
 from uavctl.cli.common import Common, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.cli.prepare import ready_library
@@ -104,7 +104,7 @@ def campaign(
             report = write_report(store.folder)
     except KeyboardInterrupt:
         _tell(_interrupted(store, spec, runs))
-        return 1
+        return INTERRUPTED
     result = CampaignResult(
         name=read.spec.name,
         runs_file=str(runs_file),
