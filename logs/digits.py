@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-_ROUNDING = 1e-6  # of the product that finds thousandths of a percent
+_ROUNDING = 1e-6  # of the quotient that finds two digits
+_LEAST_PERCENT = 1e-3
 
 
 def duration(value_us: float) -> str:
@@ -20,5 +21,7 @@ def number(value: float, decimals: int = 3) -> str:
 
 
 def percent_above(share: float) -> str:
-    """A share in percent, rounded up to thousandths of one, so that it stays a bound; never less than one of them."""
-    return f"{number(max(1, math.ceil(1e5 * share - _ROUNDING)) / 1000)} %"
+    """A share in percent, rounded up to two digits, so that it stays a bound; never less than a thousandth of one."""
+    percent = max(_LEAST_PERCENT, 100.0 * share)
+    place = math.floor(math.log10(percent)) - 1  # of the second digit
+    return f"{number(math.ceil(percent / 10.0**place - _ROUNDING) * 10.0**place, 5)} %"

@@ -17,12 +17,24 @@ from uavctl.data import Plan
 # Roles of the ways to a plan, in the order of their names.
 _ROLES = ("estimate", "sample", "target", "plan", "limit")
 _LEAST_GAP = 1e-12
+_PERCENT = 100.0
+_WAYS = {
+    "frozen": "with the policy that costs least of those made beforehand",
+    "mixture": "with another of them, or with several, weighed together",
+    "exact": "with a policy found for this very plan",
+}
 
 
 def methods(flight: FlightData) -> list[tuple[str, str]]:
     """Ways in which plans were found, each with its colour's role."""
     names = sorted({plan.method for plan in flight.plans})
     return [(name, _ROLES[place % len(_ROLES)]) for place, name in enumerate(names)]
+
+
+def ways(flight: FlightData) -> str:
+    """A sentence on the ways in which plans were found, and a space after it; empty where none is known."""
+    told = [f"“{name}”: {_WAYS[name]}" for name in sorted({plan.method for plan in flight.plans} & set(_WAYS))]
+    return f"Plans were found in these ways: {'; '.join(told)}. " if told else ""
 
 
 def certificates(flight: FlightData) -> Iterator[Drawing]:
@@ -36,11 +48,11 @@ def certificates(flight: FlightData) -> Iterator[Drawing]:
 
 def _gaps(flight: FlightData) -> Drawing:
     with canvas("plan-gap", 2.5) as one:
-        ax = one.axes("Certified gap", "time [s]", "share of the cost (log scale)")
+        ax = one.axes("Certified gap", "time [s]", "% of the cost (log scale)")
         ax.set_yscale("log")
         for name, role in methods(flight):
             plans = [plan for plan in flight.plans if plan.method == name and np.isfinite(plan.gap)]
-            gaps = np.maximum(np.array([plan.gap for plan in plans], dtype=np.float64), _LEAST_GAP)
+            gaps = _PERCENT * np.maximum(np.array([plan.gap for plan in plans], dtype=np.float64), _LEAST_GAP)
             shown_s, shown = largest(flight.seconds([plan.base_ns for plan in plans]), gaps)
             dots(ax, shown_s, shown, role, 2.4)
         ax.yaxis.set_major_locator(LogLocator(numticks=7))
@@ -52,7 +64,7 @@ def _gaps(flight: FlightData) -> Drawing:
         if np.floor(high) <= np.ceil(low):  # a single tick would say nothing of the scale
             ax.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
         span(ax, flight)
-    label = "Certified gap of each plan between its cost and the least possible, as a share of the cost, over time"
+    label = "Certified gap of each plan between its cost and the least possible, in percent of the cost, over time"
     return Drawing("plan-gap", one.svg, label)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from logs import page, plots, plots_control, plots_link, plots_solver
+from logs.digits import number
 from logs.flight_data import FALLBACK, FlightData
 from logs.outputs import write_whole
 from logs.page import Mark, Section
@@ -16,7 +17,7 @@ from logs.report_origin import origin_sections
 from logs.report_verdicts import verdict_rows, verdict_sections
 from logs.summary import FlightSummary, rows
 from logs.timeline import timeline
-from logs.verdict_link import LinkVerdict
+from logs.verdict_link import DelayVerdict, LinkVerdict
 from logs.verdicts import Judged, judge
 from logs.words import part_begins, story
 from uavctl.data import Event
@@ -131,7 +132,7 @@ def _link_section(flight: FlightData, verdict: LinkVerdict) -> Section:
     horizon = (Mark("dotted", "muted", f"horizon H = {flight.design.horizon}"),) if verdict.ages else ()
     note = "The dashed line is what the design counts on, by the link of the configuration."
     if verdict.delay is not None and verdict.delay.from_quickest:
-        note += " Delays are short of the quickest one, as the sender's clock is only known by it."
+        note += _quickest(verdict.delay)
     return Section(
         "The link, estimated against promised",
         note,
@@ -148,6 +149,16 @@ def _link_section(flight: FlightData, verdict: LinkVerdict) -> Section:
     )
 
 
+def _quickest(delay: DelayVerdict) -> str:
+    """What is known of delays where the sender's clock is only known by the quickest arrival."""
+    if delay.latency_ms:
+        return (
+            f" The shortest delay is taken to be {number(delay.latency_ms)} ms (clock.latency_s), as the sender's "
+            "clock is only known by it."
+        )
+    return " Delays are short of the quickest one, as the sender's clock is only known by it."
+
+
 def _certificates_section(flight: FlightData) -> Section:
     drawings = list(plots_solver.certificates(flight))
     marks = [Mark("dot", role, name) for name, role in plots_solver.methods(flight)]
@@ -155,11 +166,15 @@ def _certificates_section(flight: FlightData) -> Section:
     told = (
         "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
         if gave
-        else "No plan that was flown gave way anywhere."
+        else (
+            "Slack is what state limits give way by, so that there is a plan at all. No plan that was flown gave way "
+            "anywhere."
+        )
     )
     return Section(
         "Certificates and slack",
-        f"Each plan comes with a bound of the least cost there is: the gap between them is certified. {told}",
+        f"Each plan comes with a bound of the least cost there is: the gap between them is certified. "
+        f"{plots_solver.ways(flight)}{told}",
         page.grid(drawings) if drawings else page.paragraph(_NO_PLAN),
         tuple(marks) if drawings else (),
     )

@@ -25,6 +25,10 @@ _RARE = 1e-9
 # A position takes so much longer than the simulated link lets it without being called late: the step of a daemon's
 # own clock, by which the capture time is known. [s]
 _DELAY_TOLERANCE_S = 0.002
+# Events by which the controller warns of the link in flight.
+_WARNINGS = frozenset({"link-bursts", "link-below-promise"})
+
+_WARNED = " The events' warnings of the link were made in flight, on few steps; this verdict is on all steps flown."
 
 
 class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -36,7 +40,8 @@ class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
     promised_low_ms: float | None  # configured; None where it is not known, or as in a trace
     promised_high_ms: float | None
     late: Share | None  # positions that took longer than the longest delay configured
-    from_quickest: bool  # capture times are known but for the quickest delay, which is missing from these figures
+    from_quickest: bool  # capture times are known but for the quickest delay, for which `clock.latency_s` stands
+    latency_ms: float | None = None  # what the quickest one is taken to be; None where the configuration is not known
 
 
 class LinkVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,7 +82,8 @@ def judge_link(flight: FlightData, config: Config | None) -> LinkVerdict:
         promised_loss=config.link.loss if config is not None and independent and not config.link.probability else None,
         delay=_delay(flight, config),
     )
-    return msgspec.structs.replace(found, text=_text(found, independent))
+    warned = not found.refuted and any(event.code in _WARNINGS for event in flight.events)
+    return msgspec.structs.replace(found, text=_text(found, independent) + (_WARNED if warned else ""))
 
 
 def delays_s(flight: FlightData) -> Floats:
@@ -142,6 +148,7 @@ def _delay(flight: FlightData, config: Config | None) -> DelayVerdict | None:
         promised_high_ms=None if high_s is None else 1e3 * high_s,
         late=late,
         from_quickest=_from_quickest(flight),
+        latency_ms=None if config is None else 1e3 * config.clock.latency_s,
     )
 
 

@@ -249,7 +249,7 @@ def _times(axes: list[AxisVerdict]) -> str:
 
 def _each(axes: list[AxisVerdict], value: Callable[[AxisVerdict], float]) -> str:
     """A figure of some axes, as in "0.8 north, 0.7 east"; empty without any."""
-    return ", ".join(f"{value(one):.2g} {one.axis}" for one in axes)
+    return ", ".join(f"{value(one):.2g} {one.axis}" for one in axes).replace("-", "−")
 
 
 def _leads_text(leads: tuple[LeadVerdict, ...]) -> str:

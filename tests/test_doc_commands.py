@@ -36,3 +36,16 @@ def test_a_design_can_be_made_of_each(line: str) -> None:
     config = next((value for name, value in given if name == "--config"), "room")
     overrides = tuple(value for name, value in given if name == "--set")
     assert build_design(Common(config=config, overrides=overrides).load().config).schedule
+
+
+def test_lists_are_quoted_as_shells_want_them() -> None:
+    """Some shells take brackets for a pattern of file names."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    bare = re.compile(r"(?:--set|--link) (?=[^'\"\s])[^\s`]*\[")
+    assert [(page.name, one) for page in pages for one in bare.findall(page.read_text(encoding="utf-8"))] == []
+
+
+def test_a_command_for_one_recording_is_not_given_all_of_them() -> None:
+    bare = re.compile(r"^uavctl log (?:replay|report|whatif|export|info) [^\"\n]*\*", re.M)
+    for page in ("README.md", "docs/quick-start.md"):
+        assert not bare.search((ROOT / page).read_text(encoding="utf-8"))

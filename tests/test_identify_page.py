@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import re
 from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from uavctl.cli import identify_cmd
 from uavctl.config import load_config
 from uavctl.errors import DesignError
 from uavctl.identify.history import Asked, Seen
 from uavctl.identify.link_fit import fit_link
-from uavctl.identify.page import write_page
+from uavctl.identify.page import _innovations, write_page
+from uavctl.identify.prediction import Prediction
 from uavctl.identify.recorded import History
 from uavctl.identify.result import AxisResponse, Identification, Identified
 
@@ -81,6 +84,21 @@ def test_another_warning_takes_no_axis_its_line() -> None:
     said = sentences(write_page(found(uncertain), seen(), "flight"))
     assert sum("of the motion of the next 1 s is predicted" in one for one in said) == 3
     assert said.count(f"{uncertain}.") == 1
+
+
+def test_differences_of_millimetres_leave_room_for_the_name_of_their_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    left_px: list[float] = []
+
+    def keep(figure: Figure, out: io.StringIO, **options: object) -> None:
+        figure.draw_without_rendering()
+        left_px.append(figure.axes[0].yaxis.label.get_window_extent().x0)
+        out.write("<svg ></svg>")
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    differences_m = np.linspace(-0.08, 0.06, 30)
+    rest = np.ones(30)
+    _innovations("north", Prediction(np.arange(30.0), differences_m, 0.02 * rest, rest, rest, np.zeros(20)))
+    assert left_px and left_px[0] >= 0.0
 
 
 def test_what_speaks_against_a_design_is_on_the_page_too(

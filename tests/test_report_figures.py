@@ -93,7 +93,8 @@ def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
         list(plots_solver.certificates(dataclasses.replace(flight, plans=plans)))
     ax = figures["Certified gap"].axes[0]
     low, high = ax.get_ylim()
-    assert low <= gaps[0] and gaps[-1] <= high
+    assert low <= 100.0 * gaps[0] and 100.0 * gaps[-1] <= high and high < 1000.0 * gaps[-1]
+    assert ax.get_ylabel() == "% of the cost (log scale)"
     assert sum(low <= tick <= high for tick in ax.get_yticks()) >= 2
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import msgspec
 import pytest
 from report_rig import words_of
@@ -11,7 +13,9 @@ from synthetic_scene import room
 from logs.flight_data import FlightData
 from logs.summary import Spread, summarise
 from logs.words import story
-from uavctl.data import ControlMode, Decision, Record, StepInput
+from uavctl.config import load_config
+from uavctl.config.load import dump_config
+from uavctl.data import ControlMode, Decision, LinkStats, Record, StepInput
 
 TICK_S = room().tick_s
 
@@ -87,3 +91,35 @@ def test_what_went_amiss_is_told() -> None:
     told = story(flight, bad)
     assert "3 ticks were missed; the latest tick began 73.4 ms late." in told
     assert "1 record was dropped because the disk was too slow, and missing from all figures." in told
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.03])
+def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: float) -> None:
+    config = load_config("room", (f"clock.latency_s={latency_s}",))
+    found = FlightData.from_records(fly(room(), 4.0, config_toml=dump_config(config)))
+    stats = LinkStats(
+        at_ns=1,
+        link="mocap",
+        datagrams=1,
+        messages=1,
+        samples=7,
+        bad={},
+        clock_offset_ns=0,
+        clock_source="minimum",
+        clock_rtt_ns=None,
+        clock_drift_ppm=None,
+        clock_rejected=0,
+    )
+    text = " ".join(words_of(dataclasses.replace(found, links=(stats,))).text)
+    taken = "The shortest delay is taken to be 30 ms (clock.latency_s)" in text
+    short = "Delays are short of the quickest one" in text
+    assert (taken, short) == (latency_s > 0.0, latency_s == 0.0)
+
+
+def test_the_ways_to_a_plan_and_slack_are_explained_where_they_stand() -> None:
+    found = FlightData.from_records(fly(room(), 4.0))
+    ways = ("frozen", "mixture", "exact")
+    plans = tuple(msgspec.structs.replace(plan, method=ways[at % 2]) for at, plan in enumerate(found.plans))
+    text = " ".join(words_of(dataclasses.replace(found, plans=plans)).text)
+    assert [f"“{way}”: with " in text for way in ways] == [True, True, False]
+    assert "Slack is what state limits give way by" in text

@@ -329,7 +329,9 @@ def test_numbers_for_people(value: float, text: str) -> None:
 @pytest.mark.parametrize(
     ("share", "text"),
     [
-        (2.6e-5, "0.003 %"),
+        (2.6e-5, "0.0026 %"),
+        (2.032e-5, "0.0021 %"),
+        (9.91e-5, "0.01 %"),
         (1e-5, "0.001 %"),
         (3e-5, "0.003 %"),
         (1.1e-3, "0.11 %"),
@@ -345,5 +347,5 @@ def test_a_bound_in_percent_is_never_rounded_below_itself(share: float, text: st
 
 def test_the_certified_gap_is_said_without_an_exponent() -> None:
     s = msgspec.structs.replace(figures(decision(0)), methods={"frozen": 3}, largest_gap=2.6e-5)
-    assert "3 frozen; certified gap at most 0.003 % of the cost" in shown(s)
+    assert "3 frozen; certified gap at most 0.0026 % of the cost" in shown(s)
     assert msgspec.json.decode(msgspec.json.encode(s))["largest_gap"] == 2.6e-5

@@ -73,6 +73,11 @@ def test_errors_that_are_off_are_found() -> None:
     assert "east deviations off on average" in verdict.text
 
 
+def test_figures_below_zero_have_a_minus_as_elsewhere() -> None:
+    text = judge_innovations(errors(np.random.default_rng(3).standard_normal((400, 3)) - 0.5), AXES, 0.2).text
+    assert "errors are −0." in text and "errors are -" not in text
+
+
 def test_a_few_positions_are_too_few() -> None:
     verdict = judge_innovations(errors(np.ones((FEWEST - 1, 3))), AXES, 0.2)
     assert verdict.axes == ()

@@ -19,7 +19,7 @@ from logs.verdict_link import judge_link
 from logs.verdict_risk import judge_risk
 from logs.verdicts import Verdicts, flown_config, judge
 from uavctl.config import Config
-from uavctl.data import Decision, LinkStats, Plan, PositionSample, Record, StepInput, Truth
+from uavctl.data import Decision, Event, LinkStats, Plan, PositionSample, Record, Severity, StepInput, Truth
 
 
 def flight(duration_s: float = 40.0, **changes: object) -> FlightData:
@@ -138,6 +138,15 @@ def test_delays_against_those_configured() -> None:
     assert (good.promised_low_ms, good.promised_high_ms) == pytest.approx((30.0, 70.0))
     assert (good.late.hits, short.late.hits) == (0, len(found.samples))
     assert not good.from_quickest
+
+
+@pytest.mark.parametrize(("loss", "code", "said"), [(0.3, "link-bursts", 1), (0.3, "wind", 0), (0.5, "link-bursts", 0)])
+def test_a_warning_in_flight_that_the_verdict_does_not_share_is_explained(loss: float, code: str, said: int) -> None:
+    found = as_modelled(room_config(), 600, seed=2, loss=loss)
+    event = Event(at_ns=0, severity=Severity.WARNING, code=code, text="")
+    verdict = judge_link(dataclasses.replace(found, events=(event,)), room_config())
+    assert verdict.refuted == (loss == 0.5)
+    assert verdict.text.count("made in flight, on few steps") == said
 
 
 def stats(at_s: float, offset_s: float, **changes: object) -> LinkStats:

@@ -14,10 +14,10 @@ from synthetic_scene import room
 from test_report_figures import drawn
 
 from logs.flight_data import FlightData
-from logs.summary import summarise
+from logs.summary import FlightSummary, summarise
 from logs.svg import colour
 from uavctl.whatif.compare import ModelFit, Reproduction, WhatIf
-from uavctl.whatif.page import write_page
+from uavctl.whatif.page import story, write_page
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +38,19 @@ def other(recorded: FlightData) -> FlightData:
 def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], str]:
     """The page's axes by their titles, and its text."""
     summary = summarise(recorded, wall_s=None)
-    found = WhatIf(
+    with drawn() as kept:
+        text = write_page(worse_link(summary), recorded, other)
+    return {title: figure.axes[0] for title, figure in kept.items()}, text
+
+
+def worse_link(summary: FlightSummary) -> WhatIf:
+    """A what-if over a link that loses more, with no key changed; the same figures on every side."""
+    return WhatIf(
         flight="flight.mcap",
         reproduction=Reproduction(identical=True, decisions=1, largest_state=0.0, largest_input=0.0),
         model=ModelFit(source="the recording's [plant]", ahead_s=1.0, moves=0, r2=None, rms_m=None),
         controller="smpc",
-        link="recorded",
+        link="loss=0.5",
         changed=(),
         compared_s=6.0,
         ended="the recording ends",
@@ -55,9 +62,6 @@ def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], s
         report="",
         page="",
     )
-    with drawn() as kept:
-        text = write_page(found, recorded, other)
-    return {title: figure.axes[0] for title, figure in kept.items()}, text
 
 
 def levels(ax: Axes) -> list[float]:
@@ -87,6 +91,12 @@ def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: Fl
         above = max(edges, key=lambda one: one.y1)
         assert above.y1 == pytest.approx(design.state_box.upper[index])
         assert above.y0 == pytest.approx(design.state_box.upper[index] - max(kept))
+
+
+def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
+    summary = summarise(recorded, wall_s=None)
+    (said,) = (text for text in story(worse_link(summary)) if "link: loss=0.5" in text)
+    assert "nothing" not in said
 
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:

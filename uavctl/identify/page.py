@@ -15,6 +15,7 @@ from uavctl.identify.prediction import AHEAD_S, LAGS, Prediction
 from uavctl.identify.result import Identification
 
 _HEIGHT_IN = 2.6
+_LEFT_IN = 0.85  # room for differences with a sign and three decimals or four
 _MOST_DELAYS = 2000  # dots of a picture
 
 
@@ -105,7 +106,7 @@ def _moved(name: str, one: Prediction) -> Drawing:
 
 def _innovations(name: str, one: Prediction) -> Drawing:
     with canvas(f"innovations-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "difference [m]")
+        ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "difference [m]", _LEFT_IN)
         for sign in (-2.0, 2.0):
             ax.plot(one.times_s, sign * one.stds_m, color=colour("limit"), linewidth=0.8)
         dots(ax, one.times_s, one.innovations_m, "estimate", 2.5)

@@ -56,11 +56,11 @@ def story(found: WhatIf) -> list[str]:
         same = f"not bit for bit: states within {again.largest_state:.1e}, inputs within {again.largest_input:.1e}"
     within = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
     explained = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{within}"
-    changed = ", ".join(found.changed) or "nothing"
+    changed = f"Changed: {', '.join(found.changed)}" if found.changed else "No key of the configuration was changed"
     return [
         f"Reproduced with nothing changed, {same}.",
         f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times{explained}.",
-        f"Changed: {changed}; controller {found.controller}; link: {found.link}.",
+        f"{changed}; controller {found.controller}; link: {found.link}.",
         f"Compared over {found.compared_s:.1f} s: {found.ended}. The flights came {found.largest_departure_m:.3g} m "
         "apart.",
     ]
