@@ -138,8 +138,7 @@ def _scan(path: Path, data: Buffer, order: Order | None) -> Iterator[Message | D
         try:
             length = _whole(data, at)
             if opcode == Opcode.CHUNK:
-                content = _chunk(data, at, length)
-                yield from contents.messages(content, at) if order is None else contents.records(content, at, order)
+                yield from contents.messages(_chunk(data, at, length), at, order)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
                 if not damaged and stored != _crc(data, at):

@@ -59,24 +59,16 @@ class Contents:
         self._schemas: dict[int, Schema] = {}
         self._known: dict[bytes, tuple[int, Definition]] = {}
 
-    def messages(self, content: bytes, offset: int) -> Iterator[Message]:
-        """Messages of one chunk, whose checksum is right."""
-        channels: dict[int, Definition] = {}
-        at = 0
-        size = len(content)
-        while at < size:
-            if content[at] == _IS_MESSAGE:
-                _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-                begin, at = at + _MESSAGE.size, at + _RECORD.size + length
-                yield Message(channels[channel], sequence, at_ns, content[begin:at], offset)
-            else:
-                at = self._define(content, at, channels)
+    def messages(self, content: bytes, offset: int, order: Order | None = None) -> Iterator[Message]:
+        """Messages of one chunk, whose checksum is right.
 
-    def records(self, content: bytes, offset: int, order: Order) -> Iterator[Message]:
-        """The same without those for viewers, which are half of a recording: what a replay's time goes to.
+        Args:
+            content: the chunk.
+            offset: its place in the file.
+            order: where the reader is, moved on; then without those for viewers, which are half of a recording.
 
         Raises:
-            RecordingError: a message is missing.
+            RecordingError: a message is missing that the order wants.
         """
         channels: dict[int, Definition] = {}
         at = 0
@@ -86,13 +78,15 @@ class Contents:
                 at = self._define(content, at, channels)
                 continue
             _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-            if sequence != order.following and order.following is not None:
-                raise order.broken(sequence)
-            order.following = sequence + 1
             begin, at = at + _MESSAGE.size, at + _RECORD.size + length
             definition = channels[channel]
-            if not definition.for_viewers:
-                yield Message(definition, sequence, at_ns, content[begin:at], offset)
+            if order is not None:
+                if sequence != order.following and order.following is not None:
+                    raise order.broken(sequence)
+                order.following = sequence + 1
+                if definition.for_viewers:
+                    continue
+            yield Message(definition, sequence, at_ns, content[begin:at], offset)
 
     def _define(self, content: bytes, at: int, channels: dict[int, Definition]) -> int:
         """Take a channel or schema; the place after it."""

@@ -85,9 +85,10 @@ def lacks_end(path: Path) -> str:
         RecordingError: there is no such recording.
     """
     files = segment_files(path)
-    if any(last_chunk(file) is None for file in files):
+    ends = [last_chunk(file) for file in files]
+    if None in ends:
         return "the recording is torn"
-    note = last_note(path)
+    note = _note(ends[-1])
     if note is None or note.text != GOES_ON:
         return ""
     return f"the recording goes on after {files[-1].name}, in a file that is missing"
@@ -99,7 +100,12 @@ def last_note(path: Path) -> RecorderNote | None:
     Raises:
         RecordingError: there is no such recording.
     """
-    for message in reversed(last_chunk(segment_files(path)[-1]) or []):
+    return _note(last_chunk(segment_files(path)[-1]))
+
+
+def _note(end: list[Message] | None) -> RecorderNote | None:
+    """The last one of a file's last chunk."""
+    for message in reversed(end or []):
         if message.definition.topic == RECORDER:
             note = decode(RECORDER, message.data, message.at_ns)
             assert isinstance(note, RecorderNote)  # the topic's type

@@ -10,6 +10,7 @@ from logs.digits import duration, number
 from logs.flight_data import FALLBACK, FLOWN, FlightData
 from logs.moving_limits import box_at
 from logs.summary import Ending, FlightSummary, count, input_outside, position_error_m, state_outside
+from logs.topics import GOES_ON, RECOVERED
 from uavctl.data import ControlMode
 from uavctl.naming import severity, tell, worst
 
@@ -62,9 +63,9 @@ def _cut(flight: FlightData) -> list[str]:
     if not flight.notes:
         return []
     text = flight.notes[-1].text
-    if text.startswith("recovered"):
+    if text.startswith(RECOVERED):
         return [f"The recording was {text}."]
-    if text.startswith("goes on in"):
+    if text == GOES_ON:
         return ["The flight goes on in the next file."]
     if flight.breaks_off:
         return [

@@ -18,14 +18,14 @@ from logs.export import Exported, TableFormat, Watch, export_tables
 from logs.export_tlog import ExportedTlog, export_tlog
 from logs.reader import lacks_end
 from logs.summary import count
-from uavctl.cli.common import Common, messages, warn
+from uavctl.cli.common import Common, Flight, Json, messages, warn
 from uavctl.errors import UsageError
 
 TLOG = "tlog"
 
 
 def export(
-    flight: Annotated[Path, Parameter(help="the recording")],
+    flight: Flight,
     /,
     *,
     to: Annotated[Literal["csv", "parquet", "tlog"], Parameter(help="format")],
@@ -34,13 +34,9 @@ def export(
     ] = None,
     link: Annotated[str | None, Parameter(help="with tlog: this connection alone, as in vehicle; else all")] = None,
     force: Annotated[bool, Parameter(negative=(), help="write anew the files that exist")] = False,
-    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+    json: Json = False,
 ) -> int:
-    """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog.
-
-    One table for each topic of records. Topics made for viewers (/view, /plot) are left out: they hold nothing that the
-    records do not. docs/recordings.md says what the columns are.
-    """
+    """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog."""
     if to == TLOG:
         _export_tlog(flight, _tlog_file(flight, out), link, force=force, common=Common(json=json))
     elif link is not None:

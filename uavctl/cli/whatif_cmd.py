@@ -29,7 +29,7 @@ from logs.topics import HEADER, RecorderNote
 from logs.views import Views
 from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
-from uavctl.cli.common import Common, messages, warn
+from uavctl.cli.common import Common, Flight, Json, messages, warn
 from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
@@ -49,7 +49,7 @@ RECORDED, CONFIGURED = "recorded", "configured"
 
 
 def whatif(
-    flight: Annotated[Path, Parameter(help="the recording")],
+    flight: Flight,
     /,
     *,
     config: Annotated[str | None, Parameter(help="preset or TOML file in place of the recorded configuration")] = None,
@@ -73,13 +73,9 @@ def whatif(
         Path | None, Parameter(help="TOML file whose [plant] answers to other setpoints, as of `uavctl identify`")
     ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
-    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+    json: Json = False,
 ) -> int:
-    """Fly a recorded flight again with something changed, in the same disturbance, and compare.
-
-    The recorded inputs of the control loop come again at their times; positions are moved by as much as the vehicle,
-    by its model, would have been elsewhere. docs/what-if.md says what that can tell, and what not.
-    """
+    """Fly a recorded flight again with something changed, in the same disturbance, and compare."""
     if (flight.suffix == ".tlog" and flight.exists()) or is_foreign(flight):
         raise UsageError(
             f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
