@@ -8,7 +8,18 @@ from dataclasses import FrozenInstanceError, replace
 import pytest
 
 from uavctl.data import ControlMode, Vec3
-from uavctl.flight.fallback import End, Fallback, FallbackParameters, acceleration, advance, enter, request
+from uavctl.flight.fallback import (
+    Biases,
+    End,
+    Fallback,
+    FallbackParameters,
+    acceleration,
+    advance,
+    enter,
+    learnt,
+    remember,
+    request,
+)
 from uavctl.flight.limits import ZERO
 
 S = 1_000_000_000
@@ -16,7 +27,7 @@ PARAMETERS = FallbackParameters(brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, lan
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, BARRED, STOP, TO_LAND = End.RECOVER, End.BARRED, End.STOP, End.LAND
+RECOVER, BARRED, LET_GO, STOP, TO_LAND = End.RECOVER, End.BARRED, End.LET_GO, End.STOP, End.LAND
 
 
 @pytest.mark.parametrize(
@@ -44,7 +55,9 @@ RECOVER, BARRED, STOP, TO_LAND = End.RECOVER, End.BARRED, End.STOP, End.LAND
         (BRAKE, BARRED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
         (BRAKE, BARRED, 0, STILL, PARAMETERS, HOLD),
         (HOLD, BARRED, 0, FAST, PARAMETERS, LAND),
-        (HOLD, BARRED, 99 * S, FAST, STAY, HOLD),
+        (HOLD, BARRED, 99 * S, FAST, STAY, STOPPED),  # nothing that we left in the air is left to drift
+        (HOLD, LET_GO, 0, FAST, PARAMETERS, LAND),
+        (HOLD, LET_GO, 0, FAST, STAY, STOPPED),
         (BRAKE, TO_LAND, 2 * S - 1, FAST, STAY, BRAKE),
         (BRAKE, TO_LAND, 2 * S, FAST, STAY, HOLD),
         (HOLD, TO_LAND, 0, FAST, PARAMETERS, LAND),
@@ -92,9 +105,10 @@ def test_begins_with_braking() -> None:
 
 def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
     velocity = (1.0, -2.0, 0.0)
-    assert acceleration(enter(0), velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
+    assert acceleration(enter(0), 2 * S - 1, velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
+    assert acceleration(enter(0), 2 * S, velocity, PARAMETERS) == (0.0, 0.0, 0.0)  # on the way to holding
     for mode in (HOLD, LAND, STOPPED):
-        assert acceleration(Fallback(mode=mode, since_ns=0), velocity, PARAMETERS) == (0.0, 0.0, 0.0)
+        assert acceleration(Fallback(mode=mode, since_ns=0), 0, velocity, PARAMETERS) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +123,10 @@ def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
         (Fallback(BRAKE, 4, TO_LAND), STOP, Fallback(BRAKE, 4, TO_LAND)),  # nobody takes a landing back
         (Fallback(BRAKE, 4, STOP), BARRED, Fallback(BRAKE, 4, STOP)),
         (Fallback(BRAKE, 4, BARRED), TO_LAND, Fallback(BRAKE, 4, TO_LAND)),
+        (None, LET_GO, Fallback(HOLD, 9, LET_GO)),  # nothing is braked on
+        (Fallback(BRAKE, 4, BARRED), LET_GO, Fallback(HOLD, 9, LET_GO)),
+        (Fallback(BRAKE, 4, STOP), LET_GO, Fallback(BRAKE, 4, STOP)),
+        (Fallback(HOLD, 4, LET_GO), TO_LAND, Fallback(HOLD, 4, TO_LAND)),
         (Fallback(LAND, 4), TO_LAND, Fallback(LAND, 4)),
         (Fallback(STOPPED, 4), STOP, Fallback(STOPPED, 4)),
     ],
@@ -118,7 +136,7 @@ def test_an_end_that_is_asked_for(before: Fallback | None, end: End, after: Fall
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, end).final for end in End] == [False, True, True, True]
+    assert [Fallback(HOLD, 0, end).final for end in End] == [False, True, True, True, True]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:
@@ -130,3 +148,68 @@ def test_a_tick_cannot_change_what_the_tick_before_left() -> None:
         enter(7).since_ns = 8  # type: ignore[misc]
     with pytest.raises(FrozenInstanceError):
         replace(PARAMETERS).brake_s = 9.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("sent_mps2", "held_mps2", "after_ns", "speed_mps", "wanted"),
+    [
+        ((0.3, 0.0, 0.0), ZERO, 0, STILL, BRAKE),  # HOLD does not begin with what braking left
+        ((0.04, -0.04, 0.04), ZERO, 0, STILL, HOLD),
+        ((0.041, 0.0, 0.0), ZERO, 0, STILL, BRAKE),
+        ((0.0, 0.0, -0.3), (0.0, 0.0, -0.3), 0, STILL, HOLD),
+        ((0.0, 0.0, 0.3), (0.0, 0.0, -0.3), 0, STILL, BRAKE),
+        ((0.3, 0.0, 0.0), ZERO, 3 * S - 1, FAST, BRAKE),
+        ((0.3, 0.0, 0.0), ZERO, 3 * S, FAST, HOLD),  # it is not waited for for ever
+    ],
+)
+def test_holding_begins_once_the_setpoint_is_what_is_held(
+    sent_mps2: Vec3, held_mps2: Vec3, after_ns: int, speed_mps: float, wanted: ControlMode
+) -> None:
+    before = Fallback(mode=BRAKE, since_ns=5 * S)
+    after = advance(before, 5 * S + after_ns, speed_mps, sent_mps2, PARAMETERS, held_mps2)
+    assert after.mode is wanted
+    assert after.held_ns == (5 * S + after_ns if wanted is HOLD else None)
+
+
+@pytest.mark.parametrize(
+    ("end", "measured", "speed_mps", "wanted"),
+    [
+        (RECOVER, True, 0.151, BRAKE),
+        (RECOVER, True, 0.15, HOLD),
+        (RECOVER, False, 9.0, HOLD),  # a prediction does not drift
+        (STOP, True, 9.0, HOLD),
+    ],
+)
+def test_what_drifts_by_its_own_word_is_braked_again(
+    end: End, measured: bool, speed_mps: float, wanted: ControlMode
+) -> None:
+    before = Fallback(mode=HOLD, since_ns=5 * S, end=end, held_ns=4 * S)
+    after = advance(before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0), measured=measured)
+    if end is STOP:
+        assert after.mode is LAND  # its second for the zero is over
+    else:
+        assert (after.mode, after.held_ns) == (wanted, 4 * S)
+
+
+@pytest.mark.parametrize("mode", [BRAKE, HOLD])
+@pytest.mark.parametrize(("after_ns", "over"), [(3 * S - 1, False), (3 * S, True)])
+def test_the_time_to_hold_runs_on_while_it_brakes_again(mode: ControlMode, after_ns: int, over: bool) -> None:
+    before = Fallback(mode=mode, since_ns=5 * S + after_ns, held_ns=5 * S)
+    after = advance(before, 5 * S + after_ns, FAST, ZERO, PARAMETERS)
+    assert after == (replace(before, mode=LAND) if over else before)
+    # Where nothing is configured to land, it brakes for as long as it drifts.
+    assert advance(before, 5 * S + after_ns, FAST, ZERO, STAY, measured=True).mode is BRAKE
+
+
+def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> None:
+    assert learnt(()) == ()
+    biases: Biases = ()
+    for n, bias in enumerate([(0.3, 0.2, -0.1), (0.2, -0.1, -0.3), (0.4, 0.2, -0.2)]):
+        biases = remember(biases, n * S, bias)
+        assert (learnt(biases) == (0.0, 0.0, 0.0)) == (n < 2)
+    assert learnt(biases) == (0.2, 0.0, -0.1)
+    assert learnt(((0, (0.5,)), (2 * S - 1, (0.5,)))) == (0.0,)
+    assert learnt(((0, (0.5,)), (2 * S, (0.5,)))) == (0.5,)
+    later = remember(biases, 3 * S, (0.4, 0.1, 0.1))
+    assert later[0][0] == 0
+    assert remember(later, 3 * S + 1, (0.4, 0.1, 0.1))[0][0] == S

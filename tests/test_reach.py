@@ -85,9 +85,10 @@ def test_row_13_one_jump_counts_as_lost_and_is_told(by_m: float) -> None:
 def test_row_13_a_jump_that_persists_ends_in_landing_and_is_never_believed_again(by_m: float) -> None:
     samples = shifted(noisy(one_a_step()), range(6, 1000), by_m)
     outputs = run(gated(), inputs_of(range(40 * TICKS), samples))
-    # Steps 6, 7, 8 and 9: more than 0.5 s from the first to the last.
-    found = 9 * TICKS
-    assert modes(outputs)[:found] == [TRACK] * found
+    # Steps 6, 7, 8 and 9: more than 0.5 s from the first to the last; two of them are enough to brake.
+    doubted, found = 7 * TICKS, 9 * TICKS
+    assert modes(outputs)[:doubted] == [TRACK] * doubted
+    assert set(modes(outputs)[doubted:found]) <= {BRAKE, HOLD}
     assert modes(outputs)[found] in (BRAKE, HOLD)
     assert outputs[found].decision.reason == "positions jumped and are not believed any more"
     lands = modes(outputs).index(LAND)
@@ -98,11 +99,11 @@ def test_row_13_a_jump_that_persists_ends_in_landing_and_is_never_believed_again
 
 
 @pytest.mark.fault(13)
-def test_row_13_without_a_configured_landing_it_holds_on_and_never_goes_back_to_plans() -> None:
+def test_row_13_without_a_configured_landing_it_lets_go_and_never_goes_back_to_plans() -> None:
     samples = shifted(noisy(one_a_step()), range(6, 12), 2.0)  # and comes back
     outputs = run(gated(land=False), inputs_of(range(60 * TICKS), samples))
     assert TRACK not in modes(outputs)[9 * TICKS :]
-    assert set(modes(outputs)[-20 * TICKS :]) == {HOLD}
+    assert set(modes(outputs)[-20 * TICKS :]) == {STOPPED}
 
 
 @pytest.mark.fault(13)

@@ -51,7 +51,7 @@ def relay(**more: Any) -> Relay:
 def test_a_pose_carries_its_time_of_capture_in_the_vehicle_s_clock() -> None:
     one = relay()
     one.take(sample(NOW - 30 * MS), LEVEL)
-    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=False, refused=0)
+    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=False, refused=())
     assert pose == Pose("vision-position-estimate", 99_970_000, (1.0, 2.0, -0.5), LEVEL, None)
 
 
@@ -59,7 +59,7 @@ def test_a_vehicle_that_asks_for_our_time_gets_stamps_of_our_clock() -> None:
     """PX4 moves the stamps by what its own TIMESYNC found: moved here too they would be shifted twice."""
     one = relay()
     one.take(sample(NOW - 30 * MS), LEVEL)
-    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=True, refused=0)
+    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=True, refused=())
     assert pose.usec == (NOW - 30 * MS) // 1000
 
 
@@ -71,24 +71,25 @@ def test_nothing_goes_without_a_clock_or_an_attitude_or_when_switched_off() -> N
     one = relay()
     one.take(sample(NOW), LEVEL)
     one.take(sample(NOW), None)
-    assert one.due(NOW, offset_ns=None, asks=False, refused=0) == ()
+    assert one.due(NOW, offset_ns=None, asks=False, refused=()) == ()
     one.take(sample(NOW), LEVEL)
-    assert one.due(NOW, offset_ns=NOW, asks=False, refused=0) == ()  # before the vehicle's clock began
+    assert one.due(NOW, offset_ns=NOW, asks=False, refused=()) == ()  # before the vehicle's clock began
     assert kept(one) == {"no clock": 2, "no attitude": 1}
     off = Relay(RelayConfig())
     off.take(sample(NOW), LEVEL)
-    assert off.due(NOW, offset_ns=0, asks=False, refused=0) == ()
+    assert off.due(NOW, offset_ns=0, asks=False, refused=()) == ()
 
 
 def test_stale_late_and_refused_positions_stay_here() -> None:
     one = relay()
     one.take(sample(NOW - MAX_AGE_NS - 1), LEVEL)
     one.take(sample(NOW - 10 * MS, 1.0, 1.0, 0.0), LEVEL)
-    assert len(one.due(NOW, offset_ns=0, asks=False, refused=0)) == 1
+    assert len(one.due(NOW, offset_ns=0, asks=False, refused=())) == 1
     one.take(sample(NOW - 40 * MS, 1.1, 1.0, 0.0), LEVEL)  # captured before the one that went
-    assert one.due(NOW, offset_ns=0, asks=False, refused=0) == ()
-    one.take(sample(NOW + 40 * MS, 1.2, 1.0, 0.0), LEVEL)
-    assert one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=1) == ()
+    assert one.due(NOW, offset_ns=0, asks=False, refused=()) == ()
+    refused = sample(NOW + 40 * MS, 1.2, 1.0, 0.0)
+    one.take(refused, LEVEL)
+    assert one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=(refused,)) == ()
     assert kept(one) == {"stale": 1, "late": 1, "refused": 1}
 
 
@@ -97,11 +98,11 @@ def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
     for n in range(60):
         at_ns = NOW + n * 50 * MS
         one.take(sample(at_ns, received_ns=at_ns), LEVEL)
-        sent += len(one.due(at_ns, offset_ns=0, asks=False, refused=0))
+        sent += len(one.due(at_ns, offset_ns=0, asks=False, refused=()))
     assert (sent, kept(one)) == (STUCK_AFTER, {"stuck": 60 - STUCK_AFTER})
     at_ns = NOW + 60 * 50 * MS
     one.take(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
-    assert len(one.due(at_ns, offset_ns=0, asks=False, refused=0)) == 1
+    assert len(one.due(at_ns, offset_ns=0, asks=False, refused=())) == 1
 
 
 def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
@@ -110,7 +111,7 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
         at_ns = NOW + n * 10 * MS
         one.take(sample(at_ns, n * 1e-3, 0.0, 0.0, received_ns=at_ns), LEVEL)
         if n % 10 == 9:
-            poses += one.due(at_ns, offset_ns=0, asks=False, refused=0)
+            poses += one.due(at_ns, offset_ns=0, asks=False, refused=())
     stamps = [pose.usec for pose in poses]
     assert stamps == sorted(stamps) and 38 <= len(stamps) <= 41
 
@@ -118,8 +119,8 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
 def test_what_arrives_after_the_tick_waits_for_the_next() -> None:
     one = relay()
     one.take(sample(NOW, received_ns=NOW + 1), LEVEL)
-    assert one.due(NOW, offset_ns=0, asks=False, refused=0) == ()
-    assert len(one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=0)) == 1
+    assert one.due(NOW, offset_ns=0, asks=False, refused=()) == ()
+    assert len(one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=())) == 1
 
 
 def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position() -> None:
@@ -127,13 +128,13 @@ def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position
     assert east is not None
     one = relay(message="odometry")
     one.take(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)
-    (pose,) = one.due(NOW, offset_ns=0, asks=False, refused=0)
+    (pose,) = one.due(NOW, offset_ns=0, asks=False, refused=())
     assert pose.body_mps == pytest.approx((2.0, 0.0, 0.0))
     (message,) = read(Encoder(245, 25).external_position(pose))
     assert (message.get_type(), message.frame_id, message.child_frame_id) == ("ODOMETRY", 20, 12)
     assert (message.x, message.y, message.z, message.vx) == pytest.approx((1.0, 2.0, -0.5, 2.0))
     one.take(sample(NOW + SECOND, received_ns=NOW + SECOND), east)
-    (pose,) = one.due(NOW + SECOND, offset_ns=0, asks=False, refused=0)
+    (pose,) = one.due(NOW + SECOND, offset_ns=0, asks=False, refused=())
     (message,) = read(Encoder(245, 25).external_position(pose))
     assert message.get_type() == "VISION_POSITION_ESTIMATE"
     assert (message.roll, message.pitch, message.yaw) == pytest.approx((0.0, 0.0, math.pi / 2))

@@ -15,7 +15,7 @@ CONTROLLER = make_controller()
 def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> Intake:
     """Intake after several ticks, each (time in ms, samples)."""
     history = begin(CONTROLLER.kalman, START_NS, START_NS)
-    intake = Intake(history=history, trust=Trust(), moved=False, accepted=0, refused=(), fresh=0)
+    intake = Intake(history=history, trust=Trust(), moved=False, accepted=(), refused=(), clean_ns=None, fresh=0)
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
         intake = take(CONTROLLER.kalman, CONTROLLER.reach, intake.history, intake.trust, inp, horizon, intake.fresh)
@@ -56,24 +56,24 @@ def test_an_overtaken_sample_changes_nothing() -> None:
 
 def test_the_same_instant_from_a_second_source_counts_once() -> None:
     intake = taken([(200, [captured(200), captured(200, source="second")])])
-    assert (intake.accepted, intake.fresh) == (2, 1)
+    assert (len(intake.accepted), intake.fresh) == (2, 1)
 
 
 def test_refused_samples_do_not_count() -> None:
     again = captured(200)
     future = captured(471, received_ms=450)
     intake = taken([(200, [again]), (450, [again, future])])
-    assert (intake.fresh, intake.accepted) == (1, 0)
-    assert sorted(intake.refused) == ["sample-duplicate", "sample-future"]
+    assert (intake.fresh, intake.accepted) == (1, ())
+    assert intake.refused == ((future, "sample-future"), (again, "sample-duplicate"))
 
 
 def test_a_stamp_within_the_tolerance_after_the_arrival_counts_as_captured_at_the_arrival() -> None:
     arrival_ns = START_NS + 440 * MS
     intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS, arrival_ns)])])
-    assert (intake.accepted, intake.history.captured_ns) == (1, arrival_ns)
+    assert (len(intake.accepted), intake.history.captured_ns) == (1, arrival_ns)
 
 
 def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_tick() -> None:
     arrival_ns = START_NS + 440 * MS
     intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS + 1, arrival_ns)])])
-    assert (intake.accepted, intake.refused) == (0, ("sample-future",))
+    assert (len(intake.accepted), [why for _, why in intake.refused]) == (0, ["sample-future"])

@@ -36,9 +36,10 @@ def watched(values: list[float], source: str = "camera", watches: Watches | None
 def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_last_one() -> None:
     watch = watched([0.0, 0.5, 0.25, 0.75])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.coasting) == (0.25, 0, None)
-    assert watch.news_m == pytest.approx(0.001 * (1 - 0.9**3))
+    assert watch.news_m == pytest.approx(0.001)
+    assert (watch.changes, watch.first_ns) == (3, START_NS + 4 * TICK_NS)
     watch = watched([0.0, 0.5, 0.5, 0.5])["camera"]
-    assert (watch.resolution_m, watch.repeats) == (0.5, 2)
+    assert (watch.resolution_m, watch.repeats, watch.first_ns) == (0.5, 2, START_NS + 2 * TICK_NS)
     assert watch.coasting is not None
     assert watch.coasting.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
     watch = watched([0.0, 0.5, 0.5, 0.25])["camera"]
@@ -127,7 +128,7 @@ def test_what_counts_as_stuck(
         mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
-    watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats, belief)
+    watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats=repeats, coasting=belief)
     assert stuck(watch, KALMAN, one, PARAMETERS) is found
     assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
     assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS) is True

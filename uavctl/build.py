@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,8 +11,10 @@ from uavctl.build_late import build_delayed_link, late_steps
 from uavctl.build_link import promised
 from uavctl.build_mission import build_mission, build_names
 from uavctl.config.types import Config
+from uavctl.data import Vec3
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
+from uavctl.flight.envelope import EnvelopeParameters
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
@@ -29,6 +33,12 @@ from uavctl.smpc.plant import AXES, Plant, drag_lag
 from uavctl.smpc.sets import Polytope
 
 NANOSECONDS = 1e9
+
+# Where `[envelope]` says nothing; the figures of false alarms are in docs/soak.md.
+LEAST_OUTSIDE_M = 0.5
+LEAST_UNEXPLAINED_MPS2, ENVELOPE_SIGMA = 1.5, 6.0
+DISAGREES_S = 0.17
+LEAST_WINDOW_S = 1.2
 
 
 def build_plant(config: Config) -> Plant:
@@ -178,6 +188,40 @@ def build_estimator(config: Config) -> EstimatorParameters:
     )
 
 
+def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
+    """What is possible in flight, by the limits, the plant and the last gate."""
+    sets, envelope, limits = config.sets, config.envelope, config.limits
+    places = dict(zip(plant.axes, plant.position_index, strict=True))
+    lower = [sets.state_lower[places[axis]] if axis in places else -math.inf for axis in AXES]
+    upper = [sets.state_upper[places[axis]] if axis in places else math.inf for axis in AXES]
+    room = [high - low for low, high in zip(lower, upper, strict=True)]
+    outside = [envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, LEAST_OUTSIDE_M) for size in room]
+    # What one step's disturbance does to a velocity, as an acceleration over the step.
+    spread = plant.e[list(plant.velocity_index)] @ plant.w @ plant.e[list(plant.velocity_index)].T
+    std_mps2 = float(np.sqrt(np.diagonal(spread).max())) / plant.dt_s
+    unexplained = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, LEAST_UNEXPLAINED_MPS2)
+    lags: dict[str, float] = {}
+    if config.plant.model == "drag-lag":
+        lags.update(zip(plant.axes, config.plant.lag_s, strict=True))
+    return EnvelopeParameters(
+        axes=tuple(axis in plant.axes for axis in AXES),
+        lower_m=_vec3(lower),
+        upper_m=_vec3(upper),
+        outside_m=_vec3(outside),
+        brake_mps2=limits.accel_mps2,
+        lag_s=_vec3([lags.get(axis, 0.0) for axis in AXES]),
+        unexplained_mps2=unexplained,
+        disagreement_mps=envelope.disagreement_mps or DISAGREES_S * unexplained,
+        window_ns=round(max(LEAST_WINDOW_S, 4.0 * plant.dt_s) * NANOSECONDS),
+        begins_mps=config.estimator.initial_std,
+    )
+
+
+def _vec3(values: list[float]) -> Vec3:
+    north, east, down = values
+    return north, east, down
+
+
 def build_controller(config: Config, design: Design | None = None, library: Library | None = None) -> Controller:
     """Everything constant that a control tick needs; design and policy library are made if they are not given.
 
@@ -186,8 +230,9 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
     """
     design = build_design(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
+    plant = build_plant(config)
     return Controller(
-        plant=build_plant(config),  # the design's own may be the one that the estimator makes of it
+        plant=plant,  # the design's own may be the one that the estimator makes of it
         design_id=design.design_id,
         horizon=design.horizon,
         solver=build_solver(design, config, library),
@@ -195,6 +240,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
         names=build_names(design),
         link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
         late_steps=len(design.late),
+        envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
         fallback=FallbackParameters(
             brake_gain_1ps=fallback.brake_gain_1ps,

@@ -158,7 +158,17 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
     landed: bool | None = None
     battery_v: float | None = None
     boots: int = 0  # times that it was seen to start anew
+    own_climb: bool = False  # it climbs, or lands, by itself, whatever it is sent
     alone: bool = True  # no other vehicle has been heard lately
+
+
+class VehicleMotion(Record, frozen=True, kw_only=True):
+    """How the vehicle itself says that it moves: the newest of each, with its time of arrival."""
+
+    velocity_mps: Vec3 | None = None  # local NED, by its own estimate
+    velocity_ns: int | None = None
+    attitude_rad: Vec3 | None = None  # roll, pitch, yaw: body axes forward, right, down in NED
+    attitude_ns: int | None = None
 
 
 class Severity(StrEnum):
@@ -211,6 +221,7 @@ class StepInput(Record, frozen=True, kw_only=True):
     at_ns: int  # the tick's place on the grid, not the moment it ran
     samples: tuple[PositionSample, ...] = ()
     vehicle: VehicleStatus | None = None
+    motion: VehicleMotion | None = None
     missed_ticks: int = 0
     stop: bool = False  # the operator asks for the hand-over
     commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came

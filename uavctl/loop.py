@@ -27,6 +27,7 @@ from uavctl.data import (
     Sink,
     StepInput,
     Timing,
+    VehicleMotion,
     VehicleStatus,
     raw_topic,
 )
@@ -85,11 +86,12 @@ class ControlLoop:
         self._config = config.hand_over
         self._heard: tuple[Ack | Text, ...] = ()
         self._state = initial_state()
-        self._inbox: deque[tuple[int, PositionSample | VehicleStatus | Ack | Text]] = deque()
+        self._inbox: deque[tuple[int, PositionSample | VehicleStatus | VehicleMotion | Ack | Text]] = deque()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
         self.heard_vehicle = False  # whether the last datagram came from the vehicle that is flown
         self.vehicle: VehicleStatus | None = None
+        self._motion: VehicleMotion | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
         self.link: LinkEstimate | None = None
@@ -163,7 +165,7 @@ class ControlLoop:
         self.link = out.link or self.link
         self._record(out, at_ns)
         autopilot = "" if self.vehicle is None else self.vehicle.autopilot
-        for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.decision.rejected):
+        for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
             yield self._send(VEHICLE, data, at_ns)
         yield from self._command(inp, out)
         self._record_stats(at_ns)
@@ -199,6 +201,7 @@ class ControlLoop:
             at_ns=at_ns,
             samples=samples,
             vehicle=self._hand_over.flown(at_ns, self.vehicle),
+            motion=self._motion,
             missed_ticks=missed_ticks,
             stop=stop,
             commands=tuple(self._orders),
@@ -221,6 +224,8 @@ class ControlLoop:
             if isinstance(item, VehicleStatus):
                 self.vehicle = item
                 heard.append(item)
+            elif isinstance(item, VehicleMotion):
+                self._motion = item
             elif isinstance(item, PositionSample):
                 samples.append(item)
             else:

@@ -101,7 +101,7 @@ class Preflight:
             for data in link.due(at_ns):
                 yield Outgoing(link=name, data=data)
         vehicle = self._links[VEHICLE]
-        for data in vehicle.relay(self._relay, at_ns, self._autopilot, refused=0):
+        for data in vehicle.relay(self._relay, at_ns, self._autopilot, refused=()):
             yield Outgoing(link=VEHICLE, data=data)
         if vehicle.vehicle is not None:
             for data in vehicle.place_on_globe(at_ns, self._config.hand_over.origin_deg_m):

@@ -268,6 +268,36 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
     slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
 
 
+Bound = Annotated[float, Meta(gt=0)] | None
+
+
+class EnvelopeConfig(Section, frozen=True, kw_only=True):
+    """What is possible in flight; beyond it the vehicle is let go: level, and its own landing."""
+
+    outside_m: Annotated[
+        Bound,
+        Meta(
+            description="how far the estimate may be beyond the position limits of `[sets]`, or come to by braking; "
+            "without it a tenth of the room in that axis, at least 0.5 [m]"
+        ),
+    ] = None
+    unexplained_mps2: Annotated[
+        Bound,
+        Meta(
+            description="acceleration that positions may show beside the setpoints sent: wind, and the model's error, "
+            "not a frame that is turned; without it six standard deviations of the plant's disturbance, at least 1.5 "
+            "[m/s²]"
+        ),
+    ] = None
+    disagreement_mps: Annotated[
+        Bound,
+        Meta(
+            description="difference between the velocity that positions show and the vehicle's own, where that comes; "
+            "without it what unexplained_mps2 makes in 0.17 s [m/s]"
+        ),
+    ] = None
+
+
 class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
@@ -288,6 +318,7 @@ class Config(Section, frozen=True, kw_only=True):
     link: LinkConfig = LinkConfig()
     frame: FrameConfig = FrameConfig()
     fallback: FallbackConfig = FallbackConfig()
+    envelope: EnvelopeConfig = EnvelopeConfig()
     clock: ClockConfig = ClockConfig()
     source: SourceConfig = SourceConfig()
     hand_over: HandOverConfig = HandOverConfig()

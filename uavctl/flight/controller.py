@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import msgspec
 
 from uavctl.data import Command, ControlMode, Plan, Vec3
+from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Watching
 from uavctl.flight.estimator import History
-from uavctl.flight.fallback import Fallback, FallbackParameters
+from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
@@ -38,6 +39,7 @@ class Controller:
         dt_ns: Δt [ns].
         tick_ns: Time between ticks [ns]; divides Δt.
         link: What the estimate of the link goes by.
+        envelope: What is possible; None: nothing is held against it.
         late_steps: Age up to which the solver counts what it has not seen since [steps].
         kalman: The filter, made from the others.
         reach: Where the vehicle can be, made from the others.
@@ -60,6 +62,7 @@ class Controller:
     tick_ns: int
     link: LinkEstimateParameters
     late_steps: int = 0
+    envelope: EnvelopeParameters | None = None
     kalman: Kalman = field(init=False, repr=False)
     reach: Reach = field(init=False, repr=False)
 
@@ -94,6 +97,9 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         order: What the operator ordered of the mission and no decision has taken up yet.
         link: What the boundaries so far have shown of the link.
         link_alarms: What was told of the link and still holds, by event code.
+        watching: What the envelope knows of this flight.
+        breach: What it found that cannot be; None for nothing.
+        biases: Estimated biases of late.
     """
 
     history: History | None = None
@@ -107,6 +113,9 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     order: Command | None = None
     link: LinkBelief = NOTHING_SEEN
     link_alarms: tuple[str, ...] = ()
+    watching: Watching = NOT_WATCHING
+    breach: Breach | None = None
+    biases: Biases = ()
 
     @property
     def mode(self) -> ControlMode:

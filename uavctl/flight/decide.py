@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.data import ControlMode, Estimate, Plan, SolveStatus, StepInput, Vec3
+from uavctl.data import ControlMode, Estimate, Plan, PositionSample, SolveStatus, StepInput, Vec3, Vector
+from uavctl.flight import envelope
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.estimator import History, belief_at, estimate, estimated, newest_capture_ns
@@ -46,6 +50,7 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
 
 _FINAL = {
     End.BARRED: "positions jumped and are not believed any more",
+    End.LET_GO: "what is seen cannot be",
     End.STOP: "the operator asked for the hand-over",
     End.LAND: "landing is due",
 }
@@ -75,7 +80,7 @@ def place(state: ControlState, inp: StepInput, history: History, controller: Con
 def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
     """Who flies: nobody yet, the plan, or the fallback."""
     if state.fallback is not None and state.fallback.ended:
-        return _fall(state, state.fallback, tick, inp.at_ns, controller, "handed over")
+        return _fall(state, state.fallback, tick, inp, controller, "handed over")
     why_not = unready(inp.vehicle)
     if inp.stop:
         state = replace(state, fallback=fb.request(state.fallback, End.STOP, inp.at_ns))
@@ -83,30 +88,37 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns, end=End.STOP)
         return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
     if inp.vehicle is None and state.mode is not ControlMode.WAIT:
-        return _wait_out(state, state.fallback or fb.enter(inp.at_ns), tick, inp.at_ns, controller)
+        return _wait_out(state, state.fallback or fb.enter(inp.at_ns), tick, inp, controller)
     if why_not:
         return Choice(replace(state, plan=None, fallback=None), why_not)
     if state.fallback is not None and state.fallback.final:
-        return _fall(state, state.fallback, tick, inp.at_ns, controller, _FINAL[state.fallback.end])
+        why = _FINAL[state.fallback.end]
+        if state.fallback.end is End.LET_GO and state.breach is not None:
+            why = state.breach.text
+        return _fall(state, state.fallback, tick, inp, controller, why)
+    if state.plan is not None and state.trust.suspect is not None and state.trust.suspect.likely:
+        why = "positions jumped: braking until they are believed again, or not any more"
+        return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
     if tick.boundary:
-        return _decide(state, tick, inp.at_ns, controller)
+        return _decide(state, tick, inp, controller)
     if state.fallback is not None:
-        return _fall(state, state.fallback, tick, inp.at_ns, controller, "fallback goes on")
+        return _fall(state, state.fallback, tick, inp, controller, "fallback goes on")
     waiting = state.plan is None
     return Choice(state, "waits for the next boundary" if waiting else "held until the next boundary")
 
 
-def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller) -> Choice:
+def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
     """The decision of a Δt boundary, with a vehicle that takes setpoints."""
+    at_ns = inp.at_ns
     if tick.age_steps is None:
         never = tick.estimate is None
         return Choice(state, "no position yet" if never else "no position from before this boundary yet")
     if tick.age_steps >= controller.horizon:
         reason = f"age of information {tick.age_steps} has reached H = {controller.horizon}"
-        return _fall(state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, reason)
+        return _fall(state, state.fallback or fb.enter(at_ns), tick, inp, controller, reason)
     if state.fallback is not None and state.fresh < controller.fallback.recover_samples:
         reason = f"{state.fresh} of {controller.fallback.recover_samples} fresh samples in a row"
-        return _fall(state, state.fallback, tick, at_ns, controller, reason)
+        return _fall(state, state.fallback, tick, inp, controller, reason)
     on_time = at_ns == tick.boundary_ns
     base = tick.estimate if on_time else estimate(controller.kalman, tick.history, tick.boundary_ns)
     if base is None:
@@ -115,12 +127,12 @@ def _decide(state: ControlState, tick: Tick, at_ns: int, controller: Controller)
     state = replace(state, mission=mission)
     if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
-        return _fall(state, landing, tick, at_ns, controller, "the mission is over: landing")
+        return _fall(state, landing, tick, inp, controller, "the mission is over: landing")
     choice = _replan(state, mission, base, tick, controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
-    fallen = _fall(choice.state, state.fallback or fb.enter(at_ns), tick, at_ns, controller, "no plan is left to fly")
+    fallen = _fall(choice.state, state.fallback or fb.enter(at_ns), tick, inp, controller, "no plan is left to fly")
     return replace(choice, state=fallen.state, reason=fallen.reason)
 
 
@@ -142,23 +154,23 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
 
 
 def _fall(
-    state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller, reason: str
+    state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller, reason: str
 ) -> Choice:
     """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
-    fallback = _advanced(state, fallback, tick, at_ns, controller)
+    fallback = _advanced(state, fallback, tick, inp, controller)
     if fallback.mode is ControlMode.LAND and not fallback.final:
         reason = f"held for {controller.fallback.hold_s:g} s, and positions did not come back: landing"
     fresh = 0 if state.fallback is None else state.fresh
     return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
 
 
-def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Choice:
+def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
     """Let the fallback's time run on while the vehicle is silent.
 
     Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
     nothing is sent, so that a vehicle that still listens lands by its own failsafe.
     """
-    later = _advanced(state, fallback, tick, at_ns, controller)
+    later = _advanced(state, fallback, tick, inp, controller)
     state = replace(state, plan=None, fresh=0 if state.fallback is None else state.fresh)
     if later.ended:
         reason = "no vehicle is heard, and the time to hold is over: its own failsafe is left to act"
@@ -167,15 +179,74 @@ def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, c
     return Choice(replace(state, fallback=later), "no vehicle is heard; the fallback's time runs on")
 
 
-def _advanced(state: ControlState, fallback: Fallback, tick: Tick, at_ns: int, controller: Controller) -> Fallback:
-    speed_mps = float(np.linalg.norm(velocity(tick.estimate, controller.plant)))
-    return fb.advance(fallback, at_ns, speed_mps, state.accel_mps2, controller.fallback)
+def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Fallback:
+    moving, measured = moving_mps(state, tick, inp, controller)
+    return fb.advance(
+        fallback,
+        inp.at_ns,
+        math.hypot(*moving),
+        state.accel_mps2,
+        controller.fallback,
+        held_mps2(state, fallback, controller),
+        measured=measured,
+    )
+
+
+def held_mps2(state: ControlState, fallback: Fallback, controller: Controller) -> Vec3:
+    """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
+    bias = fb.learnt(state.biases)
+    # What the vehicle keeps when nothing more is sent is zero itself.
+    if not bias or (fallback.final and fallback.mode is ControlMode.HOLD) or fallback.end is End.LET_GO:
+        return ZERO
+    north, east, down = controller.plant.to_accel(-np.array(bias))
+    return north, east, down
+
+
+def moving_mps(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> tuple[Vec3, bool]:
+    """Velocity to brake on, and whether it is the vehicle's own word; else it is the predicted one."""
+    predicted = velocity(tick.estimate, controller.plant)
+    if controller.envelope is None or inp.motion is None or tick.estimate is None:
+        return predicted, False
+    seen = seen_of(tick, inp, state.accel_mps2, controller.plant)
+    own = envelope.own_velocity(state.watching, seen, tick.estimate.age_s, controller.envelope)
+    if own is None:
+        return predicted, False
+    north, east, down = (v if axis in controller.plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
+    return (north, east, down), True
+
+
+def seen_of(
+    tick: Tick,
+    inp: StepInput,
+    sent_mps2: Vec3,
+    plant: Plant,
+    accepted: Sequence[PositionSample] = (),
+    *,
+    braking: bool = False,
+) -> envelope.Seen:
+    """What the envelope may know of a tick."""
+    position, speed = None, (math.nan, math.nan, math.nan)
+    if tick.estimate is not None:
+        mean = tick.estimate.mean
+        position, speed = (_vec3(plant, mean, each, math.nan) for each in (plant.position_index, plant.velocity_index))
+    return envelope.Seen(
+        at_ns=inp.at_ns,
+        samples=accepted,
+        sent_mps2=sent_mps2,
+        position_m=position,
+        velocity_mps=speed,
+        motion=inp.motion,
+        braking=braking,
+    )
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
     """Predicted velocity, zero in the axes that the plant has not."""
-    if estimated is None:
-        return ZERO
-    speeds = dict(zip(plant.axes, (estimated.mean[index] for index in plant.velocity_index), strict=True))
-    north, east, down = (speeds.get(axis, 0.0) for axis in AXES)
+    return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.velocity_index, 0.0)
+
+
+def _vec3(plant: Plant, mean: Vector, index: Sequence[int], missing: float) -> Vec3:
+    """Entries of a state (n_x,) as north, east, down."""
+    values = dict(zip(plant.axes, (mean[place] for place in index), strict=True))
+    north, east, down = (values.get(axis, missing) for axis in AXES)
     return north, east, down

@@ -8,7 +8,7 @@ late one a recomputation from its place on: the result is the same to the last b
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 
 import msgspec
@@ -122,6 +122,17 @@ def absorb(
             history = _inserted(kalman, history, new, belief)
         belief = None  # the next one's is another
     return history, tuple(taken), tuple(refused)
+
+
+def without(kalman: Kalman, history: History, poisoned: Callable[[PositionSample], bool]) -> History:
+    """The state as if some samples of the window had not come."""
+    node, kept = history.anchor, []
+    for entry in history.entries:
+        if entry.sample is not None and poisoned(entry.sample):
+            continue
+        node = _after(kalman, history.origin_ns, node, entry)
+        kept.append(replace(entry, after=node))
+    return replace(history, entries=tuple(kept))
 
 
 def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, belief: Belief | None = None) -> History:

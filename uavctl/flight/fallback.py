@@ -1,4 +1,4 @@
-"""What flies when no plan may: brake on the prediction, zero acceleration, the vehicle's own landing.
+"""What flies when no plan may: brake, zero acceleration, the vehicle's own landing.
 
 A state machine of four modes, each with a time limit:
 
@@ -6,9 +6,14 @@ A state machine of four modes, each with a time limit:
 
     end       from HOLD
     RECOVER   LAND after hold_s, if configured; else it holds on
-    BARRED    LAND once its zero has been sent, if configured; else it holds on
+    BARRED    LAND once its zero has been sent, if configured; else STOPPED
+    LET_GO    the same; and nothing is braked on before, as no position is believed: level at once
     STOP      LAND once its zero has been sent, if configured; else STOPPED
     LAND      LAND once its zero has been sent
+
+Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.envelope`), else by the predicted
+one. By its own velocity it brakes again if it drifts while it holds; the time to hold runs on meanwhile. HOLD begins
+only when the setpoint has come down to what is held: it never accelerates.
 
 The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at Δt boundaries
 (`uavctl.flight.decide`).
@@ -19,11 +24,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import IntEnum, auto
 
-from uavctl.data import ControlMode, Vec3
+from uavctl.data import ControlMode, Vec3, Vector
 from uavctl.flight.limits import ZERO
 
 SETTLE_S = 1.0  # longest time that the last gate may take to let a zero through
-STILL_MPS = 0.02  # below this predicted speed there is nothing left to brake
+STILL_MPS = 0.02  # below this speed there is nothing left to brake
+DRIFT_MPS = 0.15  # above this speed, by the vehicle's own word, it drifts
+CALM_MPS2 = 0.04  # HOLD begins within this of what it sends
+LEARNT_NS = 2_000_000_000  # a bias counts that has been there for so long,
+LATELY_NS = 3_000_000_000  # as far as it has been there for all of this time
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,7 @@ class End(IntEnum):
 
     RECOVER = auto()  # plans, once positions are back; until then as configured
     BARRED = auto()  # positions are not believed any more: as configured, and plans never again
+    LET_GO = auto()  # what is seen cannot be: the same, and nothing is braked on
     STOP = auto()  # the operator's stop: as configured, and then nothing is sent
     LAND = auto()  # the vehicle's own landing, whatever is configured
 
@@ -62,11 +72,13 @@ class Fallback:
         mode: BRAKE, HOLD, LAND or STOPPED.
         since_ns: When this mode was entered [ns].
         end: What it ends in.
+        held_ns: When it first held [ns]; None before.
     """
 
     mode: ControlMode
     since_ns: int
     end: End = End.RECOVER
+    held_ns: int | None = None
 
     @property
     def ended(self) -> bool:
@@ -85,43 +97,67 @@ def enter(at_ns: int) -> Fallback:
 
 
 def request(fallback: Fallback | None, end: End, at_ns: int) -> Fallback:
-    """The fallback once an end other than RECOVER is asked for; braking begins unless it is under way."""
+    """The fallback once an end other than RECOVER is asked for; it brakes first, unless nothing may be braked on."""
     if fallback is not None and (fallback.ended or fallback.end >= end):
         return fallback
-    if fallback is not None and fallback.mode is ControlMode.BRAKE:
+    if end is End.LET_GO:
+        return Fallback(mode=ControlMode.HOLD, since_ns=at_ns, end=end)
+    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.end is End.LET_GO):
         return replace(fallback, end=end)
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, end=end)
 
 
 def advance(
-    fallback: Fallback, at_ns: int, speed_mps: float, sent_mps2: Vec3, parameters: FallbackParameters
+    fallback: Fallback,
+    at_ns: int,
+    speed_mps: float,
+    sent_mps2: Vec3,
+    parameters: FallbackParameters,
+    held_mps2: Vec3 = ZERO,
+    *,
+    measured: bool = False,
 ) -> Fallback:
     """The fallback at `at_ns`, with all transitions that are due.
 
     Args:
         fallback: State after the tick before.
         at_ns: Time of this tick [ns].
-        speed_mps: Predicted speed now [m/s]; NaN counts as moving.
+        speed_mps: Speed now [m/s]; NaN counts as moving.
         sent_mps2: The setpoint of the tick before [m/s²].
         parameters: Times and choices.
+        held_mps2: What HOLD sends [m/s²].
+        measured: Whether the speed is the vehicle's own word, not a prediction.
     """
     mode = fallback.mode
+    if mode is ControlMode.STOPPED:
+        return fallback
     if mode is ControlMode.LAND:
         return replace(fallback, mode=ControlMode.STOPPED, since_ns=at_ns)
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
-    if mode is ControlMode.BRAKE and (speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s):
-        return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns)
+    held_ns = fallback.since_ns if fallback.held_ns is None else fallback.held_ns
+    due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= parameters.hold_s
+    if mode is ControlMode.BRAKE and not due:
+        slow = speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s
+        off_mps2 = max(abs(sent - held) for sent, held in zip(sent_mps2, held_mps2, strict=True))
+        if slow and (off_mps2 <= CALM_MPS2 or elapsed_s >= parameters.brake_s + SETTLE_S):
+            held_ns = at_ns if fallback.held_ns is None else held_ns
+            return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns, held_ns=held_ns)
+        return fallback
     # A vehicle keeps its last setpoint for a while: that one is HOLD's zero, once the last gate lets it through.
     settled = fallback.final and (sent_mps2 == ZERO or elapsed_s >= SETTLE_S)
-    if mode is ControlMode.HOLD and (settled or elapsed_s >= parameters.hold_s):
+    if settled or due:
         after = _after_hold(fallback.end, parameters.land)
-        return fallback if after is mode else replace(fallback, mode=after, since_ns=at_ns)
+        if after is not ControlMode.HOLD:
+            return replace(fallback, mode=after, since_ns=at_ns)
+    if mode is ControlMode.HOLD and measured and not fallback.final and speed_mps > DRIFT_MPS:
+        return replace(fallback, mode=ControlMode.BRAKE, since_ns=at_ns)
     return fallback
 
 
-def acceleration(fallback: Fallback, velocity_mps: Vec3, parameters: FallbackParameters) -> Vec3:
-    """Acceleration asked for [m/s²]: against the predicted velocity while braking, else zero."""
-    if fallback.mode is not ControlMode.BRAKE:
+def acceleration(fallback: Fallback, at_ns: int, velocity_mps: Vec3, parameters: FallbackParameters) -> Vec3:
+    """Acceleration asked for [m/s²]: against the velocity while braking, else zero."""
+    over = at_ns - fallback.since_ns >= parameters.brake_s * 1e9
+    if fallback.mode is not ControlMode.BRAKE or over:
         return ZERO
     north, east, down = (-parameters.brake_gain_1ps * v for v in velocity_mps)
     return north, east, down
@@ -130,4 +166,27 @@ def acceleration(fallback: Fallback, velocity_mps: Vec3, parameters: FallbackPar
 def _after_hold(end: End, land: bool) -> ControlMode:
     if land or end is End.LAND:
         return ControlMode.LAND
-    return ControlMode.STOPPED if end is End.STOP else ControlMode.HOLD
+    return ControlMode.HOLD if end is End.RECOVER else ControlMode.STOPPED
+
+
+# The bias that braking and holding count on
+
+Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), oldest first
+
+
+def remember(biases: Biases, at_ns: int, bias: Vector) -> Biases:
+    """The biases of late, with one more, from an estimate with a fresh position in it."""
+    return (*(one for one in biases if at_ns - one[0] <= LATELY_NS), (at_ns, bias))
+
+
+def learnt(biases: Biases) -> Vector:
+    """The part of a bias (n_u,) that has been there all the time of late; zero of one that is not known for long.
+
+    In the first seconds, and where the vehicle does not answer as the model says, an estimated bias comes and goes with
+    what is flown; blind, its acceleration would be flown for seconds.
+    """
+    if not biases:
+        return ()
+    known = biases[-1][0] - biases[0][0] >= LEARNT_NS
+    sides = [(min(values), max(values)) for values in zip(*(bias for _, bias in biases), strict=True)]
+    return tuple(max(low, 0.0) + min(high, 0.0) if known else 0.0 for low, high in sides)

@@ -20,7 +20,8 @@ from uavctl.smpc.plant import AXES, Plant
 
 JUMP = "sample-jump"
 
-_SAMPLES = 3  # that agree make a jump; two may be a chance
+_SAMPLES = 3  # that agree make a jump; two may be a chance,
+_SUSPECT_SAMPLES, _SUSPECT_NS = 2, 100_000_000  # and so long apart are reason enough to brake until it is known
 _HORIZONS = 2  # the vehicle may be anywhere after that many horizons of silence
 
 
@@ -70,6 +71,11 @@ class Suspect:
     last_ns: int
     count: int
     offset_m: Array
+
+    @property
+    def likely(self) -> bool:
+        """Whether the source may well have moved: nothing is flown on what is left of it."""
+        return self.count >= _SUSPECT_SAMPLES and self.last_ns - self.first_ns >= _SUSPECT_NS
 
     def moved(self, parameters: GateParameters) -> bool:
         """Whether this is no chance any more: the source has moved, or the estimate is lost."""

@@ -10,10 +10,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.data import PositionSample, StepInput, VehicleStatus
-from uavctl.flight.estimator import History, absorb, begin, belief_at, move_on
+from uavctl.flight.estimator import History, absorb, begin, belief_at, move_on, without
 from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
-from uavctl.flight.stuck import FROZEN, Watches, observe, stuck
+from uavctl.flight.stuck import FROZEN, REPEATED, Watches, doubtful, observe, stuck
 
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
@@ -47,16 +47,18 @@ class Intake(msgspec.Struct, frozen=True, eq=False):
         history: The estimator with them.
         trust: What is known of the sources.
         moved: A source has moved: positions are not to be believed any more.
-        accepted: Number of samples taken.
-        refused: Reason (an event's code) for each one that was not.
+        accepted: The samples taken.
+        refused: Those that were not, each with the reason (an event's code).
+        clean_ns: What was captured after this was believed and has been taken back; None if nothing was [ns].
         fresh: Fresh samples in a row, up to now.
     """
 
     history: History
     trust: Trust
     moved: bool
-    accepted: int
-    refused: tuple[str, ...]
+    accepted: tuple[PositionSample, ...]
+    refused: tuple[tuple[PositionSample, str], ...]
+    clean_ns: int | None
     fresh: int
 
 
@@ -81,18 +83,19 @@ def take(
     """
     newest_ns = history.captured_ns
     history = move_on(kalman, history, inp.at_ns)
-    accepted = 0
-    refused: tuple[str, ...] = ()
+    believed = _Believed(history=history, trust=trust)
     if inp.samples:
-        history, trust, taken, refused = _believe(kalman, reach, history, trust, inp)
-        accepted, fresh = len(taken), _fresh_in_row(kalman, history, newest_ns, inp.at_ns, taken, horizon, fresh)
+        believed = _believe(kalman, reach, history, trust, inp)
+        history, trust = believed.history, believed.trust
+        fresh = _fresh_in_row(kalman, history, newest_ns, inp.at_ns, believed.taken, horizon, fresh)
     return Intake(
         history=history,
         trust=trust,
         moved=trust.suspect is not None and trust.suspect.moved(reach.parameters),
-        accepted=accepted,
-        refused=refused,
-        fresh=fresh,
+        accepted=believed.taken,
+        refused=believed.refused,
+        clean_ns=believed.clean_ns,
+        fresh=0 if believed.clean_ns is not None else fresh,
     )
 
 
@@ -123,26 +126,65 @@ def _fresh_in_row(
     return fresh
 
 
-def _believe(
-    kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput
-) -> tuple[History, Trust, list[PositionSample], tuple[str, ...]]:
+class _Believed(msgspec.Struct, frozen=True, eq=False):
+    """What came of samples that were looked at one after another; the fields are those of `Intake`."""
+
+    history: History
+    trust: Trust
+    taken: tuple[PositionSample, ...] = ()
+    refused: tuple[tuple[PositionSample, str], ...] = ()
+    clean_ns: int | None = None
+
+
+def _believe(kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: StepInput) -> _Believed:
     """Give samples to the estimator in the order of their capture, each after it is held against what is known."""
     reasons = [refusal(sample, inp.at_ns, kalman.parameters) for sample in inp.samples]
     valid = [sample for sample, reason in zip(inp.samples, reasons, strict=True) if reason is None]
-    refused = [reason for reason in reasons if reason is not None]
+    refused = [(sample, reason) for sample, reason in zip(inp.samples, reasons, strict=True) if reason is not None]
     taken: list[PositionSample] = []
+    clean_ns: int | None = None
     for sample in sorted(valid, key=captured_ns):
         at_ns = captured_ns(sample)
         belief = belief_at(kalman, history, at_ns) if at_ns > history.horizon_ns else None
         if belief is not None:  # else it is the first one, or too old
-            trust, reason = _distrust(kalman, reach, history, trust, inp, sample, belief)
-            if reason is not None:
-                refused.append(reason)
+            found = _distrust(kalman, reach, history, trust, inp, sample, belief)
+            trust = found.trust
+            if found.stuck_ns is not None:
+                history, clean_ns = _unstuck(kalman, history, sample.source, found.stuck_ns, clean_ns)
+            if found.reason is not None:
+                refused.append((sample, found.reason))
                 continue
         history, one, why = absorb(kalman, history, inp.at_ns, (sample,), belief)
         taken.extend(one)
-        refused.extend(why)
-    return history, trust, taken, tuple(refused)
+        refused.extend((sample, reason) for reason in why)
+    return _Believed(history, trust, tuple(taken), tuple(refused), clean_ns)
+
+
+def _unstuck(
+    kalman: Kalman, history: History, source: str, first_ns: int, clean_ns: int | None
+) -> tuple[History, int | None]:
+    """Take back what a stuck source said again after `first_ns`; and from when on anything was taken back so far."""
+
+    def again(sample: PositionSample) -> bool:
+        return sample.source == source and captured_ns(sample) > first_ns
+
+    if not any(entry.sample is not None and again(entry.sample) for entry in history.entries):
+        return history, clean_ns
+    return without(kalman, history, again), first_ns if clean_ns is None else min(first_ns, clean_ns)
+
+
+class _Distrust(msgspec.Struct, frozen=True, eq=False):
+    """What is known of the sources with one more sample.
+
+    Attributes:
+        trust: That.
+        reason: Why the sample is not believed; None if it is.
+        stuck_ns: When its source, now found to be stuck, first said what it says [ns].
+    """
+
+    trust: Trust
+    reason: str | None
+    stuck_ns: int | None = None
 
 
 def _distrust(
@@ -153,11 +195,8 @@ def _distrust(
     inp: StepInput,
     sample: PositionSample,
     belief: Belief,
-) -> tuple[Trust, str | None]:
-    """What is known of the sources with one more sample, and why it is not believed (None if it is).
-
-    `belief` is the prediction for the sample's capture time.
-    """
+) -> _Distrust:
+    """What is known of the sources with one more sample; `belief` is the prediction for its capture time."""
     at_ns = captured_ns(sample)
     values, variances = shown_by(kalman, sample)
     off = values - belief.mean[kalman.shown[: len(values)]]
@@ -166,16 +205,20 @@ def _distrust(
     trust = replace(trust, watches=watches)
     watch = watches[sample.source]
     newest = watch.at_ns == at_ns
-    if newest and _flies(inp.vehicle) and stuck(watch, kalman, sample, reach.parameters):
-        return replace(trust, watches={**watches, sample.source: replace(watch, found=True)}), FROZEN
+    if newest and _flies(inp.vehicle):
+        if stuck(watch, kalman, sample, reach.parameters):
+            found = {**watches, sample.source: replace(watch, found=True)}
+            return _Distrust(replace(trust, watches=found), FROZEN, watch.first_ns)
+        if doubtful(watch, kalman, sample, reach.parameters):
+            return _Distrust(trust, REPEATED)
     doubted = np.zeros(n_axes) if trust.doubt_mps is None else trust.doubt_mps
     width = radius(reach, kalman, belief, variances, doubted)
     believed, suspect = judge(trust.suspect, at_ns, off, width, n_axes)
     if believed and at_ns > (history.captured_ns or at_ns):
         trust = replace(trust, doubt_mps=doubt(reach, belief, off[:n_axes]))
     if not believed and newest and watch.repeats:
-        return trust, FROZEN  # a value that came before did not jump
-    return replace(trust, suspect=suspect), None if believed else JUMP
+        return _Distrust(trust, FROZEN)  # a value that came before did not jump
+    return _Distrust(replace(trust, suspect=suspect), None if believed else JUMP)
 
 
 def _flies(vehicle: VehicleStatus | None) -> bool:

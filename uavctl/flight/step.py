@@ -1,6 +1,6 @@
 """One control tick: samples in; estimate, plan, decision and setpoint out. Pure: time is an argument.
 
-    samples -> estimator -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last gate
+    samples -> estimator -> envelope -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last gate
 
 Tick n is at n * tick on the grid, step k = n // (Δt / tick). What a boundary decides is held until the next.
 """
@@ -18,26 +18,26 @@ from uavctl.data import (
     Event,
     LinkEstimate,
     Plan,
+    PositionSample,
     Setpoint,
     SetpointSource,
     Severity,
     StepInput,
-    Vec3,
-    Vector,
 )
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decide import Choice, Tick, choose, place, velocity
-from uavctl.flight.estimator import begin, set_input
+from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
+from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, watch
+from uavctl.flight.estimator import begin, set_input, without
 from uavctl.flight.fallback import End
-from uavctl.flight.kalman import Array
+from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
 from uavctl.flight.orders import take_orders, unready
-from uavctl.flight.samples import forget, take
+from uavctl.flight.samples import Intake, forget, take
+from uavctl.flight.stuck import REPEATED
 from uavctl.naming import Names, tell_all
-from uavctl.smpc.plant import Plant
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
@@ -62,6 +62,7 @@ class StepOutput(msgspec.Struct, frozen=True):
         setpoint: What to send; None for nothing.
         events: What is worth telling.
         land: Ask for the vehicle's own landing, once.
+        refused: Samples that were not believed.
         link: What is believed of the link; at boundaries that were not missed.
     """
 
@@ -71,6 +72,7 @@ class StepOutput(msgspec.Struct, frozen=True):
     setpoint: Setpoint | None
     events: tuple[Event, ...]
     land: bool
+    refused: tuple[PositionSample, ...] = ()
     link: LinkEstimate | None = None
 
 
@@ -98,20 +100,31 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
     tick = place(state, inp, intake.history, controller)
+    watching, breach = _watched(state, tick, intake, inp, controller)
+    clean_ns = intake.clean_ns
+    if breach is not None or (intake.moved and not lost):
+        clean_ns = min(clean_ns or inp.at_ns, watching.clean_ns or inp.at_ns)
+        intake = _cleaned(intake, clean_ns, controller)
+        tick = place(state, inp, intake.history, controller)
     stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
     ordered, answers = take_orders(state, inp, controller)
     if intake.moved:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
+    if breach is not None:
+        ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)
     begun = replace(
         ordered,
         history=intake.history,
         trust=intake.trust,
         decided_step=tick.number,
         fresh=0 if stale else intake.fresh,
+        watching=watching,
+        plan=_outdated(ordered.plan, clean_ns),
+        biases=_biases(state, tick, clean_ns),
     )
     choice = choose(begun, tick, inp, controller)
     mode = choice.state.mode
-    setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, mode, tick, inp.at_ns, controller)
+    setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, mode, tick, inp, controller)
     acting = None if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
     alarms = state.link_alarms if link is None else _alarms(link, state.link_alarms)
@@ -138,7 +151,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         input=None if applied is None else tuple(applied.tolist()),
         fresh=choice.state.fresh,
         missed_ticks=inp.missed_ticks,
-        accepted=intake.accepted,
+        accepted=len(intake.accepted),
         rejected=len(intake.refused),
         reason=choice.reason,
         target=None if mission is None else wanted(controller.mission, mission, tick.boundary_ns),
@@ -152,12 +165,60 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         events=(
             *answers,
             *((_restarted(inp.at_ns),) if lost else ()),
-            *_events(before, mode, choice, inp, intake.refused, controller.names),
+            *(() if breach is None else (_breached(inp.at_ns, breach),)),
+            *_events(before, mode, choice, inp, tuple(why for _, why in intake.refused), controller.names),
             *_link_events(alarms, state.link_alarms, link),
         ),
+        refused=tuple(sample for sample, _ in intake.refused),
         link=link,
         land=mode is ControlMode.LAND and before is not ControlMode.LAND,
     )
+
+
+def _watched(
+    state: ControlState, tick: Tick, intake: Intake, inp: StepInput, controller: Controller
+) -> tuple[Watching, Breach | None]:
+    """Hold the tick against the envelope, as long as it is we who fly."""
+    if state.breach is not None:
+        return state.watching, None
+    vehicle = inp.vehicle
+    flies = state.mode not in _NOT_FLOWN and vehicle is not None and not unready(vehicle)
+    if controller.envelope is None or not flies or vehicle is None or vehicle.landed or vehicle.own_climb:
+        return NOT_WATCHING, None
+    seen = seen_of(
+        tick,
+        inp,
+        state.accel_mps2,
+        controller.plant,
+        intake.accepted,
+        braking=state.mode is ControlMode.BRAKE,
+    )
+    return watch(state.watching, seen, controller.envelope)
+
+
+def _cleaned(intake: Intake, clean_ns: int, controller: Controller) -> Intake:
+    """Take back what was captured after `clean_ns` and believed."""
+    history = without(controller.kalman, intake.history, lambda sample: captured_ns(sample) > clean_ns)
+    return replace(intake, history=history, fresh=0)
+
+
+def _outdated(plan: Plan | None, clean_ns: int | None) -> Plan | None:
+    """The plan that is flown; where it was made of what has been taken back, any estimate is news beside it."""
+    if plan is None or clean_ns is None or plan.captured_ns <= clean_ns:
+        return plan
+    return replace(plan, captured_ns=clean_ns - 1)
+
+
+def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
+    """The biases of late, without those of what has been taken back, and with that of a boundary with news."""
+    biases = state.biases
+    if clean_ns is not None:
+        biases = tuple(one for one in biases if one[0] <= clean_ns)
+    if state.mode is not ControlMode.TRACK:
+        return biases if state.fallback is not None else ()
+    if not tick.boundary or tick.age_steps or tick.estimate is None or not tick.estimate.bias:
+        return biases
+    return fb.remember(biases, tick.boundary_ns, tick.estimate.bias)
 
 
 _LINK_TEXTS = {
@@ -197,30 +258,29 @@ def _link_events(alarms: tuple[str, ...], told: tuple[str, ...], link: LinkEstim
 
 
 def _setpoint(
-    state: ControlState, mode: ControlMode, tick: Tick, at_ns: int, controller: Controller
+    state: ControlState, mode: ControlMode, tick: Tick, inp: StepInput, controller: Controller
 ) -> tuple[Setpoint | None, Array | None]:
     """The setpoint after the last gate, and the input (n_u,) that it is."""
     source = _SOURCES.get(mode)
-    if source is None or tick.estimate is None:
+    if source is None or (tick.estimate is None and state.fallback is None):
         return None, None
     want = ZERO
     if state.fallback is not None:
-        want = fb.acceleration(state.fallback, velocity(tick.estimate, controller.plant), controller.fallback)
-        if not (state.fallback.final and mode is ControlMode.HOLD):  # what is kept after the end is zero itself
-            want = _beside(tick.estimate.bias, want, controller.plant)
+        moving, _ = moving_mps(state, tick, inp, controller)
+        brake = fb.acceleration(state.fallback, inp.at_ns, moving, controller.fallback)
+        held = held_mps2(state, state.fallback, controller)
+        want = (brake[0] + held[0], brake[1] + held[1], brake[2] + held[2])
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
-    accel, limited = gate(want, state.accel_mps2, controller.tick_ns * 1e-9, controller.limits)
-    setpoint = Setpoint(at_ns=at_ns, accel_mps2=accel, source=source, limited=limited)
+    # Level at once where what is seen cannot be: each tick of slewing would be flown on nobody knows what.
+    before = ZERO if state.fallback is not None and state.fallback.end is fb.End.LET_GO else state.accel_mps2
+    accel, limited = gate(want, before, controller.tick_ns * 1e-9, controller.limits)
+    setpoint = Setpoint(at_ns=inp.at_ns, accel_mps2=accel, source=source, limited=limited)
     return setpoint, controller.plant.to_input(accel)
 
 
-def _beside(bias: Vector, wanted_mps2: Vec3, plant: Plant) -> Vec3:
-    """What to ask for beside a bias (n_u,) of the input, so that both together are the acceleration wanted."""
-    if not bias:
-        return wanted_mps2
-    there = plant.to_accel(np.array(bias))
-    return wanted_mps2[0] - there[0], wanted_mps2[1] - there[1], wanted_mps2[2] - there[2]
+def _breached(at_ns: int, breach: Breach) -> Event:
+    return Event(at_ns=at_ns, severity=Severity.ERROR, code=breach.code, text=f"{breach.text}: letting go")
 
 
 def _restarted(at_ns: int) -> Event:
@@ -249,7 +309,7 @@ def _events(
             text="the sample counts as lost",
             count=refused.count(code),
         )
-        for code in sorted(set(refused))
+        for code in sorted(set(refused) - {REPEATED})  # some sources send each value twice
     ]
     if inp.missed_ticks:
         text = "ticks were missed; they are not made up for"

@@ -9,6 +9,10 @@ without noise. It counts as stuck where
   what this source said was news so far. A world without noise brings no news, and is not held to that.
 
 The resolution is the smallest change that the source has shown.
+
+Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
+source's values have been news so far, or where inputs alone have carried the prediction away from it. What had been
+believed of a source that is then found to be stuck is taken back, to the moment at which the value first came.
 """
 
 from __future__ import annotations
@@ -25,12 +29,15 @@ from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import GateParameters
 
 FROZEN = "sample-frozen"
+REPEATED = "sample-repeated"
 
 _REPEATS = 3  # some sources send each value twice
 _MANY = 20.0  # resolutions that the prediction is spread over
 _NEWS = 0.5  # of a resolution: rounding alone makes no more
+_PLAIN = 4.0  # resolutions: noise of that size does not say the same twice
 _LEAST_NEWS_M = 2e-5  # nor do the numbers of a message, however large the room is; any camera's noise is more
-_SMOOTH = 0.1  # weight of a sample in the mean of what was news
+_SMOOTH = 0.1  # least weight of a sample in the mean of what was news
+_NEAR = 0.5  # of the gate: how far a value that comes again may be off what inputs alone foretell
 _SOURCES = 8  # that are watched at once
 
 
@@ -42,6 +49,8 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         position_m: What that said.
         resolution_m: The smallest change of an axis so far [m]; 0 where there was none.
         news_m: How far its samples are off the prediction, the older the less they count [m].
+        changes: How often it said something else, up to a number that is enough.
+        first_ns: Capture time at which the value first came [ns].
         repeats: How often the value came again.
         coasting: The belief that the value first gave, moved on by inputs alone; None without repeats.
         found: Whether it was found to be stuck, which holds until it says something else.
@@ -51,6 +60,8 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
     position_m: Vec3
     resolution_m: float = 0.0
     news_m: float = 0.0
+    changes: int = 0
+    first_ns: int = 0
     repeats: int = 0
     coasting: Belief | None = None
     found: bool = False
@@ -72,22 +83,25 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
     at_ns, watch = captured_ns(sample), watches.get(sample.source)
     if watch is None:
         fewer = watches if len(watches) < _SOURCES else {}
-        return {**fewer, sample.source: Watch(at_ns=at_ns, position_m=sample.position_m)}
+        return {**fewer, sample.source: Watch(at_ns=at_ns, position_m=sample.position_m, first_ns=at_ns)}
     if at_ns <= watch.at_ns:
         return watches
-    changes = [abs(new - old) for new, old in zip(sample.position_m, watch.position_m, strict=True)]
-    if not any(changes):
+    moved_m = [abs(new - old) for new, old in zip(sample.position_m, watch.position_m, strict=True)]
+    if not any(moved_m):
         begun = watch.coasting or belief_at(kalman, history, watch.at_ns)
         coasting = None if begun is None else coasted(kalman, history, begun, at_ns)
         watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting)
     else:
-        smallest = min(change for change in changes if change)
+        smallest = min(one for one in moved_m if one)
         news_m = float(np.abs(off_m).max())
+        changes = min(watch.changes + 1, round(1.0 / _SMOOTH))
         watch = Watch(
             at_ns=at_ns,
             position_m=sample.position_m,
             resolution_m=min(smallest, watch.resolution_m) if watch.resolution_m else smallest,
-            news_m=watch.news_m + _SMOOTH * (news_m - watch.news_m),
+            news_m=watch.news_m + (news_m - watch.news_m) / changes,
+            changes=changes,
+            first_ns=at_ns,
         )
     return {**watches, sample.source: watch}
 
@@ -106,5 +120,21 @@ def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: Gate
     if (far_m > doubt_m).any():
         return True
     spread_m = float(np.sqrt(variance.max()))
-    noisy = bool(watch.resolution_m) and watch.news_m >= max(_LEAST_NEWS_M, _NEWS * watch.resolution_m)
-    return noisy and spread_m >= _MANY * watch.resolution_m and watch.repeats >= _REPEATS
+    return _noisy(watch, _NEWS) and spread_m >= _MANY * watch.resolution_m and watch.repeats >= _REPEATS
+
+
+def doubtful(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
+    """Whether a value that came again is not to be believed, though its source is not found to be stuck."""
+    belief = watch.coasting
+    if belief is None:
+        return False
+    n_axes = len(kalman.axes)
+    values, variances = shown_by(kalman, sample)
+    far_m = np.abs(belief.mean[kalman.shown[:n_axes]] - values[:n_axes])
+    near_m = _NEAR * parameters.sigma * np.sqrt(variances[:n_axes]) + watch.resolution_m
+    return _noisy(watch, _PLAIN) or bool((far_m > near_m).any())
+
+
+def _noisy(watch: Watch, resolutions: float) -> bool:
+    """Whether what the source said was news so far, of so many resolutions at least."""
+    return bool(watch.resolution_m) and watch.news_m >= max(_LEAST_NEWS_M, resolutions * watch.resolution_m)

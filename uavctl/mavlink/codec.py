@@ -196,6 +196,7 @@ def _landed(raw: Fields) -> Landed:
         system=raw.src_system,
         component=raw.src_component,
         landed=None if undefined else state == mavlink.MAV_LANDED_STATE_ON_GROUND,
+        own_climb=state in (mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING),
     )
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, Vec3, VehicleStatus
+from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, Vec3, VehicleMotion, VehicleStatus
 from uavctl.frames import Quaternion
 from uavctl.mavlink.clocksync import RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
@@ -38,7 +38,7 @@ STREAM_SCHEMES = ("tcp:", "serial:")
 UNANSWERED = "timesync-flood"
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
-Item = PositionSample | VehicleStatus | Event | Ack | Text
+Item = PositionSample | VehicleStatus | VehicleMotion | Event | Ack | Text
 
 
 class Link:
@@ -225,14 +225,16 @@ class Link:
             return self._encoder.request_message(message_id, *self._target())
         return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
 
-    def relay(self, relay: Relay, at_ns: int, autopilot: str, *, refused: int) -> tuple[bytes, ...]:
+    def relay(
+        self, relay: Relay, at_ns: int, autopilot: str, *, refused: Sequence[PositionSample]
+    ) -> tuple[bytes, ...]:
         """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
             relay: what waits to be passed on.
             at_ns: now.
             autopilot: the vehicle's kind; only PX4 moves stamps by what it has asked.
-            refused: samples that the tick refused.
+            refused: samples that the tick did not believe.
         """
         if not relay.enabled or self.vehicle is None:
             return ()

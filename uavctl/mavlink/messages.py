@@ -61,9 +61,10 @@ class TimeSync(Message, frozen=True, kw_only=True):
 
 
 class Landed(Message, frozen=True, kw_only=True):
-    """EXTENDED_SYS_STATE; None while the vehicle does not know."""
+    """EXTENDED_SYS_STATE; None while the vehicle does not know. `own_climb`: it takes off, or lands, by itself."""
 
     landed: bool | None
+    own_climb: bool = False
 
 
 class Battery(Message, frozen=True, kw_only=True):

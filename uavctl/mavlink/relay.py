@@ -9,6 +9,7 @@ A vehicle stamps by its own clock. Two ways lead there, and taking both would sh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.preflight import RelayConfig
@@ -75,14 +76,16 @@ class Relay:
         self._waiting.append((sample, attitude))
         del self._waiting[:-_WAITING]
 
-    def due(self, at_ns: int, *, offset_ns: int | None, asks: bool, refused: int) -> tuple[Pose, ...]:
+    def due(
+        self, at_ns: int, *, offset_ns: int | None, asks: bool, refused: Sequence[PositionSample]
+    ) -> tuple[Pose, ...]:
         """What goes to the vehicle in this tick, in order of capture.
 
         Args:
             at_ns: now, in our clock.
             offset_ns: (our time - the vehicle's) from round trips; None if it does not answer.
             asks: the vehicle asks for our time, and so moves stamps itself.
-            refused: samples that the tick refused. Which ones is not told, so then none of this tick's is sent.
+            refused: samples that the tick did not believe.
         """
         arrived = [one for one in self._waiting if one[0].received_ns <= at_ns]
         self._waiting = [one for one in self._waiting if one[0].received_ns > at_ns]
@@ -93,7 +96,7 @@ class Relay:
         offset_ns = 0 if asks else offset_ns or 0
         out = []
         for sample, attitude in waiting:
-            reason = "refused" if refused else self._reason(sample, attitude, at_ns)
+            reason = "refused" if sample in refused else self._reason(sample, attitude, at_ns)
             if reason is None and sample.captured_ns - offset_ns < 1000:
                 reason = "no clock"  # before the vehicle's clock began
             if reason is not None:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Event, Severity, VehicleStatus
-from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Position, Text
+from uavctl.data import Event, Severity, Vec3, VehicleMotion, VehicleStatus
+from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
 
 SECOND_VEHICLE = "second-vehicle"
@@ -38,12 +38,14 @@ class VehicleWatch:
         self._bad = bad
         self._own = own
         self._landed: bool | None = None
+        self._own_climb = False
         self._battery_v: float | None = None
         self._boot_ms: int | None = None
         self._boot_read_ns = 0
         self._started = False  # past its start-up
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
+        self._motion = VehicleMotion()
         self.boots = 0
         self.address: tuple[int, int] | None = None  # system, component
 
@@ -52,19 +54,21 @@ class VehicleWatch:
         """Which autopilot it is; empty before its first heartbeat."""
         return "" if self._status is None else self._status.autopilot
 
-    def take(self, message: Message, at_ns: int) -> tuple[VehicleStatus | Event | Ack | Text, ...]:
+    def take(self, message: Message, at_ns: int) -> tuple[VehicleStatus | VehicleMotion | Event | Ack | Text, ...]:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._heartbeat(message, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
         match message:
-            case Landed(landed=landed):
-                self._landed = landed
+            case Landed(landed=landed, own_climb=own_climb):
+                self._landed, self._own_climb = landed, own_climb
             case Battery(voltage_v=voltage_v):
                 self._battery_v = voltage_v
             case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
-                return self._clock(stamp_us // 1000, at_ns)
+                return (*self._clock(stamp_us // 1000, at_ns), *self._moves(at_ns, velocity=message.velocity_mps))
+            case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
+                return self._moves(at_ns, attitude=angles_rad)
             case Text(severity=severity, text=text):
                 return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
             case Ack() if self._is_ours(message):
@@ -86,6 +90,16 @@ class VehicleWatch:
         if not BACK_MS < back_ms < _WRAP_MS // 2:
             return ()
         return self._reboot()
+
+    def _moves(
+        self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
+    ) -> tuple[VehicleMotion, ...]:
+        """How it moves, with what it just said of that."""
+        if velocity is not None:
+            self._motion = msgspec.structs.replace(self._motion, velocity_mps=velocity, velocity_ns=at_ns)
+        if attitude is not None:
+            self._motion = msgspec.structs.replace(self._motion, attitude_rad=attitude, attitude_ns=at_ns)
+        return (self._motion,)
 
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
@@ -119,6 +133,7 @@ class VehicleWatch:
             mode=mode,
             external=external,
             landed=self._landed,
+            own_climb=self._own_climb,
             battery_v=self._battery_v,
             boots=self.boots,
             alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,

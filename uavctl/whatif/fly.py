@@ -185,14 +185,15 @@ class _Flight:
         done = 0
         for seen in self._axes.seen(data):
             captured_ns = self._history.captured_ns(seen, at_ns)
-            if captured_ns is None:
+            own = captured_ns is None and seen.position.local_ned  # the vehicle's word of itself, on its own connection
+            if captured_ns is None and not own:
                 continue
             begin = data.index(seen.frame.data, done)
             parts.append(data[done:begin])
             done = begin + len(seen.frame.data)
-            if self._other is None:
-                where, how_fast = departure.position_m(captured_ns), departure.velocity_mps(captured_ns)
-                parts.append(self._axes.moved(seen, where, how_fast))
+            if self._other is None or own:
+                when_ns = at_ns if captured_ns is None else captured_ns
+                parts.append(self._axes.moved(seen, departure.position_m(when_ns), departure.velocity_mps(when_ns)))
         return b"".join((*parts, data[done:]))
 
 

@@ -1,0 +1,444 @@
+"""The envelope in flight: what is believed is held against what is possible, whoever estimates and whoever plans.
+
+Each tick of a flight, four questions:
+
+1. Is the estimate outside the limits by more than a margin and not on its way back, or on its way out faster than the
+   vehicle can brake?
+2. Do positions show an acceleration that no setpoint asked for? A small observer of its own, a position, a velocity and
+   an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
+   believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
+   the acceleration sent a wrong direction or size, a marker that came loose none at all.
+3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)?
+4. Does braking brake?
+
+The answer is a `Breach` that names the cause. What follows needs no position: level, and the vehicle's own landing
+(`uavctl.flight.fallback`). The observer also says how far back all was quiet: what came since is thrown away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from uavctl.data import PositionSample, Vec3, VehicleMotion
+from uavctl.flight.limits import AXES, ZERO
+
+Array = NDArray[np.float64]
+
+OUTSIDE = "envelope-outside"
+RESPONSE = "envelope-response"
+VELOCITY = "envelope-velocity"
+SCATTER = "envelope-scatter"
+BRAKING = "envelope-braking"
+
+MOTION_NS = 300_000_000  # the vehicle's own words count for so long
+SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge
+TOLD_NS = 3_000_000_000  # setpoints and own velocities are remembered for so long
+DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles have 1.0
+CLIP = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
+SCATTERED, OF = 3, 5  # clipped innovations of the last ones that are no chance
+PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no time at all where it is beyond
+PLAIN = 1.5  # this many times its bound
+HINT = 0.4  # of the bound of the unexplained acceleration
+OUTSIDE_NS = 100_000_000
+POSITION_STD_M = 0.02  # what gate and rounding may leave
+VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the flight begins
+BRAKES_NS = 1_000_000_000  # after which braking must have shown
+BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
+REACTION_S = 0.3  # from a setpoint to what it does: recorded autopilots need 0.18 to 0.32 s
+GRAVITY_MPS2 = 9.81
+LEAST_LAG_S = 1e-3  # for a plant without one
+
+
+@dataclass(frozen=True)
+class EnvelopeParameters:
+    """What is possible; vectors are north, east, down.
+
+    Attributes:
+        axes: Which axes the plant has; the others are not looked at.
+        lower_m: Position limits; minus infinity where there is none.
+        upper_m: The same, infinity where there is none.
+        outside_m: How far beyond them the vehicle may be.
+        brake_mps2: What it can brake with.
+        lag_s: Time constant from setpoint to acceleration.
+        unexplained_mps2: Acceleration that positions may show beside what was sent: wind, and the model's error.
+        disagreement_mps: Difference between the velocity that positions show and the vehicle's own.
+        window_ns: Time over which those two are compared [ns].
+        begins_mps: Standard deviation of the velocity at which a flight begins.
+    """
+
+    axes: tuple[bool, ...]
+    lower_m: Vec3
+    upper_m: Vec3
+    outside_m: Vec3
+    brake_mps2: Vec3
+    lag_s: Vec3
+    unexplained_mps2: float
+    disagreement_mps: float
+    window_ns: int
+    begins_mps: float
+
+
+class Breach(msgspec.Struct, frozen=True):
+    """What cannot be: an event's code, and the cause in words."""
+
+    code: str
+    text: str
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """What the envelope may know of a tick.
+
+    Attributes:
+        at_ns: The tick [ns].
+        samples: Positions that were believed in this tick.
+        sent_mps2: Setpoint that acts since the tick before.
+        position_m: Estimated position; NaN in axes that the plant has not.
+        velocity_mps: Estimated velocity, the same.
+        motion: What the vehicle itself says.
+        braking: Whether the fallback brakes.
+    """
+
+    at_ns: int
+    samples: Sequence[PositionSample]
+    sent_mps2: Vec3
+    position_m: Vec3 | None
+    velocity_mps: Vec3
+    motion: VehicleMotion | None
+    braking: bool
+
+
+class Observer(msgspec.Struct, frozen=True, eq=False):
+    """Position, velocity and unexplained acceleration at the newest position that counted.
+
+    Attributes:
+        at_ns: Its capture time [ns].
+        mean: (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis.
+        cov: (3, 3) of one axis; those of all axes are alike.
+        accel_mps2: What the setpoints so far make the vehicle accelerate by, behind its lag (3,).
+    """
+
+    at_ns: int
+    mean: Array
+    cov: Array
+    accel_mps2: Array
+
+
+class Watching(msgspec.Struct, frozen=True, eq=False):
+    """What one tick leaves to the next while we fly.
+
+    Attributes:
+        observer: None before the first position.
+        tick_ns: The last tick.
+        sent: Setpoints, each with the tick from which it acted [ns], oldest first.
+        clipped: Whether each of the last innovations was clipped, newest last.
+        over_ns: Capture time from which the unexplained acceleration has been too large; None while it is not.
+        apart_ns: The same of the velocities.
+        clean_ns: Capture time of the last position at which all was quiet; None before any.
+        way: (at_ns, distance (3,)) flown by the vehicle's own velocity; empty while it is silent.
+        offsets: (capture time, position minus that distance (3,)), oldest first.
+        contradicted: Whether the vehicle's own velocity disagreed with positions when it was last compared.
+        outside_ns: Since when the estimate has been outside; None while it is not.
+        braking: When braking began, and the speed then [m/s]; None while it does not.
+    """
+
+    observer: Observer | None = None
+    tick_ns: int | None = None
+    sent: tuple[tuple[int, Vec3], ...] = ()
+    clipped: tuple[bool, ...] = ()
+    over_ns: int | None = None
+    apart_ns: int | None = None
+    clean_ns: int | None = None
+    way: tuple[tuple[int, Array], ...] = ()
+    offsets: tuple[tuple[int, Array], ...] = ()
+    contradicted: bool = False
+    outside_ns: int | None = None
+    braking: tuple[int, float] | None = None
+
+
+NOT_WATCHING = Watching()
+
+
+def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
+    """Take a tick in which we fly.
+
+    Args:
+        watching: What the tick before left; `NOT_WATCHING` where a flight begins.
+        seen: The tick.
+        parameters: What is possible.
+    """
+    watching = _told(watching, seen)
+    breach: Breach | None = None
+    for sample in sorted(seen.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
+        watching, found = _position(watching, sample, seen, parameters)
+        breach = breach or found
+    watching, outside = _place(watching, seen, parameters)
+    watching, brakes = _braking(watching, seen)
+    return watching, breach or outside or brakes
+
+
+def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
+    """The vehicle's own velocity where it may be braked on; None where it does not come, or contradicts what is known.
+
+    Args:
+        watching: After the tick.
+        seen: The tick; with the velocity that is predicted.
+        age_s: How old that prediction's newest position is [s]: gusts may have changed it since.
+        parameters: What is possible.
+    """
+    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
+    if velocity is None or watching.contradicted:
+        return None
+    drift_mps = parameters.disagreement_mps + REACTION_S * parameters.unexplained_mps2 * age_s
+    apart = [abs(own - known) for own, known in zip(velocity, seen.velocity_mps, strict=True) if not math.isnan(known)]
+    return velocity if max(apart, default=0.0) <= drift_mps else None
+
+
+def _own(motion: VehicleMotion, at_ns: int) -> Vec3 | None:
+    fresh = motion.velocity_ns is not None and at_ns - motion.velocity_ns <= MOTION_NS
+    return motion.velocity_mps if fresh else None
+
+
+def _told(watching: Watching, seen: Seen) -> Watching:
+    """Remember what was sent, and how far the vehicle says that it has flown."""
+    horizon_ns = seen.at_ns - TOLD_NS
+    sent = watching.sent
+    if not sent or sent[-1][1] != seen.sent_mps2:
+        sent = (*sent, (watching.tick_ns or seen.at_ns, seen.sent_mps2))
+    first = max((i for i, (at_ns, _) in enumerate(sent) if at_ns <= horizon_ns), default=0)
+    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
+    if velocity is None:
+        return replace(watching, tick_ns=seen.at_ns, sent=sent[first:], way=(), offsets=())
+    way = watching.way
+    distance = np.zeros(3)
+    if way:
+        since_s = (seen.at_ns - way[-1][0]) * 1e-9
+        distance = way[-1][1] + since_s * np.array(velocity)
+    kept = tuple(one for one in way if one[0] > horizon_ns)
+    return replace(watching, tick_ns=seen.at_ns, sent=sent[first:], way=(*kept, (seen.at_ns, distance)))
+
+
+def _position(
+    watching: Watching, sample: PositionSample, seen: Seen, parameters: EnvelopeParameters
+) -> tuple[Watching, Breach | None]:
+    """Take one believed position, if it is newer than those before by enough to tell something."""
+    at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
+    before = watching.observer
+    if before is None or at_ns - before.at_ns >= TOLD_NS:
+        # After a long silence nobody knows what gusts have made of the velocity.
+        speed_mps = parameters.begins_mps if before is None else parameters.unexplained_mps2
+        begun = _begun(at_ns, sample, speed_mps, parameters)
+        watching = replace(watching, observer=begun, clipped=(), over_ns=None, clean_ns=at_ns)
+        return _compared(watching, at_ns, position, False, parameters)
+    if at_ns - before.at_ns < SPACING_NS:
+        return watching, None
+    observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position)
+    recent = (*watching.clipped, clipped)[-OF:]
+    unexplained = _unexplained(observer) * parameters.axes
+    size = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2])) / parameters.unexplained_mps2
+    over_ns = None if size <= 1.0 else watching.over_ns or at_ns
+    watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
+    quiet = size <= 0.5 and not clipped and watching.apart_ns is None
+    watching = replace(
+        watching,
+        observer=observer,
+        clipped=recent,
+        over_ns=over_ns,
+        clean_ns=at_ns if quiet else watching.clean_ns,
+    )
+    if over_ns is not None and (size >= PLAIN or at_ns - over_ns >= PERSISTS_NS):
+        return watching, Breach(RESPONSE, _response_text(observer, unexplained, seen))
+    if velocity is not None:
+        return watching, velocity
+    if sum(recent) >= SCATTERED:
+        return watching, Breach(SCATTER, "positions leap about by more than the vehicle can move")
+    return watching, None
+
+
+# The observer
+
+
+def _begun(at_ns: int, sample: PositionSample, speed_mps: float, parameters: EnvelopeParameters) -> Observer:
+    mean = np.zeros((3, 3))
+    mean[0] = sample.position_m
+    if sample.velocity_mps is not None:
+        mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
+    deviations = (POSITION_STD_M, speed_mps, parameters.unexplained_mps2 / 3.0)
+    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=np.zeros(3))
+
+
+def _predicted(
+    observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, parameters: EnvelopeParameters
+) -> Observer:
+    """Fly on by what was sent, behind the vehicle's lag; the unexplained acceleration wanders."""
+    lag_s = np.maximum(parameters.lag_s, LEAST_LAG_S)
+    (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
+    ends_ns = [min(max(begin_ns, observer.at_ns), at_ns) for begin_ns, _ in sent]
+    spans = zip([observer.at_ns, *ends_ns], [*ends_ns, at_ns], [ZERO, *(u for _, u in sent)], strict=True)
+    for begin_ns, end_ns, setpoint in spans:
+        if end_ns <= begin_ns:
+            continue
+        s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
+        gone = np.exp(-s / lag_s)
+        behind = (accel - u) * lag_s * (1.0 - gone)  # what the lag adds to the velocity
+        position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lag_s * ((accel - u) * s - behind)
+        velocity = velocity + s * (u + unexplained) + behind
+        accel = u + (accel - u) * gone
+    s = (at_ns - observer.at_ns) * 1e-9
+    f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
+    q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
+    cov = f @ observer.cov @ f.T + parameters.unexplained_mps2**2 * q
+    return Observer(at_ns=at_ns, mean=np.array([position, velocity, unexplained]), cov=cov, accel_mps2=accel)
+
+
+def _corrected(observer: Observer, position: Array) -> tuple[Observer, bool]:
+    """Take a position; an innovation counts up to a bound, and whether it was beyond."""
+    variance = float(observer.cov[0, 0]) + POSITION_STD_M**2
+    bound = CLIP * math.sqrt(variance)
+    innovation = position - observer.mean[0]
+    gain = observer.cov[:, 0] / variance
+    mean = observer.mean + np.outer(gain, np.clip(innovation, -bound, bound))
+    keep = np.eye(3)
+    keep[:, 0] -= gain
+    cov = keep @ observer.cov @ keep.T + POSITION_STD_M**2 * np.outer(gain, gain)
+    clipped = bool((np.abs(innovation) > bound).any())
+    return Observer(at_ns=observer.at_ns, mean=mean, cov=cov, accel_mps2=observer.accel_mps2), clipped
+
+
+def _unexplained(observer: Observer) -> Array:
+    """Unexplained acceleration (3,) once as much of it as can be drag is taken away."""
+    _, velocity, unexplained = observer.mean
+    along = float(velocity @ velocity)
+    drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
+    rest: Array = unexplained + drag_1ps * velocity
+    return rest
+
+
+def _response_text(observer: Observer, unexplained: Array, seen: Seen) -> str:
+    text = (
+        f"positions show an acceleration of {_vector(unexplained)} m/s² that no setpoint asked for "
+        f"({_vector(observer.accel_mps2)} m/s² was)"
+    )
+    lean = None if seen.motion is None else lean_mps2(seen.motion, seen.at_ns)
+    if lean is None:
+        return text
+    off = math.hypot(lean[0] - float(observer.accel_mps2[0]), lean[1] - float(observer.accel_mps2[1]))
+    as_told = off <= 0.5 * math.hypot(float(unexplained[0]), float(unexplained[1]))
+    return f"{text}; the vehicle leans {'as it was told' if as_told else 'otherwise than it was told'}"
+
+
+def lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] | None:
+    """Horizontal acceleration (north, east) that the vehicle's own attitude makes of a thrust that carries it."""
+    if motion.attitude_rad is None or motion.attitude_ns is None or at_ns - motion.attitude_ns > MOTION_NS:
+        return None
+    roll, pitch, yaw = motion.attitude_rad
+    up = math.cos(roll) * math.cos(pitch)
+    if up < 0.1:  # on its side: there is no thrust that carries it
+        return None
+    forward, right = -math.sin(pitch) * math.cos(roll) / up, math.sin(roll) / up
+    north = forward * math.cos(yaw) - right * math.sin(yaw)
+    east = forward * math.sin(yaw) + right * math.cos(yaw)
+    return GRAVITY_MPS2 * north, GRAVITY_MPS2 * east
+
+
+# Positions against the vehicle's own velocity
+
+
+def _compared(
+    watching: Watching, at_ns: int, position: Array, hinted: bool, parameters: EnvelopeParameters
+) -> tuple[Watching, Breach | None]:
+    """Compare the way that positions have come with the one that the vehicle says it has flown.
+
+    Where the observer too has a hint of something amiss, that has not to persist.
+    """
+    flown = _flown(watching.way, at_ns)
+    if flown is None:
+        return replace(watching, offsets=(), apart_ns=None), None
+    kept = (one for one in watching.offsets if one[0] > at_ns - parameters.window_ns)
+    offsets = (*kept, (at_ns, position - flown))
+    watching = replace(watching, offsets=offsets)
+    times_s = np.array([(one - at_ns) * 1e-9 for one, _ in offsets])
+    if len(offsets) < 3 or -times_s[0] < 0.3e-9 * parameters.window_ns:
+        return watching, None
+    centred = times_s - times_s.mean()
+    apart: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
+    apart = apart * parameters.axes
+    speed_mps = float(np.linalg.norm(apart))
+    contradicted = speed_mps > parameters.disagreement_mps
+    apart_ns = (watching.apart_ns or at_ns) if contradicted else None
+    watching = replace(watching, apart_ns=apart_ns, contradicted=contradicted)
+    plain = hinted or speed_mps >= PLAIN * parameters.disagreement_mps
+    if apart_ns is None or (not plain and at_ns - apart_ns < PERSISTS_NS):
+        return watching, None
+    text = f"positions move otherwise than the vehicle itself says, by {_vector(apart)} m/s"
+    return watching, Breach(VELOCITY, text)
+
+
+def _flown(way: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
+    """Distance flown by the vehicle's own velocity at `at_ns`; None where that is not known."""
+    for (begin_ns, begin), (end_ns, end) in pairwise(way):
+        if begin_ns <= at_ns <= end_ns:
+            share = (at_ns - begin_ns) / (end_ns - begin_ns)
+            between: Array = begin + share * (end - begin)
+            return between
+    return None
+
+
+# Limits and braking
+
+
+def _place(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
+    """Whether the estimate is outside by more than the margin, or cannot stop before it is."""
+    found = _outside(seen, parameters)
+    if found is None:
+        return replace(watching, outside_ns=None), None
+    since_ns = watching.outside_ns or seen.at_ns
+    watching = replace(watching, outside_ns=since_ns)
+    return watching, Breach(OUTSIDE, found) if seen.at_ns - since_ns >= OUTSIDE_NS else None
+
+
+def _outside(seen: Seen, parameters: EnvelopeParameters) -> str | None:
+    if seen.position_m is None:
+        return None
+    rows = zip(
+        AXES,
+        seen.position_m,
+        seen.velocity_mps,
+        parameters.lower_m,
+        parameters.upper_m,
+        parameters.outside_m,
+        parameters.brake_mps2,
+        strict=True,
+    )
+    for axis, position, velocity, lower, upper, margin, brake in rows:
+        for beyond, outward in ((lower - position, -velocity), (position - upper, velocity)):
+            if beyond > margin and outward > -BRAKED_MPS:
+                return f"the estimate is {beyond:.1f} m beyond the limit of {axis}"
+            if outward > 0.0 and beyond + outward * REACTION_S + outward**2 / (2.0 * brake) > margin:
+                return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
+    return None
+
+
+def _braking(watching: Watching, seen: Seen) -> tuple[Watching, Breach | None]:
+    """Whether braking brakes, by the vehicle's own velocity."""
+    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
+    if not seen.braking or velocity is None:
+        return replace(watching, braking=None), None
+    speed_mps = math.hypot(*velocity)
+    if watching.braking is None:
+        return replace(watching, braking=(seen.at_ns, speed_mps)), None
+    since_ns, began_mps = watching.braking
+    if seen.at_ns - since_ns < BRAKES_NS or speed_mps <= BRAKED * began_mps + BRAKED_MPS:
+        return watching, None
+    return watching, Breach(BRAKING, f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now")
+
+
+def _vector(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in values) + ")"
