@@ -18,7 +18,7 @@ from logs.disk import OutputFile, RoomWatch, later_segments
 from logs.encoding import encode, encode_message
 from logs.onlookers import Onlookers
 from logs.rotation import Rotation
-from logs.topics import GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote
+from logs.topics import END, GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote
 from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Record
 from uavctl.errors import RecordingError
@@ -139,7 +139,7 @@ class Journal:
             self._files.try_again()
             self.drain(len(self.queue), len(self.views_due) + len(self.queue))
             if self._files.is_open:
-                self._finish_file("end")
+                self._finish_file(END)
 
     def status(self) -> RecorderStatus:
         """How it is doing."""
