@@ -36,7 +36,7 @@ def health() -> Health:
     return Health(
         name="one", url="udpin://x:1", pid=7, running_s=1.0, mode=None, reason="", age_s=None, age_steps=None,
         position_m=None, velocity_mps=None, target_m=None, waypoint=None, loss=None, lateness_us=0.0, missed_ticks=0,
-        vehicle=None, recorder=RecorderHealth(ok=True, dropped=0, reason="", path="f.mcap"),
+        vehicle=None, recorder=RecorderHealth(ok=True, dropped=0, reason="", path="f.mcap", unwritten_s=0.0),
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -171,6 +172,28 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
     assert heard[0] == "READY=1"
     lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
     assert lines[0] in told  # the health line of a daemon without a terminal
+
+
+def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(air.folder / "notify"))
+        manager.settimeout(LIMIT_S)
+        with ended(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
+            wait_for_flight(air)
+            assert air.status()["recorder"]["ok"]
+            shutil.rmtree(air.folder / "f")
+            until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
+            found = air.status()["recorder"]
+            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted, moved or replaced")
+            assert "in trouble, " in air.ctl("status")[1]
+            until(lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0)
+            process.send_signal(signal.SIGINT)
+            _, told = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1
+    assert "warning: recording in trouble: flight.mcap deleted, moved or replaced" in told
+    assert "flight.mcap deleted, moved or replaced); what is in it is whole" in told and "Traceback" not in told
+    rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
+    assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
 
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
