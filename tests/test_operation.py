@@ -216,6 +216,9 @@ def test_a_unit_of_systemd_s_comes_with_the_package() -> None:
     assert lines["Type"] == "notify" and float(lines["WatchdogSec"]) <= 1.0
     assert lines["WatchdogSignal"] == "SIGKILL" and lines["Restart"] == "no"  # the vehicle's own failsafe has it
     assert "--realtime" in lines["ExecStart"]
+    # Where its user's processes look for locks, and where a killed daemon's word stays.
+    assert (lines["RuntimeDirectory"], lines["RuntimeDirectoryMode"]) == ("uavctl", "0700")
+    assert lines["RuntimeDirectoryPreserve"] == "yes"
     config = load_config("room")
     assert float(lines["TimeoutStopSec"]) > config.fallback.brake_s + config.fallback.hold_s + 10.0
 

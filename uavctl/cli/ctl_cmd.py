@@ -32,7 +32,7 @@ class Which:
         str | None, Parameter(help="which daemon, if several run: its name, or a part of it that no other one has")
     ] = None
     control: Annotated[
-        Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or $XDG_RUNTIME_DIR/uavctl")
+        Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or the user's own")
     ] = None
     json: Annotated[
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
