@@ -126,6 +126,8 @@ class Journal:
                 self._files.look()
             if self._files.unwritten and self._ready():
                 self._files.write_unwritten()
+            if self._files.is_open and self._dropped and not self._noted[0]:
+                self._note_news()  # before all that was put after it: a recording without an end tells of it, too
             for _ in range(min(records, len(self.queue))):
                 if not self._ready():
                     return

@@ -196,6 +196,40 @@ def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end
     assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
 
+HANGING = """
+import os, threading, time
+plain = os.{call}
+def hanging(*arguments):
+    while threading.current_thread().name == "recorder" and os.path.exists({flag!r}):
+        time.sleep(0.02)
+    return plain(*arguments)
+os.{call} = hanging
+"""
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
+    flag = air.folder / "hangs"
+    (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))
+    with ended(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
+        wait_for_flight(air)
+        flag.touch()
+        until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
+        found = air.status()
+        assert found["mode"] == "track" and found["recorder"]["dropped"] == 0
+        assert (
+            found["recorder"]["reason"]
+            == f"the recording was last written {found['recorder']['unwritten_s']:.1f} s ago"
+        )
+        flag.unlink()
+        until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
+        flag.touch()
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "Traceback" not in told
+    assert "records (the recording was last written " in told
+
+
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
     with scene("sim.seed=3") as other:
         other.control = air.control
