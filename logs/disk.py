@@ -40,7 +40,8 @@ class DiskFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        # What is appended to a file that somebody has cut stays too short, and so can be seen.
+        self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
     def write(self, data: bytes) -> None:
         """Hand all of `data` to the operating system."""
@@ -51,7 +52,6 @@ class DiskFile:
     def truncate(self, size: int) -> None:
         """Cut the file to `size` bytes and go on writing there."""
         os.ftruncate(self._fd, size)
-        os.lseek(self._fd, size, os.SEEK_SET)
 
     def sync(self) -> None:
         """Wait until the disk has what was written."""
@@ -74,6 +74,23 @@ def later_segments(path: Path) -> tuple[Path, ...]:
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
     found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
     return tuple(found[number] for number in sorted(found))
+
+
+def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
+    """Whether a file is where it was made, and holds no less than was written to it.
+
+    Args:
+        path: of the file.
+        size: bytes that were written.
+        opened: what it is, while it is open. Of a closed one some file systems (FAT) change the number.
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True  # nobody knows, and the next write will tell
+    return found.st_size >= size and (opened is None or os.path.samestat(found, opened))
 
 
 def free_bytes(folder: Path) -> int | None:

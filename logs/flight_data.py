@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.design_view import DesignView, Floats, design_view
-from logs.topics import RecorderNote
+from logs.topics import END, GOES_ON, RecorderNote
 from uavctl.data import (
     Checked,
     ControlMode,
@@ -139,7 +139,7 @@ class FlightData:
     @property
     def breaks_off(self) -> bool:
         """Whether the recorder was not able to end it: killed, without power, or the file was cut."""
-        return bool(self.notes) and not self.notes[-1].text.startswith(("end", "goes on in"))
+        return bool(self.notes) and not self.notes[-1].text.startswith((END, GOES_ON))
 
     @cached_property
     def virtual_time(self) -> bool:

@@ -13,14 +13,14 @@ import msgspec
 from logs.chunks import Damage, End, Message
 from logs.encoding import decode
 from logs.reader import segment_files, walk
-from logs.topics import HEADER, LIBRARY, RECORDER, RecorderNote
+from logs.topics import END, HEADER, LIBRARY, RECORDER, RecorderNote
 from uavctl.data import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 from uavctl.errors import RecordingError
 
 _OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
 _LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
 _NEWEST_TELLS = ("/uavctl/link_estimate", "/sim/truth")
-_PLAIN_NOTES = ("begin", "end")
+_PLAIN_NOTES = ("begin", END)
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -18,12 +19,13 @@ from logs.disk import OutputFile, RoomWatch, later_segments
 from logs.encoding import encode, encode_message
 from logs.onlookers import Onlookers
 from logs.rotation import Rotation
-from logs.topics import GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote
+from logs.topics import END, GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote
 from uavctl.config.log import LogConfig
 from uavctl.data import Datagram, Record
 from uavctl.errors import RecordingError
 
 LOOK_S = 1.0  # between two syncs, and looks at the disk's room
+LATE_S = 3.0  # a last completed write that is older means that the disk hangs
 LAST_TRIES = 3  # files that closing may begin on a failing disk
 
 
@@ -35,12 +37,14 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     waiting: int  # records in memory
     dropped: int  # records that found the queue full, or came after the end
     refused: int  # records that could not be encoded
+    gone: int  # records in files that somebody has removed or replaced since
     failures: int  # failed writes
-    reason: str  # of the newest failed write, or rest; "" while there was none
+    reason: str  # what is wrong now, or was last (a failed write, a rest); "" while nothing was
     refusal: str  # of the newest refused record
     bytes: int  # on the disk
     segments: tuple[str, ...]  # files with at least one chunk
     warning: str = ""  # the disk gets low
+    unwritten_s: float = 0.0  # since the last completed write, while something waits for the disk [s]
     unseen: int = 0  # records of which no messages for viewers could be made; they are in the recording
 
 
@@ -61,6 +65,7 @@ class Journal:
         queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
         views_due: the same, with the record's message, of records whose messages for viewers are not made yet.
         closed: no more records will come.
+        finished: all that could be done is done.
 
     Raises:
         RecordingError: the name is taken, or the folder cannot be made.
@@ -87,7 +92,8 @@ class Journal:
         self._files = Rotation(path, log, open_file, clock)
         self._clock = clock
         self._onlookers = onlookers
-        self._next_look_s = clock() + LOOK_S
+        self._written_s = clock()  # nothing that waited for the disk then does so now
+        self._next_look_s = self._written_s + LOOK_S
         self._noted = (0, 0)  # dropped and refused, as last written down
         self._told_low = False
         self._drop_lock = threading.Lock()
@@ -96,7 +102,7 @@ class Journal:
         self._refusal = ""
         self.queue: deque[tuple[str, int, Record]] = deque()
         self.views_due: deque[tuple[str, int, Record, bytes]] = deque()
-        self.closed = False
+        self.closed = self.finished = False
 
     def drop(self) -> None:
         """Count a record that found no room in the queue."""
@@ -116,8 +122,12 @@ class Journal:
             self._room.look()
             self._rest()
         try:
+            if due:
+                self._files.look()
             if self._files.unwritten and self._ready():
                 self._files.write_unwritten()
+            if self._files.is_open and self._dropped and not self._noted[0]:
+                self._note_news()  # before all that was put after it: a recording without an end tells of it, too
             for _ in range(min(records, len(self.queue))):
                 if not self._ready():
                     return
@@ -129,6 +139,8 @@ class Journal:
             if due and self._files.is_open:
                 self._note_news()
                 self._files.sync()
+            if due:
+                self._written_s = self._clock()
         except OSError as error:
             self._files.fail(error)
 
@@ -139,27 +151,40 @@ class Journal:
             self._files.try_again()
             self.drain(len(self.queue), len(self.views_due) + len(self.queue))
             if self._files.is_open:
-                self._finish_file("end")
+                self._finish_file(END)
+        with suppress(OSError):  # none is open
+            self._files.look()
+        self.finished = True
 
     def status(self) -> RecorderStatus:
         """How it is doing."""
         files = self._files
         parts = files.parts()
         waiting = len(self.queue) + files.open_messages
-        lost = self._dropped + self._refused + (waiting if self.closed else 0)
+        lost = self._dropped + self._refused + files.gone_records + (waiting if self.closed else 0)
         stuck = bool(files.reason) and not self.closed and not files.has_chunk
+        hangs = self.closed and not self.finished
+        unwritten_s = max(0.0, self._clock() - self._written_s) if waiting or hangs else 0.0
+        late = hangs or unwritten_s > LATE_S
+        reasons = (
+            (bool(files.gone), f"{', '.join(files.gone)} deleted, moved or replaced"),
+            (late, f"the recording was last written {unwritten_s:.1f} s ago"),
+            (bool(files.reason) and not (files.gone and not stuck), files.reason),
+        )
         return RecorderStatus(
-            ok=not lost and not stuck,
+            ok=not lost and not stuck and not late,
             written=sum(messages for _, messages, _ in parts),
             waiting=waiting,
             dropped=self._dropped,
             refused=self._refused,
+            gone=files.gone_records,
             failures=files.failures,
-            reason=files.reason,
+            reason="; ".join(text for holds, text in reasons if holds),
             refusal=self._refusal,
             bytes=sum(size for _, _, size in parts),
             segments=tuple(str(path) for path, _, _ in parts),
             warning=self._room.text if self._room.low else "",
+            unwritten_s=unwritten_s,
             unseen=self._onlookers.unseen,
         )
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 from logs.chunks import Damage, End, Message, Order, last_chunk, scan
 from logs.disk import later_segments
 from logs.encoding import decode
-from logs.topics import GOES_ON, HEADER, LIBRARY, RECORDER, RecorderNote, record_type
+from logs.topics import END, GOES_ON, HEADER, LIBRARY, NO_END, RECORDER, RECOVERED, RecorderNote, record_type
 from uavctl.data import Header, Record
 from uavctl.errors import RecordingError
 
@@ -70,7 +70,7 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
 
 
 def finished(path: Path) -> bool:
-    """Whether every file of a recording was closed in order, and none is missing after the last.
+    """Whether every file of a recording was closed in order, and the last of them with the recorder's last word.
 
     Raises:
         RecordingError: there is no such recording.
@@ -81,6 +81,9 @@ def finished(path: Path) -> bool:
 def lacks_end(path: Path) -> str:
     """Why a recording's end is not there, in words; nothing if it is.
 
+    Only the recorder's last word says that it is: index and footer stand in a file that was full or could not be
+    written on, and in one that was recovered, too.
+
     Raises:
         RecordingError: there is no such recording.
     """
@@ -89,9 +92,19 @@ def lacks_end(path: Path) -> str:
     if None in ends:
         return "the recording is torn"
     note = _note(ends[-1])
-    if note is None or note.text != GOES_ON:
+    if note is not None and is_end(note):
         return ""
-    return f"the recording goes on after {files[-1].name}, in a file that is missing"
+    text = "" if note is None else note.text
+    if text.startswith(GOES_ON):
+        return f"the recording goes on after {files[-1].name}, in a file that is missing"
+    if text.startswith(RECOVERED):
+        return f"the recording was {text}"
+    return f"the recording has no end: nothing could be written after {files[-1].name}"
+
+
+def is_end(note: RecorderNote) -> bool:
+    """Whether the end of a recording is there if this is what was noted last."""
+    return note.text.startswith(END) or (note.text.startswith(RECOVERED) and NO_END not in note.text)
 
 
 def last_note(path: Path) -> RecorderNote | None:

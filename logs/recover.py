@@ -9,10 +9,10 @@ import msgspec
 
 from logs.chunks import Damage, End, Message
 from logs.disk import DiskFile
-from logs.encoding import encode
-from logs.reader import walk
+from logs.encoding import decode, encode
+from logs.reader import is_end, walk
 from logs.segment import Entry, Segment
-from logs.topics import RECORDER, RECOVERED, RecorderNote, definition
+from logs.topics import HOLES, NO_END, RECORDER, RECOVERED, RecorderNote, definition
 from uavctl.errors import RecordingError
 
 CHUNK_BYTES = 16384
@@ -26,6 +26,7 @@ class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
     lost_bytes: int  # damaged bytes that held messages, or may have
     chunks_bad: int  # damaged places, a torn end included
     finished: bool  # every file of the recording had been closed in order
+    ended: bool  # the recorder's last word is there, so that nothing is missing after it
     damage: tuple[str, ...]  # in words: file, offset, reason; and if losses at the end cannot be counted
 
     @property
@@ -43,7 +44,7 @@ class _Tally:
         self.lost_bytes = 0
         self.damage: list[Damage] = []
         self.finished = True
-        self.open_ended = False  # nothing tells how many messages came after the last restored one
+        self.ended = False  # the newest message is the recorder's last word
         self._next: int | None = None
         self._doubtful_bytes = 0  # damaged since the last message
 
@@ -56,6 +57,7 @@ class _Tally:
         self._doubtful_bytes = 0  # without a gap nothing was in them: an index, or the file's head
         self._next = item.sequence + 1
         self.messages += not item.repeated
+        self.ended = item.definition.topic == RECORDER and _is_end(item)
 
     def damaged(self, item: Damage) -> None:
         self.damage.append(item)
@@ -63,10 +65,10 @@ class _Tally:
 
     def file_ended(self, item: End) -> None:
         self.finished &= item.finished
-        self.open_ended = not item.complete  # of the last file: a later one's numbers tell what an earlier one lost
 
     def end(self) -> None:
-        self.open_ended |= self._doubtful_bytes > 0
+        if self.ended:
+            self._doubtful_bytes = 0  # no message comes after the last word
         self.lost_bytes += self._doubtful_bytes
         self._doubtful_bytes = 0
 
@@ -74,8 +76,8 @@ class _Tally:
 def recover(src: Path, dst: Path) -> RecoverResult:
     """Write all whole chunks' messages of `src` (with its later segments) to the new file `dst`.
 
-    Messages keep their bytes, times and order; they are numbered anew. If anything was lost, the
-    last message, from the recorder, says so.
+    Messages keep their bytes, times and order; they are numbered anew. If anything was lost, or the end of
+    the recording is not there, the last message, from the recorder, says so.
 
     Raises:
         RecordingError: `src` is no recording or holds no whole chunk, `dst` exists, or it cannot be
@@ -116,17 +118,18 @@ def _copy(src: Path, segment: Segment) -> RecoverResult:
                 segment.add(Entry(item.definition, tally.messages, item.at_ns, item.data))
     tally.end()
     damage = [str(one) for one in tally.damage]
-    if tally.open_ended:
-        damage.append(f"{src}: the end is torn or damaged: messages after the last restored one cannot be counted")
+    if not tally.ended:
+        damage.append(f"{src}: the end is missing: messages after the last restored one cannot be counted")
     result = RecoverResult(
         messages=tally.messages,
         messages_lost=tally.messages_lost,
         lost_bytes=tally.lost_bytes,
         chunks_bad=len(tally.damage),
         finished=tally.finished,
+        ended=tally.ended,
         damage=tuple(damage),
     )
-    if not result.lossless:
+    if not (result.lossless and result.ended):
         segment.add(Entry(definition(RECORDER), tally.messages + 1, at_ns, encode(_note(src, result, at_ns))))
     segment.finish()
     return result
@@ -140,5 +143,20 @@ def _note(src: Path, result: RecoverResult, at_ns: int) -> RecorderNote:
         dropped=0,
         refused=0,
         failures=0,
-        text=f"{RECOVERED}{src.name}: {result.messages_lost} messages and {result.lost_bytes} bytes lost",
+        text=f"{RECOVERED}{src.name}: {_losses(result)}",
     )
+
+
+def _losses(result: RecoverResult) -> str:
+    parts = (
+        (result.messages_lost > 0, f"{result.messages_lost} {HOLES}"),
+        (result.lost_bytes > 0, f"{result.lost_bytes} bytes lost"),
+        (not result.ended, NO_END),
+    )
+    return ", ".join(text for given, text in parts if given)
+
+
+def _is_end(message: Message) -> bool:
+    note = decode(RECORDER, message.data, message.at_ns)
+    assert isinstance(note, RecorderNote)  # the topic's type
+    return is_end(note)

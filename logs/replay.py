@@ -212,12 +212,12 @@ class _Findings:
             known = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
             known.add(those, at_s)
 
-    def result(self) -> ReplayResult:
-        """All of it."""
+    def result(self, *, finished: bool) -> ReplayResult:
+        """All of it; of a recording with an end it is to be more than nothing."""
         return ReplayResult(
             decisions=self.decisions,
             compared=self.compared,
-            identical=self.first is None and self.decisions > 0,
+            identical=self.first is None and (self.decisions > 0 or not finished),
             first_difference=self.first,
             first_decision=self.first_decision,
             context=self.context,
@@ -284,7 +284,7 @@ def replay(
                 found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
     if finished:
         _unsaid(found, produced)
-    return found.result()
+    return found.result(finished=finished)
 
 
 def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:

@@ -7,16 +7,28 @@ well as possible and once the disk takes it; what the failed chunk held goes to 
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
-from logs.disk import OutputFile, segment_path
+from logs.disk import OutputFile, is_there, segment_path
 from logs.segment import Entry, Segment
 from logs.topics import HEADER, LIBRARY, definition
 from uavctl.config.log import LogConfig
 
 RETRY_S = 1.0  # between tries to begin a file after a failed write
+
+
+class _Part(NamedTuple):
+    """A file with what was written to it."""
+
+    path: Path
+    messages: int
+    bytes: int
+    records: int  # messages that were not made for viewers
 
 
 class Rotation:
@@ -36,6 +48,8 @@ class Rotation:
         at_ns: log time of the newest record.
         failures: failed writes.
         reason: of the newest one, or why recording rests.
+        gone: names of files that were written and are no longer there.
+        gone_records: that were in them.
     """
 
     def __init__(
@@ -47,7 +61,10 @@ class Rotation:
         self._repeats: dict[str, bytes] = {}  # header and library, for each segment
         self._repeats_bytes = 0
         self._retry_s = clock()
-        self._done: list[tuple[Path, int, int]] = []  # closed segments: file, messages, bytes
+        self._opened: os.stat_result | None = None  # what the open file is
+        self._done: list[_Part] = []
+        self.gone: list[str] = []
+        self.gone_records = 0
         self.unwritten: deque[tuple[str, int, bytes]] = deque()
         self.because = ""
         self.number = 1
@@ -92,8 +109,21 @@ class Rotation:
         """Files with at least one chunk: path, messages and bytes on the disk."""
         segment, done = self._segment, [*self._done]
         if segment is not None and segment.bytes:
-            done.append((segment_path(self._path, self.number), segment.messages, segment.bytes))
-        return done
+            done.append(self._part(segment))
+        return [(one.path, one.messages, one.bytes) for one in done]
+
+    def look(self) -> None:
+        """See whether what was written is still where it was made.
+
+        Raises:
+            OSError: the open file is not; closed ones are remembered as gone.
+        """
+        for part in [*self._done]:
+            if not is_there(part.path, part.bytes):
+                self._done.remove(part)
+                self._lose(part)
+        if self._segment is not None and not self._is_there(self._segment):
+            raise FileNotFoundError(errno.ENOENT, "the file was deleted, moved or replaced", self.name)
 
     def try_again(self) -> None:
         """A file may be begun at once."""
@@ -108,7 +138,10 @@ class Rotation:
         Raises:
             OSError: it cannot be opened or written.
         """
-        self._segment = Segment(self._open_file(segment_path(self._path, self.number)), self._log.chunk_bytes)
+        path = segment_path(self._path, self.number)
+        path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
+        self._segment = Segment(self._open_file(path), self._log.chunk_bytes)
+        self._opened = path.stat()
         self._preface = 0
         if self.number > 1:
             self._preface = 1 + len(self._repeats)
@@ -170,7 +203,7 @@ class Rotation:
         """
         segment = self._open_segment()
         segment.finish()
-        self._retire(segment)
+        self._retire(segment, there=self._is_there(segment))
 
     def fail(self, error: OSError) -> None:
         """After a failed write: keep what the open chunk held, and close the file as well as possible."""
@@ -185,9 +218,10 @@ class Rotation:
         kept = segment.open_entries[max(0, self._preface - segment.messages) :]
         self.unwritten.extendleft((one.definition.topic, one.at_ns, one.data) for one in reversed(kept))
         # what abandon cannot do is no second alarm: whole chunks are readable without it
+        there = self._is_there(segment)
         with contextlib.suppress(OSError):
-            segment.abandon()
-        self._retire(segment)
+            segment.abandon() if there else segment.leave()
+        self._retire(segment, there=there)
 
     def _repeat(self, topic: str) -> None:
         if topic in self._repeats:
@@ -197,14 +231,27 @@ class Rotation:
         assert self._segment is not None  # who calls has asked is_open
         return self._segment
 
-    def _retire(self, segment: Segment) -> None:
-        path = segment_path(self._path, self.number)
+    def _part(self, segment: Segment) -> _Part:
+        return _Part(segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records)
+
+    def _lose(self, part: _Part) -> None:
+        self.gone.append(part.path.name)
+        self.gone_records += part.records
+
+    def _is_there(self, segment: Segment) -> bool:
+        return is_there(segment_path(self._path, self.number), segment.bytes, self._opened)
+
+    def _retire(self, segment: Segment, *, there: bool) -> None:
+        part = self._part(segment)
         if segment.bytes:
-            self._done.append((path, segment.messages, segment.bytes))
+            if there:
+                self._done.append(part)
+            else:
+                self._lose(part)
             self.number += 1
         else:
             try:
-                path.unlink(missing_ok=True)
+                part.path.unlink(missing_ok=True)
             except OSError:
                 self.number += 1  # the name stays taken
         self._segment = None

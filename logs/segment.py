@@ -25,7 +25,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Mc
 from mcap.records import SummaryOffset as Group
 
 from logs.disk import OutputFile
-from logs.topics import Definition
+from logs.topics import Definition, is_view
 
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -74,6 +74,12 @@ class Segment:
         self.open_entries: list[Entry] = []  # not on the disk yet
         self.messages = 0  # on the disk
         self.bytes = 0  # on the disk
+
+    @property
+    def records(self) -> int:
+        """Messages on the disk that were not made for viewers."""
+        counts = self._counts.copy()
+        return sum(counts[one.number] for topic, one in [*self._channels.items()] if not is_view(topic))
 
     def add(self, entry: Entry) -> None:
         """Take a message; writes the open chunk first if it would grow too large.
@@ -136,6 +142,14 @@ class Segment:
                 raise
         finally:
             self._file.close()
+
+    def leave(self) -> None:
+        """Close a file that nobody can find any more.
+
+        Raises:
+            OSError: that could not be done.
+        """
+        self._file.close()
 
     def _begin_chunk(self) -> None:
         self._parts: list[bytes] = []

@@ -38,8 +38,13 @@ from uavctl.data import (
 HEADER = "/uavctl/header"
 LIBRARY = "/uavctl/library"
 RECORDER = "/uavctl/recorder"
-GOES_ON = "goes on in the next file"  # what the recorder notes last in a file that was full
-RECOVERED = "recovered from "  # how what a recovery notes last begins, where something was lost
+# How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
+# process was killed, the power failed, the disk took no more, or the file was cut.
+END = "end"  # all is in it that was not told as dropped or refused
+GOES_ON = "goes on in the next file"  # the file was full
+RECOVERED = "recovered from "  # by a recovery, of a recording with holes or without an end
+HOLES = "messages lost"  # in that: some are missing before the last one
+NO_END = "its end is missing"  # in that: some may be missing after the last one
 
 
 class RecorderNote(Record, frozen=True, kw_only=True):

@@ -65,7 +65,7 @@ def _cut(flight: FlightData) -> list[str]:
     text = flight.notes[-1].text
     if text.startswith(RECOVERED):
         return [f"The recording was {text}."]
-    if text == GOES_ON:
+    if text.startswith(GOES_ON):
         return ["The flight goes on in the next file."]
     if flight.breaks_off:
         return [

@@ -24,7 +24,7 @@ from sim.server import serve
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.data import Truth
-from uavctl.lock import lock_path
+from uavctl.lock import lock_paths
 
 # The machine may stand still for a while, and then neither side has failed: the vehicle bears with a pause in the
 # setpoints that is long for a flight, and the daemon with one in the positions and in the vehicle's answers.
@@ -165,7 +165,8 @@ def scene(*overrides: str) -> Iterator[Scene]:
             done.set()
             peers.join()
             tap.close()
-            lock_path(found.vehicle).unlink(missing_ok=True)  # the port's next vehicle was not left in flight
+            for path in lock_paths(found.vehicle):
+                path.unlink(missing_ok=True)  # the port's next vehicle was not left in flight
 
 
 @contextmanager

@@ -36,7 +36,7 @@ def health() -> Health:
     return Health(
         name="one", url="udpin://x:1", pid=7, running_s=1.0, mode=None, reason="", age_s=None, age_steps=None,
         position_m=None, velocity_mps=None, target_m=None, waypoint=None, loss=None, lateness_us=0.0, missed_ticks=0,
-        vehicle=None, recorder=RecorderHealth(ok=True, dropped=0, reason="", path="f.mcap"),
+        vehicle=None, recorder=RecorderHealth(ok=True, dropped=0, reason="", path="f.mcap", unwritten_s=0.0),
     )  # fmt: skip
 
 
@@ -306,12 +306,26 @@ def test_what_is_no_socket_stays(folder: Path) -> None:
         pytest.fail("a folder below a file")
 
 
+def test_a_socket_of_another_user_in_the_way_is_told_in_a_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as theirs:
+        theirs.bind(str(folder / "one.sock"))
+
+    def connect(probe: socket.socket, address: str) -> None:
+        del probe
+        raise PermissionError(13, "Permission denied", address)
+
+    monkeypatch.setattr("uavctl.control_socket.socket.socket.connect", connect)
+    with pytest.raises(UsageError, match=f"run: sudo rm {folder}/one.sock$"), listening(folder, "one"):
+        pytest.fail("bound over another one's socket")
+    assert (folder / "one.sock").is_socket()
+
+
 def test_names_and_folders() -> None:
     assert daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
     odd = load_config("room", ['name="a/../b c"', 'daemon.vehicle="serial:///dev/ttyACM0:57600"'])
     assert daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
     assert control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
     assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
-    assert control_folder(None, {"XDG_RUNTIME_DIR": "/z"}) == Path("/z/uavctl")
-    assert control_folder(None, {}) == Path(tempfile.gettempdir()) / f"uavctl-{os.getuid()}"
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as own:
+        assert control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
     assert Request(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"

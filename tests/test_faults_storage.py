@@ -203,6 +203,19 @@ def test_31_killed_processes_lose_the_open_chunk_at_most() -> None:
         assert figures["records_put"] >= figures["records_kept"] > 0
 
 
+@pytest.mark.parametrize(("scenario", "runs"), [("cuts", 4), ("killed-flight", 2)])
+def test_what_is_left_of_a_flight_replays_alike(scenario: str, runs: int) -> None:
+    done = subprocess.run(
+        [sys.executable, TOOL, "--scenario", scenario, "--runs", str(runs), "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    document = json.loads(done.stdout)
+    assert (document["runs"], document["alike"], document["wrong"]) == (runs, runs, {})
+
+
 @pytest.mark.fault(31)
 def test_31_what_the_disk_lacks_is_at_most_a_second_old(tmp_path: Path) -> None:
     items = flight(300)

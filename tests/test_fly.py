@@ -30,7 +30,7 @@ from uavctl.control_socket import listening
 from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
 from uavctl.library_bytes import decode
 from uavctl.library_store import library_for
-from uavctl.lock import lock_path, sole_daemon
+from uavctl.lock import lock_paths, sole_daemon
 
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 SOURCE = Path(__file__).parent / "foreign_source.py"
@@ -121,13 +121,13 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
     with listening(Path(control), daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
         assert run(words) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.rglob("*.mcap")) and not lock_path(url).exists()
+    assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in lock_paths(url))
 
 
 def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
-    assert not lock_path(url).exists()
+    assert not any(one.exists() for one in lock_paths(url))
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:

@@ -29,7 +29,9 @@ class Flight:
 
     def _recorder(self) -> RecorderHealth:
         ok = not self.dropped
-        return RecorderHealth(ok=ok, dropped=self.dropped, reason=self.warning if ok else "disk full", path="f.mcap")
+        return RecorderHealth(
+            ok=ok, dropped=self.dropped, reason=self.warning if ok else "disk full", path="f.mcap", unwritten_s=0.0
+        )
 
     def run(self, ticks: int, *, lateness_ns: int = 0, missed: int = 0) -> Health:
         for _ in range(ticks):

@@ -276,9 +276,11 @@ def test_who_finds_another_at_work_waits_for_its_library(design: Design, grower:
     grower.release.clear()
     found: list[bool] = []
     told: list[str] = []
+    modes: list[int] = []
 
     def tell(text: str) -> None:
         told.append(text)
+        modes.append(cache_file(design).with_suffix(".lock").stat().st_mode & 0o777)
         grower.release.set()  # only now, when the second one waits, may the first one end
 
     first = threading.Thread(target=lambda: found.append(library_for(design).cached))
@@ -291,6 +293,7 @@ def test_who_finds_another_at_work_waits_for_its_library(design: Design, grower:
     assert sorted(found) == [False, True]
     assert grower.calls == 1
     assert told == ["another process is making the policy library; waiting for it"]
+    assert modes == [0o600]  # no other user can keep a daemon waiting
 
 
 def test_a_failed_growth_holds_up_nobody(design: Design, grower: Grower) -> None:

@@ -150,11 +150,11 @@ def test_what_the_last_holder_wrote_counts_for_as_long_as_a_battery_lasts(
     file = tmp_path / "lock"
     file.write_bytes(f"123 {URL}\n{word.format(**times)}\n".encode("latin-1"))
     with file.open("r+b") as one:
-        tenure = Tenure(one.fileno(), URL, lambda: now)
+        tenure = Tenure([one.fileno()], URL, lambda: now)
         assert tenure.leaves is leaves
         tenure.note(True)
         tenure.note(True)
-        again = Tenure(one.fileno(), URL, lambda: now)
+        again = Tenure([one.fileno()], URL, lambda: now)
         assert again.leaves
         again.note(False)
     assert file.read_text() == f"{os.getpid()} {URL}\n"

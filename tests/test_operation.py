@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -173,6 +174,62 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
     assert lines[0] in told  # the health line of a daemon without a terminal
 
 
+def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(air.folder / "notify"))
+        manager.settimeout(LIMIT_S)
+        with ended(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
+            wait_for_flight(air)
+            assert air.status()["recorder"]["ok"]
+            shutil.rmtree(air.folder / "f")
+            until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
+            found = air.status()["recorder"]
+            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted, moved or replaced")
+            assert "in trouble, " in air.ctl("status")[1]
+            until(lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0)
+            process.send_signal(signal.SIGINT)
+            _, told = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1
+    assert "warning: recording in trouble: flight.mcap deleted, moved or replaced" in told
+    assert "flight.mcap deleted, moved or replaced); what is in it is whole" in told and "Traceback" not in told
+    rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
+    assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
+
+
+HANGING = """
+import os, threading, time
+plain = os.{call}
+def hanging(*arguments):
+    while threading.current_thread().name == "recorder" and os.path.exists({flag!r}):
+        time.sleep(0.02)
+    return plain(*arguments)
+os.{call} = hanging
+"""
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
+    flag = air.folder / "hangs"
+    (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))
+    with ended(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
+        wait_for_flight(air)
+        flag.touch()
+        until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
+        found = air.status()
+        assert found["mode"] == "track" and found["recorder"]["dropped"] == 0
+        assert (
+            found["recorder"]["reason"]
+            == f"the recording was last written {found['recorder']['unwritten_s']:.1f} s ago"
+        )
+        flag.unlink()
+        until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
+        flag.touch()
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "Traceback" not in told
+    assert "records (the recording was last written " in told
+
+
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
     with scene("sim.seed=3") as other:
         other.control = air.control
@@ -193,6 +250,9 @@ def test_a_unit_of_systemd_s_comes_with_the_package() -> None:
     assert lines["Type"] == "notify" and float(lines["WatchdogSec"]) <= 1.0
     assert lines["WatchdogSignal"] == "SIGKILL" and lines["Restart"] == "no"  # the vehicle's own failsafe has it
     assert "--realtime" in lines["ExecStart"]
+    # Where its user's processes look for locks, and where a killed daemon's word stays.
+    assert (lines["RuntimeDirectory"], lines["RuntimeDirectoryMode"]) == ("uavctl", "0700")
+    assert lines["RuntimeDirectoryPreserve"] == "yes"
     config = load_config("room")
     assert float(lines["TimeoutStopSec"]) > config.fallback.brake_s + config.fallback.hold_s + 10.0
 

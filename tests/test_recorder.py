@@ -130,6 +130,22 @@ def test_status_may_be_asked_while_it_writes(tmp_path: Path) -> None:
     assert seen == sorted(seen)
 
 
+def test_the_first_drop_is_noted_before_what_was_put_after_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    items = flight(100)
+    log = LogConfig(chunk_bytes=1024)
+    journal = Journal(path, log, DiskFile, lambda _: None, Clock(), Onlookers())
+    journal.queue.extend(items[:50])
+    journal.drain(1, 0)
+    journal.drop()  # item 50
+    journal.drain(10, 0)
+    journal.queue.extend(items[51:])
+    journal.drain(100, 0)
+    found = [record for _, _, record in read(path)]  # as after a kill
+    dropped = [number for number, one in enumerate(found) if isinstance(one, RecorderNote) and one.dropped == 1]
+    assert len(dropped) == 1 and items[49][2] in found[dropped[0] :] and items[51][2] in found[dropped[0] :]
+
+
 def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     reached, released = threading.Event(), threading.Event()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import stat
 import threading
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from signing_rig import OFFSET_NS, STAMP, SignedPeer, make_signing
 
 from uavctl.errors import KeyFileError
 from uavctl.mavlink.signing import NEWEST_STAMP, Refusal
-from uavctl.stamps import AHEAD, RENEW, StampKeeper, load, save, state_folder
+from uavctl.stamps import AHEAD, LOCK_TRIES, RENEW, StampKeeper, load, save, state_folder
 
 
 @pytest.mark.parametrize(
@@ -166,3 +168,31 @@ def test_its_thread_writes_by_itself(tmp_path: Path) -> None:
 
 def test_the_rig_s_clock_is_that_of_the_stamps() -> None:
     assert OFFSET_NS == 1_800_000_000 * 10**9
+
+
+def test_no_other_user_can_open_the_files_and_what_one_left_half_written_is_not_in_the_way(tmp_path: Path) -> None:
+    path = tmp_path / "keys" / "key.stamp"
+    save(path, STAMP)
+    lock, draft = path.with_suffix(".lock"), path.with_suffix(".new")
+    lock.chmod(0o644)
+    draft.symlink_to(tmp_path / "precious")
+    save(path, STAMP + 1)
+    assert load(path) == STAMP + 1
+    assert not draft.exists() and not (tmp_path / "precious").exists()
+    assert [stat.S_IMODE(one.stat().st_mode) for one in (path.parent, path, lock)] == [0o700, 0o600, 0o600]
+    lock.unlink()
+    lock.symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match="symbolic links"):
+        save(path, STAMP + 2)
+    assert not (tmp_path / "precious").exists()
+
+
+def test_a_lock_that_somebody_holds_keeps_no_daemon_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "key.stamp"
+    pauses: list[float] = []
+    monkeypatch.setattr("uavctl.stamps.time.sleep", pauses.append)
+    with path.with_suffix(".lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(KeyFileError, match="Resource temporarily unavailable"):
+            StampKeeper(path, STAMP)
+    assert len(pauses) == LOCK_TRIES

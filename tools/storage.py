@@ -8,36 +8,52 @@ refused, or recovered, and never give a wrong value, nor a recovered file whose 
 `python tools/storage.py --scenario cost --runs 5 --seconds 60`: a flight's records are put tick by tick in real time,
 and the time is taken that this costs the thread that flies, beside a sink that does nothing; medians of the runs.
 
+`python tools/storage.py --scenario cuts --runs 200`: a flight in several files is cut at a random byte.
+`python tools/storage.py --scenario killed-flight --runs 40`: `uavctl fly`, on a simulated vehicle, is killed (SIGKILL)
+at a random moment. What is left has to replay alike up to its end, as it is and recovered, with exit code 0; if not
+even its header is whole, it has to be refused.
+
 Exit code 1 where something was wrong.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
+import random
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the process is forked, so it may have no threads
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from cost_rig import cost, flown_ticks  # the tests' own
+from cut_rig import NAME, Cuts, alike, refused
 from flip_rig import Flips
 from kill_rig import KINDS, LOG, Killed, kill_once, truth
+from operation_rig import ended, scene
+from report_rig import unpaged
+
+from uavctl.cli.app import run
+
+FLIGHT = ("--set", "log.segment_bytes=100000")  # so that cuts and kills hit the change of files, too
+LONGEST_S = 4.0  # from the beginning of a recording to the kill
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do it, and say whether all was well."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", choices=("kill", "flip", "cost"), default="kill")
-    parser.add_argument("--runs", type=int, default=1000, help="kills, or measurements")
+    parser.add_argument("--scenario", choices=("kill", "flip", "cost", "cuts", "killed-flight"), default="kill")
+    parser.add_argument("--runs", type=int, default=1000, help="kills, cuts, or measurements")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a measurement")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first kill")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first kill, or of the cuts")
     parser.add_argument("--json", action="store_true", help="figures as JSON, one document")
     given = parser.parse_args(arguments)
     if given.runs < 1 or given.first < 0 or given.seconds < 1.0:
@@ -47,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         wrong, report = _flips()
     elif given.scenario == "cost":
         wrong, report = _costs(given.runs, given.seconds)
+    elif given.scenario == "cuts":
+        wrong, report = _cuts(given.first, given.runs)
+    elif given.scenario == "killed-flight":
+        wrong, report = _killed_flights(given.first, given.runs)
     else:
         wrong, report = _kills(given.first, given.runs)
     document = {**report, "wrong": wrong, "wall_s": round(time.monotonic() - begun, 1)}
@@ -109,6 +129,53 @@ def _costs(runs: int, seconds: float) -> tuple[dict[str, str], dict[str, object]
     wrong = {str(number): "records dropped" for number, one in enumerate(found) if one["dropped"]}
     report = {key: round(statistics.median(one[key] for one in found), 2) for key in found[0]}
     return wrong, {"runs": runs, "seconds": seconds, **report}
+
+
+def _cuts(seed: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
+    wrong: dict[str, str] = {}
+    with tempfile.TemporaryDirectory(prefix="uavctl-cuts-") as flown:
+        words = ["loopback", *FLIGHT, "--duration", "5", "--out", flown, "--json"]
+        with unpaged(), redirect_stdout(io.StringIO()):
+            run(words)
+        cuts = Cuts(Path(flown) / NAME)
+        for number, (file, size) in enumerate(cuts.drawn(runs, seed), 1):
+            with tempfile.TemporaryDirectory(prefix="uavctl-cut-") as folder:
+                text = cuts.wrong(Path(folder), file, size)
+            if text:
+                wrong[f"file {file + 1}, {size} bytes"] = text
+            _tell(f"{number} of {runs}")
+    report: dict[str, object] = {"files": len(cuts.files), "chunks": len(cuts.chunks), "straddled": cuts.straddled}
+    return wrong, {"runs": runs, "alike": runs - len(wrong), **report}
+
+
+def _killed_flights(first: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
+    wrong: dict[str, str] = {}
+    decisions = files = nothing = 0
+    for seed in range(first, first + runs):
+        with scene() as air, ended(air.fly("f", *FLIGHT)) as process:
+            assert process.stderr is not None
+            while "recording to" not in process.stderr.readline():
+                assert process.poll() is None, "the daemon does not start"
+            time.sleep(random.Random(seed).uniform(0.0, LONGEST_S))
+            process.kill()
+            process.wait()
+            left = [*(air.folder / "f").glob("*.mcap")]
+            files = max(files, len(left))
+            if any(one.stat().st_size for one in left):
+                text, compared = alike(air.folder / "f", ended=False)
+                decisions += compared
+            else:
+                text = refused(air.folder / "f")
+                nothing += 1
+        if text:
+            wrong[str(seed)] = text
+        _tell(f"{seed - first + 1} of {runs}")
+    report: dict[str, object] = {
+        "decisions_compared": decisions,
+        "most_files": files,
+        "before_the_first_chunk": nothing,
+    }
+    return wrong, {"runs": runs, "alike": runs - len(wrong), **report}
 
 
 def _tell(text: str) -> None:

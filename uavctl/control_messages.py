@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -19,6 +18,7 @@ from uavctl.config import Config
 from uavctl.data import Vec3
 from uavctl.errors import UsageError
 from uavctl.health import Health
+from uavctl.runtime_folder import runtime_folders
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"
@@ -57,14 +57,16 @@ def daemon_name(config: Config) -> str:
 
 
 def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
-    """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else below the user's runtime folder."""
+    """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's own runtime folder.
+
+    Raises:
+        UsageError: the user has none.
+    """
     if chosen is not None:
         return chosen
     if environ.get(FOLDER_VARIABLE):
         return Path(environ[FOLDER_VARIABLE])
-    if environ.get("XDG_RUNTIME_DIR"):
-        return Path(environ["XDG_RUNTIME_DIR"]) / "uavctl"
-    return Path(tempfile.gettempdir()) / f"uavctl-{os.getuid()}"
+    return runtime_folders(environ)[0]
 
 
 def socket_path(folder: Path, name: str) -> Path:

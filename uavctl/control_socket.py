@@ -209,7 +209,14 @@ def _own(folder: Path) -> None:
 def _listen(path: Path, name: str) -> socket.socket:
     """Bind and listen; a socket that a dead daemon left is taken over."""
     if path.is_socket():
-        if _alive(path):
+        try:
+            alive = _alive(path)
+        except OSError as error:
+            raise UsageError(
+                f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
+                f"run: sudo rm {path}"
+            ) from error
+        if alive:
             raise VehicleTakenError(
                 f"{path}: a daemon named {name} is running; end it, or give this one another --set 'name=\"...\"'"
             )
@@ -227,7 +234,11 @@ def _listen(path: Path, name: str) -> socket.socket:
 
 
 def _alive(path: Path) -> bool:
-    """Whether somebody listens there."""
+    """Whether somebody listens there.
+
+    Raises:
+        OSError: it is not ours.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:

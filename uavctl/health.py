@@ -22,6 +22,7 @@ class RecorderHealth(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int  # records that are not in it
     reason: str  # why it is not, or that the disk gets low; empty if all is well
     path: str
+    unwritten_s: float  # since the last completed write, while something waits for the disk
 
 
 class VehicleHealth(msgspec.Struct, frozen=True, kw_only=True):

@@ -150,6 +150,7 @@ def _alone(path: Path, tell: Tell) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
             lock.parent.mkdir(parents=True, exist_ok=True)
+            lock.touch(mode=0o600)  # no other user can hold it
             file = stack.enter_context(lock.open("ab"))
             stack.callback(_remove, lock)
             _wait_for(file.fileno(), tell)

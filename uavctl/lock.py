@@ -1,7 +1,9 @@
 """One daemon a vehicle: a lock on what the connection's URL means.
 
-The lock is the kernel's (flock) and machine-wide, whoever the user is; it goes when its holder dies, however that
-happens. Two URLs that mean the same (a name and its address, a serial port and a link to it) are one vehicle. That
+The lock is the kernel's (flock); it goes when its holder dies, however that happens. It is one among the processes of
+one user: its files are where no other user can touch them, so that none can hold the vehicle, or rewrite the word that
+it was left in flight. They are in each of the user's runtime folders, since not every process of the user finds the
+same one. Two URLs that mean the same (a name and its address, a serial port and a link to it) are one vehicle. That
 two different connections lead to the same vehicle cannot be seen before they are opened.
 
 Its file also tells the next holder that this one has ended, or was killed, and left the vehicle in flight.
@@ -15,16 +17,15 @@ import ipaddress
 import os
 import socket
 import stat
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
+from uavctl.runtime_folder import runtime_folders
 
-_SHARED = Path("/run/lock")  # of all users
 _LONGEST = 500  # bytes of a lock file that are looked at
 _TRIES = 10  # to lock a file that its last holder is just removing
 _FLOWN = "flown at"  # the second line, with the time since the machine's start [ns]
@@ -66,15 +67,19 @@ class Tenure:
     """A vehicle, from its lock's taking to its letting go.
 
     Args:
-        descriptor: of the locked file.
+        descriptors: of the locked files, which say the same; of what others left in them the newest counts.
         url: of the vehicle.
         now: time since the machine's start [ns].
+
+    Raises:
+        OSError: nothing can be written into the files.
     """
 
-    def __init__(self, descriptor: int, url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
-        self._descriptor, self._now = descriptor, now
+    def __init__(self, descriptors: Sequence[int], url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
+        self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
-        self._left_ns = _left_ns(os.pread(descriptor, _LONGEST, 0), now())
+        found = [_left_ns(os.pread(one, _LONGEST, 0), now()) for one in descriptors]
+        self._left_ns = max((one for one in found if one is not None), default=None)
         self._write()
 
     @property
@@ -98,8 +103,9 @@ class Tenure:
     def _write(self) -> None:
         second_line = "" if self._left_ns is None else f"{_FLOWN} {self._left_ns}\n"
         text = (self._first_line + second_line).encode()
-        os.pwrite(self._descriptor, text, 0)
-        os.ftruncate(self._descriptor, len(text))
+        for descriptor in self._descriptors:
+            os.pwrite(descriptor, text, 0)
+            os.ftruncate(descriptor, len(text))
 
 
 def _left_ns(text: bytes, now_ns: int) -> int | None:
@@ -110,39 +116,49 @@ def _left_ns(text: bytes, now_ns: int) -> int | None:
     return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
 
 
-def lock_path(url: str, folder: Path | None = None) -> Path:
-    """File of the lock of the vehicle behind a URL; arguments and errors are those of `sole_daemon`."""
-    place = _folder() if folder is None else folder
-    return place / f"uavctl-{hashlib.sha256(identity(url).encode()).hexdigest()[:16]}.lock"
+def lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
+    """Files of the lock of the vehicle behind a URL; arguments and errors are those of `sole_daemon`."""
+    name = f"uavctl-{hashlib.sha256(identity(url).encode()).hexdigest()[:16]}.lock"
+    return tuple(one / name for one in (runtime_folders() if folder is None else (folder,)))
 
 
 @contextmanager
 def sole_daemon(url: str, folder: Path | None = None) -> Iterator[Tenure]:
-    """Hold the lock of the vehicle behind a URL; its file stays if the vehicle is left in flight.
+    """Hold the lock of the vehicle behind a URL; its files stay if the vehicle is left in flight.
 
     Args:
         url: of the vehicle.
-        folder: where the lock files are; the machine's own place for them by default.
+        folder: where the lock file is; by default there is one in each of the user's runtime folders.
 
     Raises:
         VehicleTakenError: another process holds it, or the lock cannot be made; says which and what to do.
         ConnectionSpecError: the URL cannot be understood.
+        UsageError: the user has no runtime folder.
     """
-    path = lock_path(url, folder)
-    descriptor = _lock(path, url)
-    tenure: Tenure | None = None
+    paths = lock_paths(url, folder)
+    with ExitStack() as stack:
+        descriptors = []
+        for path in paths:
+            descriptors.append(_lock(path, url))
+            stack.callback(os.close, descriptors[-1])
+        tenure: Tenure | None = None
+        try:
+            tenure = _tenure(descriptors, url, paths[0])
+            yield tenure
+        finally:
+            if tenure is None or not tenure.leaves:
+                for path in paths:
+                    with suppress(OSError):  # gone with its folder, at the end of a login session
+                        path.unlink()
+
+
+def _tenure(descriptors: Sequence[int], url: str, path: Path) -> Tenure:
     try:
-        tenure = Tenure(descriptor, url)
-        yield tenure
-    finally:
-        if tenure is None or not tenure.leaves:
-            path.unlink(missing_ok=True)
-        os.close(descriptor)
-
-
-def _folder() -> Path:
-    usable = _SHARED.is_dir() and os.access(_SHARED, os.W_OK)
-    return _SHARED if usable else Path(tempfile.gettempdir())
+        return Tenure(descriptors, url)
+    except OSError as error:
+        raise VehicleTakenError(
+            f"{path}: {error.strerror}, so the next daemon would not know that {url} was left in flight; make room"
+        ) from error
 
 
 def _lock(path: Path, url: str) -> int:
@@ -152,6 +168,11 @@ def _lock(path: Path, url: str) -> int:
             descriptor = _open(path)
         except FileExistsError:
             continue  # made by another one in between
+        except PermissionError as error:
+            raise VehicleTakenError(
+                f"{path}: is not this user's, so nothing shows that {url} is free; another user, root it may be, left "
+                f"it; if nothing of theirs flies, run: sudo rm {path}"
+            ) from error
         except OSError as error:
             raise VehicleTakenError(
                 f"{path}: {error.strerror}, so nothing shows that {url} is free; see to the file or its folder"
@@ -170,12 +191,13 @@ def _open(path: Path) -> int:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:
-        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CREAT | os.O_EXCL, 0o666)
-        os.fchmod(descriptor, 0o666)  # whatever the umask: other users lock the same file
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(0, "not a regular file")
-    return descriptor
+        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CREAT | os.O_EXCL, 0o600)
+    found = os.fstat(descriptor)
+    if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid():
+        os.fchmod(descriptor, 0o600)
+        return descriptor
+    os.close(descriptor)
+    raise PermissionError if stat.S_ISREG(found.st_mode) else OSError(0, "not a regular file")
 
 
 def _is_still(path: Path, descriptor: int) -> bool:

@@ -9,8 +9,11 @@ from __future__ import annotations
 import fcntl
 import os
 import threading
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import TextIO
 
 from uavctl.errors import KeyFileError
 from uavctl.mavlink.signing import NEWEST_STAMP, Stamps
@@ -18,6 +21,7 @@ from uavctl.mavlink.signing import NEWEST_STAMP, Stamps
 AHEAD = 200_000  # units of 10 µs: written ahead of what was seen, 2 s
 RENEW = 100_000  # written anew when less than this is left
 PERIOD_S = 0.25
+LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in much less
 
 
 def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
@@ -40,7 +44,10 @@ def load(path: Path) -> int:
     except FileNotFoundError:
         return 0
     except OSError as error:
-        raise KeyFileError(f"stamp {path}: {error.strerror}; see to the folder's permissions") from error
+        raise KeyFileError(
+            f"stamp {path}: {error.strerror}; see to the folder: it and its files have to be this user's (did root "
+            "make them?)"
+        ) from error
     except ValueError as error:
         raise KeyFileError(
             f"stamp {path}: holds no number; remove the file, and share a new key, since frames of the old one could "
@@ -59,10 +66,11 @@ def save(path: Path, stamp: int) -> None:
         KeyFileError: what is there is damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with path.with_suffix(".lock").open("ab") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with _private(path.with_suffix(".lock"), 0) as lock:
+        _take(lock.fileno())
         draft = path.with_suffix(".new")
-        with draft.open("w", encoding="ascii") as file:
+        draft.unlink(missing_ok=True)  # of a process that was killed, another user's it may be
+        with _private(draft, os.O_EXCL) as file:
             file.write(f"{max(stamp, load(path))}\n")
             file.flush()
             os.fsync(file.fileno())
@@ -72,6 +80,27 @@ def save(path: Path, stamp: int) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def _private(path: Path, flags: int) -> TextIO:
+    """Open a file for writing that no other user can open, made if need be."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | flags, 0o600)
+    os.fchmod(descriptor, 0o600)
+    return os.fdopen(descriptor, "w", encoding="ascii")
+
+
+def _take(lock: int) -> None:
+    """Lock a file; who holds it for long is no daemon that is writing its stamp.
+
+    Raises:
+        BlockingIOError: it is held.
+    """
+    for _ in range(LOCK_TRIES):
+        with suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        time.sleep(LOCK_PAUSE_S)
+    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 class StampKeeper:
@@ -101,7 +130,8 @@ class StampKeeper:
             write(path, self._written)
         except OSError as error:
             raise KeyFileError(
-                f"stamp {path}: {error.strerror}, so that a restart would take old frames again; see to the folder"
+                f"stamp {path}: {error.strerror}, so that a restart would take old frames again; see to the folder: it "
+                "and its files have to be this user's (did root make them?)"
             ) from error
         self.failure: str | None = None
         self._done = threading.Event()

@@ -15,7 +15,7 @@ from uavctl.cli.common import Common, messages
 from uavctl.control_messages import SUFFIX, Reply, Request, control_folder
 from uavctl.data import Vec3
 from uavctl.errors import NotReachedError, UsageError
-from uavctl.health import Health
+from uavctl.health import Health, RecorderHealth
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
 _BLOCK = 65_536
@@ -32,7 +32,7 @@ class Which:
         str | None, Parameter(help="which daemon, if several run: its name, or a part of it that no other one has")
     ] = None
     control: Annotated[
-        Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or $XDG_RUNTIME_DIR/uavctl")
+        Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or the user's own")
     ] = None
     json: Annotated[
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
@@ -188,11 +188,16 @@ def _table(health: Health) -> Table:
         "battery": "-" if vehicle is None or vehicle.battery_v is None else f"{vehicle.battery_v:.1f} V",
         "loss": "-" if health.loss is None else f"{health.loss:.0%}",
         "lateness": f"{health.lateness_us / 1e3:.2f} ms, {health.missed_ticks} ticks missed",
-        "recording": recorder.path + (f", {recorder.dropped} dropped: {recorder.reason}" if recorder.reason else ""),
+        "recording": recorder.path if recorder.ok and not recorder.reason else f"{recorder.path}, {_trouble(recorder)}",
     }
     for name, text in rows.items():
         table.add_row(name, text)
     return table
+
+
+def _trouble(recorder: RecorderHealth) -> str:
+    """What a person has to know of the recording."""
+    return f"{'' if recorder.ok else 'in trouble, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
 
 
 def _point(point: dict[str, float] | None) -> str:

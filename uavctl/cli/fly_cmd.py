@@ -67,7 +67,7 @@ def fly(
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
     control: Annotated[
         Path | None,
-        Parameter(help="folder of the socket for `uavctl ctl`; else $UAVCTL_CONTROL or $XDG_RUNTIME_DIR/uavctl"),
+        Parameter(help="folder of the socket for `uavctl ctl`; else $UAVCTL_CONTROL or the user's own"),
     ] = None,
     realtime: Annotated[
         bool, Parameter(negative=(), help="SCHED_FIFO, locked memory, garbage collected between ticks only")

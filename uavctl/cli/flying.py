@@ -33,7 +33,7 @@ from uavctl.cli.provenance import cpu, versions
 from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
-from uavctl.errors import UsageError
+from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.smpc.design_record import design_record
 
@@ -142,6 +142,8 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
         RecordingError: the recording cannot be read, or nothing was flown.
     """
     tell_losses(status)
+    if not status.segments and status.gone:
+        raise RecordingError(f"{path}: {status.reason}; nothing of the flight is on the disk")
     flight = FlightData.from_records(read(path), path)
     page = path.with_suffix(".html")
     summary = summarise(
@@ -149,7 +151,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
         wall_s=wall_s,
         recording=str(path),
         report=str(page),
-        recorder_dropped=0 if status.ok else status.dropped + status.refused + status.waiting,
+        recorder_dropped=0 if status.ok else _lacking(status),
     )
     write_report(flight, summary, page)
     return summary
@@ -218,12 +220,17 @@ def _alarm(status: RecorderStatus) -> str:
     return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
 
 
+def _lacking(status: RecorderStatus) -> int:
+    """Records that are not in the recording."""
+    return status.dropped + status.refused + status.gone + status.waiting
+
+
 def tell_losses(status: RecorderStatus) -> None:
     """Say after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
         messages().print(
-            f"[bold red]warning:[/] the recording lacks {status.dropped + status.refused + status.waiting} records "
+            f"[bold red]warning:[/] the recording lacks {_lacking(status)} records "
             f"({escape(status.reason or status.refusal or 'the disk was too slow')}); what is in it is whole. "
-            f"Files: {escape(', '.join(status.segments))}",
+            f"Files: {escape(', '.join(status.segments)) or 'none'}",
             soft_wrap=True,
         )

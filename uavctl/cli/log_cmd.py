@@ -81,7 +81,7 @@ def layout() -> int:
 
 def _recover_table(result: RecoverResult, out: Path) -> Table:
     lost = str(result.messages_lost)
-    if not result.finished:
+    if not result.ended:
         lost += " known; those after the last restored one cannot be counted"
     return two_columns(
         "Recovered",

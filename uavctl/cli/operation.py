@@ -43,7 +43,7 @@ def operation(
             show(line)
 
         def recorder() -> RecorderHealth:
-            return _recorder(status(), path)
+            return recorder_health(status(), path)
 
         identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
         watch = HealthWatch(loop, config, identity, recorder, tell)
@@ -100,6 +100,13 @@ def _health_lines() -> Iterator[Callable[[str], None]]:
         thread.join(1.0)  # a reader that hangs does not keep the daemon
 
 
-def _recorder(status: RecorderStatus, path: Path) -> RecorderHealth:
+def recorder_health(status: RecorderStatus, path: Path) -> RecorderHealth:
+    """How a recording is doing, for those who look at the flight."""
     reason = status.warning if status.ok else status.reason or status.refusal
-    return RecorderHealth(ok=status.ok, dropped=status.dropped + status.refused, reason=reason, path=str(path))
+    return RecorderHealth(
+        ok=status.ok,
+        dropped=status.dropped + status.refused + status.gone,
+        reason=reason,
+        path=str(path),
+        unwritten_s=status.unwritten_s,
+    )

@@ -56,10 +56,11 @@ def replay(
     if result.dropped:
         text = f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
         warn(text)
-    if replayed.recovered:
-        warn(f"{replayed.recovered}: where messages are missing, what came after cannot be compared")
+    if replayed.holes:
+        warn(f"{replayed.holes}: where messages are missing, what came after cannot be compared")
     if replayed.lacks_end:
-        warn(f"{replayed.lacks_end}: compared up to there")
+        compared = "compared up to there" if result.decisions else "before its first decision, so nothing was compared"
+        warn(f"{replayed.lacks_end}: {compared}")
     document = {
         **msgspec.structs.asdict(result),
         "changed": replayed.changed,

@@ -13,12 +13,12 @@ from logs.reader import good_messages, header, lacks_end, last_note, records
 from logs.replay import MAKERS, ReplayResult
 from logs.replay import replay as replay_recording
 from logs.tlog import TlogPacket, read_tlog
-from logs.topics import RECOVERED, RecorderNote
+from logs.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.cli.common import messages, warn
 from uavctl.cli.provenance import cpu, versions
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.config.load import parse
-from uavctl.data import Header
+from uavctl.data import Header, StepInput
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop, make_links
 
@@ -38,14 +38,14 @@ class Replayed:
     Attributes:
         result: What it found.
         lacks_end: Why the recording's end is not there, in words; nothing if it is.
-        recovered: From what, and what was lost, in words; nothing if all is there.
+        holes: From what it was recovered, and what was lost before its end, in words; nothing if that is all there.
         changed: What was asked to be different.
         other_versions: What decides the last bits, and is not here what the recording was made with.
     """
 
     result: ReplayResult
     lacks_end: str
-    recovered: str
+    holes: str
     changed: tuple[Changed, ...]
     other_versions: tuple[str, ...]
 
@@ -65,6 +65,10 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     """
     check_first(flight)
     recorded = header(flight)
+    cut, note = lacks_end(flight), last_note(flight)
+    if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
+        nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
+        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded)))
     name = f"{flight} (configuration)"
     config = parse(recorded.config_toml, name).config
     if overrides:
@@ -79,16 +83,15 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         config = loaded.config
     else:
         controller, changed = recorded_flyer(flight, config).controller, ()
-    cut, note = lacks_end(flight), last_note(flight)
-    recovered = note.text if note is not None and note.text.startswith(RECOVERED) else ""
+    holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""
     result = replay_recording(
         ((one.definition.topic, one.at_ns, one.data) for one in good_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
-        finished=not cut and not recovered,
+        finished=not cut and not holes,
         ignored=MAKERS if overrides else frozenset(),
     )
-    return Replayed(result, cut, recovered, changed, tuple(other_versions(recorded)))
+    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded)))
 
 
 def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:

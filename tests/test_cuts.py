@@ -1,0 +1,58 @@
+"""A recording that ends anywhere is recovered and replays alike up to there."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+from cut_rig import NAME, Cuts
+from report_rig import unpaged
+
+from uavctl.cli.app import run
+from uavctl.cli.prepare import Prepared
+from uavctl.cli.recorded import recorded_flyer
+from uavctl.config import Config
+
+SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log.segment_bytes=100000")
+
+
+@pytest.fixture(scope="module")
+def cuts(tmp_path_factory: pytest.TempPathFactory) -> Cuts:
+    folder = tmp_path_factory.mktemp("flown")
+    with unpaged():
+        assert run(["loopback", *SMALL, "--duration", "3", "--out", str(folder), "--json"]) == 0
+    return Cuts(folder / NAME)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _designed_once(cuts: Cuts) -> Iterator[None]:
+    """All cuts are of one flight, and a flight leaves nothing in its controller: a replay would find out."""
+
+    @lru_cache
+    def flyer(config: Config) -> Prepared:
+        return recorded_flyer(cuts.files[0], config)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uavctl.cli.replaying.recorded_flyer", lambda _, config: flyer(config))
+        yield
+
+
+def all_wrong(cuts: Cuts, places: list[tuple[int, int]]) -> dict[tuple[int, int], str]:
+    found = {}
+    for place in places:
+        with tempfile.TemporaryDirectory() as folder:
+            found[place] = cuts.wrong(Path(folder), *place)
+    return {place: text for place, text in found.items() if text}
+
+
+def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
+    assert len(cuts.files) > 1 and len(cuts.chunks) > 8
+    assert all_wrong(cuts, cuts.places()) == {}
+    assert cuts.straddled >= 10  # ticks of which the decision is beyond the cut
+
+
+def test_cut_anywhere(cuts: Cuts) -> None:
+    assert all_wrong(cuts, cuts.drawn(20, seed=1)) == {}
