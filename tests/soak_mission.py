@@ -78,6 +78,9 @@ class MissionFlight:
         seconds: Length of the flight.
         max_age: Largest age of information [steps].
         legs: One a waypoint.
+        unexplained_mps2: Largest acceleration that positions showed beside what was sent.
+        apart_mps: Largest difference of their velocity from the vehicle's own.
+        alarms: What the envelope took for impossible, each a false alarm.
         wrong: What it did and should not have.
     """
 
@@ -89,12 +92,15 @@ class MissionFlight:
     seconds: float
     max_age: int
     legs: tuple[Leg, ...]
+    unexplained_mps2: float
+    apart_mps: float
+    alarms: tuple[str, ...]
     wrong: tuple[str, ...]
 
     @property
     def good(self) -> bool:
         """Whether nothing was touched and all was flown."""
-        return self.landed and not self.wrong and self.clearance_m > 0.0
+        return self.landed and not self.wrong and not self.alarms and self.clearance_m > 0.0
 
 
 class _Ground:
@@ -107,6 +113,7 @@ class _Ground:
         self._index = list(index)
         self._held = round(HELD_S / config.daemon.tick_s)
         self.clearance_m, self.nearest, self.max_age = math.inf, "", 0
+        self.unexplained_mps2 = self.apart_mps = 0.0
         self.plan: dict[int, list[float]] = {}
         self.away: dict[int, list[float]] = {}
         self._of_plan: Sequence[Sequence[float]] = ()
@@ -120,6 +127,8 @@ class _Ground:
         if decision is None or not flies:
             return
         self.max_age = max(self.max_age, decision.age_steps or 0)
+        self.unexplained_mps2 = max(self.unexplained_mps2, decision.unexplained_mps2 or 0.0)
+        self.apart_mps = max(self.apart_mps, decision.apart_mps or 0.0)
         if decision.waypoint is None or decision.target is None or decision.mode is not ControlMode.TRACK:
             return
         away = float(np.linalg.norm(place - np.array(decision.target)[self._index]))
@@ -181,6 +190,9 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
         seconds=watch.ticks * tick_s,
         max_age=ground.max_age,
         legs=ground.legs(tick_s),
+        unexplained_mps2=ground.unexplained_mps2,
+        apart_mps=ground.apart_mps,
+        alarms=tuple(watch.alarms),
         wrong=tuple(watch.wrong),
     )
 
@@ -204,6 +216,11 @@ def summary(flights: Sequence[MissionFlight]) -> dict[str, object]:
         "clearance_m": float(np.median([flight.clearance_m for flight in flights])),
         "clearance_m_worst": worst.clearance_m,
         "worst": f"seed {worst.seed}, {worst.nearest}",
+        "unexplained_mps2": float(np.median([flight.unexplained_mps2 for flight in flights])),
+        "unexplained_mps2_worst": max(flight.unexplained_mps2 for flight in flights),
+        "apart_mps": float(np.median([flight.apart_mps for flight in flights])),
+        "apart_mps_worst": max(flight.apart_mps for flight in flights),
+        "alarms": {str(flight.seed): flight.alarms for flight in flights if flight.alarms},
         "max_age": max(flight.max_age for flight in flights),
         "legs": legs,
     }

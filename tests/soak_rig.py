@@ -13,9 +13,10 @@ from uavctl.build import build_design
 from uavctl.cli.flying import put_header, stop_limit_s
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
-from uavctl.data import Command, ControlMode, Decision, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
+from uavctl.data import Command, ControlMode, Decision, Event, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
 from uavctl.loop import ControlLoop
 
+ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell
 
 
@@ -38,6 +39,7 @@ class Watch:
         take_off_m: Height of the climb that is ordered in the first tick; None for none.
         stop: Whether the operator asks for the hand-over.
         wrong: What no tick may do and one did.
+        alarms: What the envelope, or the gate of positions, took for impossible.
         ticks: Ticks so far.
         modes: Ticks in each mode.
     """
@@ -48,6 +50,7 @@ class Watch:
     take_off_m: float | None = None
     stop: bool = False
     wrong: list[str] = field(default_factory=list)
+    alarms: list[str] = field(default_factory=list)
     ticks: int = 0
     modes: dict[str, int] = field(default_factory=dict)
     plan: Plan | None = None
@@ -63,6 +66,8 @@ class Watch:
             self._setpoint = record
         elif isinstance(record, Plan):
             self.plan = record
+        elif isinstance(record, Event) and record.code.startswith(ALARMS):
+            self.alarms.append(f"at {at_ns * 1e-9:.2f} s: {record.code}: {record.text}")
         self.sink.put(topic, at_ns, record)
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:

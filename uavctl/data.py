@@ -144,6 +144,8 @@ class Decision(Record, frozen=True, kw_only=True):
     rejected: int  # samples refused in this tick (invalid, duplicate, too old)
     reason: str
     target: Vector | None = None  # (n_x,), where the mission wants the vehicle in this step; None before it began
+    unexplained_mps2: float | None = None  # acceleration that positions show beside what was sent; None if not watched
+    apart_mps: float | None = None  # velocity of the positions minus the vehicle's own, its size; None if not known
     waypoint: int | None = None  # number of the waypoint flown to, from 0; None before, on a trajectory, and on orders
 
 

@@ -139,6 +139,8 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
         tick_ns: The last tick.
         sent: Setpoints, each with the tick from which it acted [ns], oldest first.
         clipped: Whether each of the last innovations was clipped, newest last.
+        unexplained_mps2: Size of the unexplained acceleration, when it was last looked at; None before.
+        apart_mps: How far the velocities of positions and vehicle were apart then; None where that is not known.
         over_ns: Capture time from which the unexplained acceleration has been too large; None while it is not.
         apart_ns: The same of the velocities.
         clean_ns: Capture time of the last position at which all was quiet; None before any.
@@ -153,6 +155,8 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     tick_ns: int | None = None
     sent: tuple[tuple[int, Vec3], ...] = ()
     clipped: tuple[bool, ...] = ()
+    unexplained_mps2: float | None = None
+    apart_mps: float | None = None
     over_ns: int | None = None
     apart_ns: int | None = None
     clean_ns: int | None = None
@@ -242,7 +246,8 @@ def _position(
     observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position)
     recent = (*watching.clipped, clipped)[-OF:]
     unexplained = _unexplained(observer) * parameters.axes
-    size = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2])) / parameters.unexplained_mps2
+    unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2]))
+    size = unexplained_mps2 / parameters.unexplained_mps2
     over_ns = None if size <= 1.0 else watching.over_ns or at_ns
     watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
     quiet = size <= 0.5 and not clipped and watching.apart_ns is None
@@ -250,6 +255,7 @@ def _position(
         watching,
         observer=observer,
         clipped=recent,
+        unexplained_mps2=unexplained_mps2,
         over_ns=over_ns,
         clean_ns=at_ns if quiet else watching.clean_ns,
     )
@@ -360,7 +366,7 @@ def _compared(
     """
     flown = _flown(watching.way, at_ns)
     if flown is None:
-        return replace(watching, offsets=(), apart_ns=None), None
+        return replace(watching, offsets=(), apart_mps=None, apart_ns=None), None
     kept = (one for one in watching.offsets if one[0] > at_ns - parameters.window_ns)
     offsets = (*kept, (at_ns, position - flown))
     watching = replace(watching, offsets=offsets)
@@ -373,7 +379,7 @@ def _compared(
     speed_mps = float(np.linalg.norm(apart))
     contradicted = speed_mps > parameters.disagreement_mps
     apart_ns = (watching.apart_ns or at_ns) if contradicted else None
-    watching = replace(watching, apart_ns=apart_ns, contradicted=contradicted)
+    watching = replace(watching, apart_mps=speed_mps, apart_ns=apart_ns, contradicted=contradicted)
     plain = hinted or speed_mps >= PLAIN * parameters.disagreement_mps
     if apart_ns is None or (not plain and at_ns - apart_ns < PERSISTS_NS):
         return watching, None

@@ -155,6 +155,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         rejected=len(intake.refused),
         reason=choice.reason,
         target=None if mission is None else wanted(controller.mission, mission, tick.boundary_ns),
+        unexplained_mps2=watching.unexplained_mps2,
+        apart_mps=watching.apart_mps,
         waypoint=mission.waypoint if mission is not None and on_waypoints else None,
     )
     return after, StepOutput(
