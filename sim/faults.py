@@ -8,6 +8,7 @@ from typing import Literal
 import msgspec
 
 from sim.autopilot import Autopilot
+from sim.mocap import AXES, Cameras
 from sim.parameters import Parameters
 from sim.personality import PERSONALITIES
 from sim.quadrotor import Quadrotor
@@ -21,7 +22,8 @@ from uavctl.errors import ConfigError
 
 OF_LINK = ("blackout", "held", "uplink_blackout")
 OF_CAMERA = ("occluded", "swapped", "frozen")
-LASTING = ("wind", "battery", "parameter")
+LASTING = ("wind", "battery", "frame", "noise", "parameter")
+MOST_NOISE_M = 100.0
 MODE_S = 1.0  # how long a change of mode is told; afterwards the mode itself tells
 
 
@@ -48,7 +50,11 @@ def problems(autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfi
     """
     parameters, modes = Parameters(autopilot), tuple(mode.name for mode in PERSONALITIES[autopilot].modes)
     for i, fault in enumerate(faults):
-        if fault.kind == "mode":
+        if fault.kind == "frame":
+            yield from _unknown(f"{key}[{i}].name", "there are no axes", fault.name, tuple(AXES))
+        elif fault.kind == "noise" and not 0.0 <= fault.value <= MOST_NOISE_M:
+            yield Problem(f"{key}[{i}].value", f"{fault.value:g} m is no noise", f"give 0 to {MOST_NOISE_M:g} m")
+        elif fault.kind == "mode":
             yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no mode", fault.name, modes)
         elif fault.kind == "parameter" and fault.name not in parameters:
             yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no parameter", fault.name, parameters.names)
@@ -88,13 +94,16 @@ class Faults:
         ConfigError: a parameter, a value or a mode that the autopilot has not.
     """
 
-    def __init__(self, config: Config, vehicle: Vehicle | Quadrotor, autopilot: Autopilot, start_ns: int) -> None:
+    def __init__(
+        self, config: Config, vehicle: Vehicle | Quadrotor, autopilot: Autopilot, cameras: Cameras, start_ns: int
+    ) -> None:
         wrong = tuple(problems(config.sim.autopilot, config.sim.fault, "sim.fault"))
         if wrong:
             raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
         self._kind = PERSONALITIES[config.sim.autopilot]
         self._vehicle = vehicle
         self._autopilot = autopilot
+        self._cameras = cameras
         numbered = [
             (start_ns + round(fault.at_s * 1e9), i, fault)
             for i, fault in enumerate(config.sim.fault)
@@ -116,6 +125,10 @@ class Faults:
         vehicle = self._vehicle
         if fault.kind == "parameter":
             self._autopilot.parameters.set(fault.name, fault.value)
+        elif fault.kind == "frame":
+            self._cameras.mistake(fault.name)
+        elif fault.kind == "noise":
+            self._cameras.shake(fault.value)
         elif fault.kind == "mode":
             self._autopilot.pilot.change(self._kind.mode(fault.name), at_ns)
         elif isinstance(vehicle, Quadrotor):

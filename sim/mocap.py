@@ -28,6 +28,22 @@ STILL: Vec3 = (0.0, 0.0, 0.0)
 UNKNOWN = [math.nan, *([0.0] * 20)]  # a covariance whose first element is NaN is unknown (message definitions)
 
 
+# Axes that the cameras may take for local NED; a row for each component that they say.
+AXES: dict[str, tuple[Vec3, Vec3, Vec3]] = {
+    "right": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "turned-90": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "turned-180": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "turned-270": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "mirrored-north": ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "mirrored-east": ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "mirrored-down": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
+    "swapped": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "enu": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    "millimetres": ((1e3, 0.0, 0.0), (0.0, 1e3, 0.0), (0.0, 0.0, 1e3)),
+    "kilometres": ((1e-3, 0.0, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.0, 1e-3)),
+}
+
+
 class _Pose(NamedTuple):
     """Where a body is, how fast it moves and how it is turned, in local NED."""
 
@@ -69,6 +85,7 @@ class Cameras:
         self._keep = math.exp(-1.0 / (camera.occlusion_s * camera.rate_hz))
         self._hidden = False
         self._seen: _Pose | None = None
+        self._axes, self._noise_std_m = AXES["right"], camera.noise_std_m
         self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
         self._taken = 0
 
@@ -81,6 +98,14 @@ class Cameras:
     def hidden(self) -> bool:
         """Whether a random occlusion lasted at the last sample."""
         return self._hidden
+
+    def mistake(self, axes: str) -> None:
+        """Take other axes for local NED from now on, by their name in `AXES`."""
+        self._axes = AXES[axes]
+
+    def shake(self, noise_std_m: float) -> None:
+        """Have another noise of the positions from now on [m]."""
+        self._noise_std_m = noise_std_m
 
     def capture(self, position_m: Vec3, velocity_mps: Vec3, attitude: Quaternion) -> tuple[int, bytes] | None:
         """Take the sample that is due at `next_ns`.
@@ -96,7 +121,7 @@ class Cameras:
         camera, at_ns = self._camera, self.next_ns
         since_ns = at_ns - self._start_ns
         self._taken += 1
-        noise = camera.noise_std_m * self._noise.standard_normal(3)
+        noise = self._noise_std_m * self._noise.standard_normal(3)
         latency_s = camera.latency_s + camera.jitter_s * float(self._lateness.random())
         if self._hides(since_ns):
             return None
@@ -104,7 +129,8 @@ class Cameras:
         body = _Pose(camera.other_body_m, STILL, LEVEL) if within(camera.swapped, since_ns) else truth
         if self._seen is None or not within(camera.frozen, since_ns):
             north, east, down = (float(p + n) for p, n in zip(body.position_m, noise, strict=True))
-            self._seen = body._replace(position_m=(north, east, down))
+            place, speed = _in_axes(self._axes, (north, east, down)), _in_axes(self._axes, body.velocity_mps)
+            self._seen = body._replace(position_m=place, velocity_mps=speed)
         drift_us = round(since_ns * camera.clock_drift_ppm * 1e-9)
         msg = self._message(self._clock_us + since_ns // 1000 + drift_us, self._seen)
         data = bytes(msg.pack(self._mav))
@@ -135,6 +161,13 @@ class Cameras:
 
     def _angles(self, turned: Quaternion) -> Vec3:
         return euler(turned if self._convention == "ned" else multiply(turned, HALF_ROLL))
+
+
+def _in_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:
+    if axes is AXES["right"]:
+        return ned
+    north, east, down = (sum(row * value for row, value in zip(rows, ned, strict=True)) for rows in axes)
+    return north, east, down
 
 
 def turn(frame: FrameConfig) -> Quaternion:

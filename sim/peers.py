@@ -57,13 +57,13 @@ class Peers:
         else:
             self.vehicle = Vehicle(config, for_vehicle, start_ns, script)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
-        self._faults = Faults(config, self.vehicle, self.autopilot, start_ns)
         self.channel: Channel | ScriptedChannel
         if script is None:
             self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
         else:
             self.channel = ScriptedChannel(script.delays_ns)
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+        self._faults = Faults(config, self.vehicle, self.autopilot, self._cameras, start_ns)
         self._airborne = airborne
         self._start_ns = start_ns
         self._mocap_link = VEHICLE if shared_link else MOCAP

@@ -4,6 +4,8 @@
 120 ms of delay, both autopilots: take-off, four waypoints, landing. No wall may be touched.
 `python tools/soak.py --hours 100`: random faults. A fallback in the very tick in which the age reaches H, every
 setpoint finite, bounded and slew-limited, no exception, and memory that does not grow.
+`python tools/soak.py --scenario pairs --seeds 500`: two faults at a time, both plants, both autopilots: the true
+vehicle stays within 1 m of the room and below 3 m/s, whatever mode anybody believes to be in.
 `python tools/soak.py --scenario core --ticks 1000000`: the same of the control tick alone, with random inputs.
 `python tools/soak.py --scenario replay --seeds 100`: random configurations, everything amiss, recorded, and replayed
 from the file alone, a few of them in a process of their own: every decision the same, bit for bit.
@@ -32,6 +34,7 @@ from chaos import soak_core
 from draw_controller import with_libraries
 from soak_faults import Batch, fly_faults  # the tests' own
 from soak_mission import AUTOPILOTS, MISSION, MissionFlight, fly_mission, summary
+from soak_pairs import TrueFlight, fly_pair
 from soak_replay import Replayed, replayed, replayed_apart, tally
 from soak_rig import prepared_for
 
@@ -45,8 +48,10 @@ MOST_GROWN_BYTES = 5 * 1024 * 1024
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly, tell, and say whether all was well."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", choices=("mission", "faults", "core", "replay"), default="faults")
-    parser.add_argument("--seeds", type=int, default=100, help="missions of each autopilot, or flights to replay")
+    parser.add_argument("--scenario", choices=("mission", "faults", "pairs", "core", "replay"), default="faults")
+    parser.add_argument(
+        "--seeds", type=int, default=100, help="missions of each autopilot, flights with pairs of faults, or to replay"
+    )
     parser.add_argument("--hours", type=float, default=1.0, help="virtual time with faults")
     parser.add_argument("--ticks", type=int, default=1_000_000, help="control ticks alone")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
@@ -85,6 +90,40 @@ def missions(seeds: Sequence[int], out: Path) -> list[MissionFlight]:
 def faults(first: int, hours: float, out: Path) -> Batch:
     """Fly with faults in this process."""
     return fly_faults(prepared_for(), first, hours, WARM_UP, out)
+
+
+def pairs(seeds: Sequence[int], out: Path) -> list[TrueFlight]:
+    """Fly pairs of faults in this process; those that went wrong again, recorded."""
+    prepared = prepared_for()
+    flights = [fly_pair(prepared, seed) for seed in seeds]
+    for flight in flights:
+        if flight.wrong:
+            fly_pair(prepared, flight.seed, out / f"pair-{flight.seed}.mcap")
+    return flights
+
+
+def _pairs(pool: ProcessPoolExecutor, given: argparse.Namespace) -> tuple[dict[str, object], bool]:
+    seeds = list(range(given.first, given.first + given.seeds))
+    waiting = [pool.submit(pairs, seeds[i : i + 5], given.out) for i in range(0, len(seeds), 5)]
+    flights: list[TrueFlight] = []
+    for done in as_completed(waiting):
+        flights += done.result()
+        sys.stderr.write(f"\r{len(flights)} of {given.seeds} flights ")
+    sys.stderr.write("\n")
+    furthest = max(flights, key=lambda flight: flight.outside_m)
+    fastest = max(flights, key=lambda flight: flight.speed_mps)
+    wrong = {str(flight.seed): [flight.what, *flight.wrong] for flight in flights if flight.wrong}
+    document: dict[str, object] = {
+        "flights": len(flights),
+        "outside": sum(flight.outside_m > 0.0 for flight in flights),
+        "outside_m_worst": furthest.outside_m,
+        "furthest": f"seed {furthest.seed}, {furthest.what}",
+        "speed_mps_worst": fastest.speed_mps,
+        "fastest": f"seed {fastest.seed}, {fastest.what}",
+        "let_go": sum(any("envelope-" in alarm for alarm in flight.alarms) for flight in flights),
+        "wrong": wrong,
+    }
+    return document, bool(wrong)
 
 
 def _missions(pool: ProcessPoolExecutor, given: argparse.Namespace) -> tuple[dict[str, object], bool]:
@@ -153,7 +192,7 @@ def _replays(pool: ProcessPoolExecutor, given: argparse.Namespace) -> tuple[dict
     return tally(found), all(one.good for one in found)
 
 
-_SCENARIOS = {"mission": _missions, "faults": _faults, "core": _core, "replay": _replays}
+_SCENARIOS = {"mission": _missions, "faults": _faults, "pairs": _pairs, "core": _core, "replay": _replays}
 
 
 def _text(report: dict[str, object]) -> str:

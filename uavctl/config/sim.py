@@ -93,14 +93,17 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "frozen",
             "wind",
             "battery",
+            "frame",
+            "noise",
             "parameter",
             "mode",
         ],
         Meta(
             description="`blackout`, `held`, `uplink_blackout`: a span of these of `[link]`; `occluded`, `swapped`, "
             "`frozen`: a span of these of `[sim.camera]`; `wind`: the steady wind of the quadrotor changes; `battery`: "
-            "that of the quadrotor has another charge; `parameter`: one of the autopilot's has another value; `mode`: "
-            "the pilot changes the autopilot's mode with the stick"
+            "that of the quadrotor has another charge; `frame`: the cameras' axes are others from then on; `noise`: "
+            "so is the noise of their positions; `parameter`: one of the autopilot's has another value; `mode`: the "
+            "pilot changes the autopilot's mode with the stick"
         ),
     ]
     for_s: Annotated[float, Meta(ge=0, description="length of a span [s]")] = 0.0
@@ -110,8 +113,15 @@ class FaultConfig(Section, frozen=True, kw_only=True):
         0.0,
     )
     charge: Annotated[float, Meta(ge=0, le=1, description="of the battery, with `battery`")] = 0.0
-    name: Annotated[str, Meta(description="of the parameter, or of the mode as the autopilot calls it")] = ""
-    value: Annotated[float, Meta(description="of the parameter")] = 0.0
+    name: Annotated[
+        str,
+        Meta(
+            description="of the parameter, or of the mode as the autopilot calls it; of the axes: `turned-90`, "
+            "`turned-180`, `turned-270`, `mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, "
+            "`millimetres`, `kilometres`, or `right`"
+        ),
+    ] = ""
+    value: Annotated[float, Meta(description="of the parameter, or the noise's standard deviation [m]")] = 0.0
 
 
 class SimConfig(Section, frozen=True, kw_only=True):

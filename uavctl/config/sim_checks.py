@@ -12,7 +12,14 @@ from uavctl.config.section import Spans
 from uavctl.config.sim import FaultConfig, QuadrotorConfig, SimConfig, WindConfig
 
 # Keys that a kind of fault heeds; the others are spans.
-_OF_KIND = {"wind": ("velocity_mps",), "battery": ("charge",), "parameter": ("name", "value"), "mode": ("name",)}
+_OF_KIND = {
+    "wind": ("velocity_mps",),
+    "battery": ("charge",),
+    "frame": ("name",),
+    "noise": ("value",),
+    "parameter": ("name", "value"),
+    "mode": ("name",),
+}
 
 
 def spans(key: str, given: Spans) -> Iterator[Problem]:
@@ -69,8 +76,10 @@ def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[Problem]:
     if fault.kind in ("wind", "battery"):
         if plant == "linear":
             yield Problem(f"{key}.kind", f'plant "linear" has no {fault.kind}', 'set sim.plant = "quadrotor"')
-    elif fault.kind in ("parameter", "mode"):
+    elif fault.kind in ("parameter", "mode", "frame"):
         if not fault.name:
             yield Problem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
+    elif fault.kind == "noise":
+        return
     elif fault.for_s == 0.0:
         yield Problem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")

@@ -48,7 +48,7 @@ PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no
 PLAIN = 1.5  # this many times its bound
 HINT = 0.4  # of the bound of the unexplained acceleration
 OUTSIDE_NS = 100_000_000
-POSITION_STD_M = 0.02  # what gate and rounding may leave
+POSITION_STD_M = 0.02  # at least, of a position: what gate and rounding may leave
 VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the flight begins
 BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
@@ -243,7 +243,7 @@ def _position(
         return _compared(watching, at_ns, position, False, parameters)
     if at_ns - before.at_ns < SPACING_NS:
         return watching, None
-    observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position)
+    observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
     unexplained = _unexplained(observer) * parameters.axes
     unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2]))
@@ -276,7 +276,7 @@ def _begun(at_ns: int, sample: PositionSample, speed_mps: float, parameters: Env
     mean[0] = sample.position_m
     if sample.velocity_mps is not None:
         mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
-    deviations = (POSITION_STD_M, speed_mps, parameters.unexplained_mps2 / 3.0)
+    deviations = (max(sample.std_m, POSITION_STD_M), speed_mps, parameters.unexplained_mps2 / 3.0)
     return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=np.zeros(3))
 
 
@@ -304,16 +304,17 @@ def _predicted(
     return Observer(at_ns=at_ns, mean=np.array([position, velocity, unexplained]), cov=cov, accel_mps2=accel)
 
 
-def _corrected(observer: Observer, position: Array) -> tuple[Observer, bool]:
+def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
     """Take a position; an innovation counts up to a bound, and whether it was beyond."""
-    variance = float(observer.cov[0, 0]) + POSITION_STD_M**2
+    noise = max(std_m, POSITION_STD_M) ** 2
+    variance = float(observer.cov[0, 0]) + noise
     bound = CLIP * math.sqrt(variance)
     innovation = position - observer.mean[0]
     gain = observer.cov[:, 0] / variance
     mean = observer.mean + np.outer(gain, np.clip(innovation, -bound, bound))
     keep = np.eye(3)
     keep[:, 0] -= gain
-    cov = keep @ observer.cov @ keep.T + POSITION_STD_M**2 * np.outer(gain, gain)
+    cov = keep @ observer.cov @ keep.T + noise * np.outer(gain, gain)
     clipped = bool((np.abs(innovation) > bound).any())
     return Observer(at_ns=observer.at_ns, mean=mean, cov=cov, accel_mps2=observer.accel_mps2), clipped
 

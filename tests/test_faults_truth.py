@@ -1,0 +1,133 @@
+"""Faults in motion, judged on the true vehicle: both plants, both autopilots, where it is and how fast, not a mode."""
+
+from __future__ import annotations
+
+from dataclasses import replace as changed
+
+import pytest
+from msgspec.structs import replace
+from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
+from soak_rig import prepared_for
+
+from uavctl.cli.prepare import Prepared
+from uavctl.config import Config, load_config
+from uavctl.config.sim import FaultConfig
+
+# The swap of two axes looks like the right ones along their diagonal, and the mission of the preset leads along it.
+AT_ONCE = ("turned-90", "turned-180", "mirrored-north", "kilometres")
+IN_THE_AIR = ("turned-180", "mirrored-east", "enu", "millimetres", "swapped")
+MOVED_M = 3.0
+BLACKOUT_AND_M = 0.3
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    return prepared_for()
+
+
+@pytest.fixture(params=WORLDS, ids=[f"{plant}-{autopilot}" for plant, autopilot in WORLDS])
+def world(request: pytest.FixtureRequest) -> Config:
+    """The preset from its start, where plans begin at once; nothing is lost unless a fault says so."""
+    plant, autopilot = request.param
+    return load_config("room", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"])
+
+
+def with_faults(config: Config, *faults: FaultConfig) -> Config:
+    return replace(config, sim=replace(config.sim, fault=faults))
+
+
+def bounded(flight: TrueFlight) -> TrueFlight:
+    """No setpoint that is not finite, bounded and slew-limited, and the true vehicle near the room and slow."""
+    assert flight.wrong == ()
+    assert flight.outside_m <= OUTSIDE_M
+    assert flight.speed_mps <= SPEED_MPS
+    return flight
+
+
+@pytest.mark.fault(14)
+@pytest.mark.parametrize("at_s", [0.3, 2.0])
+def test_cameras_that_freeze_in_motion_are_no_worse_than_a_blackout(
+    prepared: Prepared, world: Config, at_s: float
+) -> None:
+    frozen = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=at_s, kind="frozen", for_s=30.0))))
+    blackout = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=at_s, kind="blackout", for_s=30.0))))
+    assert frozen.outside_m <= max(blackout.outside_m, 0.0) + BLACKOUT_AND_M
+    # HOLD never accelerates: what it sends is against a bias that was there all the time of late.
+    assert frozen.hold_mps2 <= world.estimator.bias_max
+    assert frozen.ended in ("AUTO.LAND", "LAND", "AUTO.LOITER", "GUIDED")
+
+
+@pytest.mark.fault(14)
+def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: Prepared, world: Config) -> None:
+    # Two seconds have not passed, so no bias is known.
+    flight = fly_true(prepared, with_faults(world, FaultConfig(at_s=1.5, kind="frozen", for_s=30.0)))
+    assert 0.0 <= bounded(flight).hold_mps2 <= 0.05
+
+
+@pytest.mark.fault(15)
+@pytest.mark.parametrize("axes", IN_THE_AIR)
+def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
+    prepared: Prepared, world: Config, axes: str
+) -> None:
+    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=2.0, kind="frame", name=axes))))
+    assert flight.moved_m < MOVED_M
+    assert "LAND" in flight.ended
+
+
+@pytest.mark.fault(15)
+@pytest.mark.parametrize("axes", AT_ONCE)
+def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
+    prepared: Prepared, world: Config, axes: str
+) -> None:
+    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=0.0, kind="frame", name=axes))))
+    assert flight.moved_m < MOVED_M / 2
+    assert any(alarm.split(": ")[1].startswith("envelope-") for alarm in flight.alarms)
+    assert "LAND" in flight.ended
+
+
+@pytest.mark.fault(15)
+@pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
+def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
+    prepared: Prepared, world: Config, axes: str
+) -> None:
+
+    limits = prepared.controller.envelope
+    assert limits is not None
+    deaf = changed(prepared, controller=changed(prepared.controller, envelope=changed(limits, disagreement_mps=1e3)))
+    flight = fly_true(deaf, with_faults(world, FaultConfig(at_s=0.0, kind="frame", name=axes)))
+    assert flight.moved_m < MOVED_M
+    assert any("envelope-response" in alarm for alarm in flight.alarms)
+
+
+@pytest.mark.fault(13)
+def test_another_body_in_motion(prepared: Prepared, world: Config) -> None:
+    swapped = FaultConfig(at_s=2.0, kind="swapped", for_s=20.0)
+    flight = bounded(fly_true(prepared, with_faults(world, swapped)))
+    assert flight.moved_m < MOVED_M
+
+
+@pytest.mark.fault(3)
+@pytest.mark.parametrize("at_s", [0.5, 2.5])
+def test_a_blackout_in_motion(prepared: Prepared, world: Config, at_s: float) -> None:
+    bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=at_s, kind="blackout", for_s=30.0))))
+
+
+@pytest.mark.parametrize("noise_m", [0.2, 0.7])
+def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: float) -> None:
+    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=2.0, kind="noise", value=noise_m))))
+    assert flight.alarms
+    assert "LAND" in flight.ended
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str) -> None:
+    config = load_config("room", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])
+    gale = FaultConfig(at_s=6.0, kind="wind", velocity_mps=(9.0, 0.0, 0.0))
+    flight = fly_true(prepared, with_faults(config, gale))
+    assert flight.ended in ("AUTO.LAND", "LAND")
+    assert any("envelope-" in alarm for alarm in flight.alarms)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_two_faults_at_a_time(prepared: Prepared, seed: int) -> None:
+    bounded(fly_pair(prepared, seed))
