@@ -45,6 +45,7 @@ DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles hav
 CLIP = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
 SCATTERED, OF = 3, 5  # clipped innovations of the last ones that are no chance
 PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no time at all where it is beyond
+KNOWN = 1.5  # it is more than this many of its standard deviations
 PLAIN = 1.5  # this many times its bound
 HINT = 0.4  # of the bound of the unexplained acceleration
 OUTSIDE_NS = 100_000_000
@@ -53,6 +54,7 @@ VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the 
 BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
 REACTION_S = 0.3  # from a setpoint to what it does: recorded autopilots need 0.18 to 0.32 s
+GUSTS = 0.3  # of the unexplained acceleration: what gusts make of it for as long as nobody looks
 GRAVITY_MPS2 = 9.81
 LEAST_LAG_S = 1e-3  # for a plant without one
 
@@ -200,7 +202,7 @@ def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: Envel
     velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
     if velocity is None or watching.contradicted:
         return None
-    drift_mps = parameters.disagreement_mps + REACTION_S * parameters.unexplained_mps2 * age_s
+    drift_mps = parameters.disagreement_mps + GUSTS * parameters.unexplained_mps2 * age_s
     apart = [abs(own - known) for own, known in zip(velocity, seen.velocity_mps, strict=True) if not math.isnan(known)]
     return velocity if max(apart, default=0.0) <= drift_mps else None
 
@@ -236,9 +238,7 @@ def _position(
     at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
     before = watching.observer
     if before is None or at_ns - before.at_ns >= TOLD_NS:
-        # After a long silence nobody knows what gusts have made of the velocity.
-        speed_mps = parameters.begins_mps if before is None else parameters.unexplained_mps2
-        begun = _begun(at_ns, sample, speed_mps, parameters)
+        begun = _begun(at_ns, sample, watching, parameters)
         watching = replace(watching, observer=begun, clipped=(), over_ns=None, clean_ns=at_ns)
         return _compared(watching, at_ns, position, False, parameters)
     if at_ns - before.at_ns < SPACING_NS:
@@ -248,7 +248,8 @@ def _position(
     unexplained = _unexplained(observer) * parameters.axes
     unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2]))
     size = unexplained_mps2 / parameters.unexplained_mps2
-    over_ns = None if size <= 1.0 else watching.over_ns or at_ns
+    known = unexplained_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
+    over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
     watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
     quiet = size <= 0.5 and not clipped and watching.apart_ns is None
     watching = replace(
@@ -271,13 +272,26 @@ def _position(
 # The observer
 
 
-def _begun(at_ns: int, sample: PositionSample, speed_mps: float, parameters: EnvelopeParameters) -> Observer:
-    mean = np.zeros((3, 3))
+def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: EnvelopeParameters) -> Observer:
+    """The observer at a first position: with the velocity that was sent since the flight began.
+
+    After a long silence, of which not all that was sent is remembered, nobody knows what gusts have made of it either.
+    """
+    mean, accel = np.zeros((3, 3)), np.zeros(3)
+    speed_mps = parameters.unexplained_mps2
+    if watching.observer is None:
+        speed_mps = parameters.begins_mps
+        if watching.sent:
+            began_ns = min(watching.sent[0][0], at_ns)
+            rest = Observer(at_ns=began_ns, mean=mean, cov=np.zeros((3, 3)), accel_mps2=accel)
+            flown = _predicted(rest, watching.sent, at_ns, parameters)
+            mean[1], accel = flown.mean[1], flown.accel_mps2
+            speed_mps += GUSTS * parameters.unexplained_mps2 * (at_ns - began_ns) * 1e-9
     mean[0] = sample.position_m
     if sample.velocity_mps is not None:
         mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
     deviations = (max(sample.std_m, POSITION_STD_M), speed_mps, parameters.unexplained_mps2 / 3.0)
-    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=np.zeros(3))
+    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel)
 
 
 def _predicted(

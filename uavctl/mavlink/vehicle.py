@@ -62,7 +62,7 @@ class VehicleWatch:
             return ()
         match message:
             case Landed(landed=landed, own_climb=own_climb):
-                self._landed, self._own_climb = landed, own_climb
+                return self._phase(landed, own_climb)
             case Battery(voltage_v=voltage_v):
                 self._battery_v = voltage_v
             case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
@@ -90,6 +90,15 @@ class VehicleWatch:
         if not BACK_MS < back_ms < _WRAP_MS // 2:
             return ()
         return self._reboot()
+
+    def _phase(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
+        """Whether it stands, climbs or lands by itself; a status tells at once when that changes in flight."""
+        changed = own_climb != self._own_climb
+        self._landed, self._own_climb = landed, own_climb
+        if self._status is None or not changed:
+            return ()
+        self._status = msgspec.structs.replace(self._status, landed=landed, own_climb=own_climb)
+        return (self._status,)
 
     def _moves(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
