@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
@@ -10,9 +11,11 @@ import msgspec
 import numpy as np
 
 from uavctl.campaign.compose import Campaign, Told, compose, flown, placed
-from uavctl.campaign.spec import TRUE, CampaignSpec
+from uavctl.campaign.spec import MOST_CELLS, TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
+from uavctl.config.bounds import oversized
 from uavctl.config.checks import dimensions
+from uavctl.config.data_file import DataFileError, read_text
 from uavctl.config.index import key_lines
 from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
@@ -29,8 +32,12 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     text = _text(path)
     source = Source(str(path), key_lines(text))
     found: list[Problem] = []
-    spec = cast("CampaignSpec | None", decode(CampaignSpec, parse_toml(text, str(path)), "", found, {}))
+    table = parse_toml(text, str(path))
     told = Told(source)
+    told.tell(oversized(table))
+    if told.problems:
+        raise ConfigError(told.problems)
+    spec = cast("CampaignSpec | None", decode(CampaignSpec, table, "", found, {}))
     told.tell(found)
     if spec is None:
         raise ConfigError(told.problems)
@@ -48,11 +55,9 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError((f"{path}: cannot be read ({error.strerror}); give the TOML file of a campaign",)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError((f"{path}: is not UTF-8 text; save it as UTF-8",)) from error
+        return read_text(path)
+    except DataFileError as error:
+        raise ConfigError(tuple(f"{reason}; give the TOML file of a campaign" for reason in error.reasons)) from error
 
 
 def _names(spec: CampaignSpec) -> Iterator[Problem]:
@@ -70,6 +75,10 @@ def _names(spec: CampaignSpec) -> Iterator[Problem]:
         for i, name in enumerate(names):
             if name in names[:i]:
                 yield Problem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
+    cells = math.prod(map(len, lists.values()))
+    if cells > MOST_CELLS:
+        reason = f"with links, disturbances and plants there are {cells} cells"
+        yield Problem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")
     if TRUE in links:
         place = f"link[{links.index(TRUE)}].name"
         yield Problem(place, f'"{TRUE}" means the link that is flown on', "give it another name")
