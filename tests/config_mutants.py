@@ -15,7 +15,11 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin
+
+import msgspec
+
+from uavctl.config import Config, dump_config, load_config
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG, SPEC, FAULTS, TRACE, MOTION = "mine.toml", "campaign.toml", "faults.toml", "trace.csv", "motion.csv"
@@ -123,6 +127,8 @@ WORDS = (
     *("serial:///dev/null", "natnet://", "udpin://127.0.0.1:-1", "udpin://[::1", "1" + "0" * 400, "smpc.horizon=1e300"),
 )
 
+LONG_OPTIONS = ("--duration", "--seconds", "--runs", "--steps", "--states", "--workers")
+
 
 @dataclass
 class Case:
@@ -180,6 +186,40 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from leaves(one, (*path, key))
 
 
+def ranges(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
+    """Least and largest number that a key takes, and whether it is a whole one, by the key's path; of lists too."""
+    for one in msgspec.structs.fields(section):
+        here = (*path, one.encode_name)
+        if isinstance(one.type, type) and issubclass(one.type, msgspec.Struct):
+            yield from ranges(one.type, here)
+        else:
+            found = next(_numbers(one.type), None)
+            if found is not None:
+                yield here, found
+
+
+def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[float, float, bool]]:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _numbers(arguments[0], (*metas, *arguments[1:]))
+    elif annotation in (int, float):
+        low = next((m.ge if m.ge is not None else m.gt for m in metas if (m.ge, m.gt) != (None, None)), -1e7)
+        high = next((m.le if m.le is not None else m.lt for m in metas if (m.le, m.lt) != (None, None)), 1e7)
+        yield low, high, annotation is int
+    else:
+        for argument in arguments:
+            yield from _numbers(argument)
+
+
+def within(rng: random.Random, low: float, high: float, whole: bool) -> float:
+    """A number that a key takes: an end of its range, or anything between, small ones as often as large ones."""
+    least = max(low, 1e-9) if low >= 0 else min(1e-9, high)
+    value = rng.choice((low, high, math.exp(rng.uniform(math.log(least), math.log(max(high, 2 * least))))))
+    if low < 0 < value:
+        value *= rng.choice((1, -1))
+    return round(value) if whole else value
+
+
 def nested(depth: int, brackets: str) -> str:
     """A value in many brackets."""
     return "[" * depth + "]" * depth if brackets == "[" else "{a=" * depth + "1" + "}" * depth
@@ -197,6 +237,7 @@ class Mutants:
         """
         self._seed = seed
         self._bases = bases
+        self._ranges = dict(ranges(Config))
 
     def config(self, number: int) -> Case:
         """A spoilt configuration, or a spoilt file beside one, under some command."""
@@ -246,6 +287,9 @@ class Mutants:
                 other = rng.randrange(len(words))
                 words[at - 1], words[other] = words[other], words[at - 1]
             case.note.append(f"{how} {at} {word[:20]!r}")
+        for i, word in enumerate(words[1:], 1):  # long work that is asked for is not refused, so not asked for
+            if words[i - 1] in LONG_OPTIONS and 4.0 < _number(word) < 1e7:
+                words[i] = "1e300"
         # A process cannot be given these in a word.
         case.words = [
             word.replace("\x00", "").encode("utf-8", "surrogateescape").decode("utf-8", "replace") for word in words
@@ -261,12 +305,19 @@ class Mutants:
 
     def _spoil_value(self, rng: random.Random, table: dict[str, Any], case: Case) -> None:
         paths = [path for path in leaves(table) if len(path) > 1 or rng.random() < 0.2]
+        if rng.random() < 0.7:  # sections of many keys leave others that matter as much
+            section = rng.choice(sorted({str(path[0]) for path in paths}))
+            paths = [path for path in paths if path[0] == section]
         path = rng.choice(paths)
         holder: Any = table
         for key in path[:-1]:
             holder = holder[key]
         value = holder[path[-1]]
         how, new = self._other(rng, value)
+        known = self._ranges.get(tuple(key for key in path if isinstance(key, str)))
+        if known is not None and isinstance(value, int | float) and rng.random() < 0.7:
+            new = within(rng, *known)
+            how = f"within {new:g}"
         case.note.append(f"{'.'.join(map(str, path))}: {how}")
         if how == "deleted" and isinstance(holder, dict):
             del holder[path[-1]]
@@ -454,7 +505,7 @@ class Mutants:
                 lambda: [*self._sim_configured(), "--vehicles", "2", "--airborne"],
                 self._check,
                 self._fly,
-                lambda: [*self._fly(), "--goto", "1,1,-1", "--live-port", "8765"],
+                lambda: [*self._fly(), "--goto", "1,1,-1", "--live", "--live-port", "18765"],
                 lambda: ["bench", "--config", CONFIG, "--states", "1", "--seed", "1", "--plot", "no/such/dir/plot.svg"],
                 lambda: [
                     "paper",
@@ -529,6 +580,13 @@ class Mutants:
         return ["log", "whatif", RECORDING, "--out", "again"]
 
 
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return 0.0
+
+
 def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, list):
         return [_scaled(one, factor) for one in value]
@@ -537,8 +595,6 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def bases() -> dict[str, dict[str, Any]]:
     """Both presets with every key, and the first one with a mission, a fence and a fault."""
-    from uavctl.config import dump_config, load_config
-
     found = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room")}
     for table in found.values():
         table["security"]["require"] = ["vehicle", "mocap"]

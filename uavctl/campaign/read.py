@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from uavctl.campaign.compose import Campaign, Told, compose, flown, placed
-from uavctl.campaign.spec import MOST_CELLS, TRUE, CampaignSpec
+from uavctl.campaign.spec import CHUNK, MOST_CELLS, MOST_STEPS_AT_ONCE, TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
 from uavctl.config.bounds import oversized
 from uavctl.config.checks import dimensions
@@ -76,6 +76,10 @@ def _names(spec: CampaignSpec) -> Iterator[Problem]:
             if name in names[:i]:
                 yield Problem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
     cells = math.prod(map(len, lists.values()))
+    together = spec.steps * min(spec.runs, CHUNK)
+    if together > MOST_STEPS_AT_ONCE:
+        reason = f"{spec.steps} steps of {min(spec.runs, CHUNK)} runs are flown at once"
+        yield Problem("steps", reason, f"give so many that they are {MOST_STEPS_AT_ONCE} in all, or fewer runs")
     if cells > MOST_CELLS:
         reason = f"with links, disturbances and plants there are {cells} cells"
         yield Problem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")

@@ -19,6 +19,10 @@ Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is 
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
 MOST_OF_A_KIND = 100
 MOST_CELLS = 10_000
+MOST_RUNS = 10_000_000
+# Part of the result: the last bits of a product depend on how many runs it is made for.
+CHUNK = 1000
+MOST_STEPS_AT_ONCE = 2_000_000  # their states are held in memory
 
 
 class ControllerSpec(Section, frozen=True, kw_only=True):
@@ -98,7 +102,7 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
     set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
     steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
-    runs: Annotated[int, Meta(ge=1, le=10_000_000, description="runs of each cell")] = 1000
+    runs: Annotated[int, Meta(ge=1, le=MOST_RUNS, description="runs of each cell")] = 1000
     master: Annotated[
         int, Meta(ge=0, le=LARGEST_SEED, description="seed: run i's draws come from (master, i), in every cell")
     ] = 0

@@ -67,6 +67,10 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         return _refuse(error.problems, error.exit_code)
     except UavctlError as error:
         return _refuse(str(error).split("\n"), error.exit_code)
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # a file that no command foresaw: a full disk, a name that is too long
+        return _refuse([f"{error.filename or 'system'}: {error.strerror or error}"], UavctlError.exit_code)
     return result if isinstance(result, int) else 0
 
 

@@ -238,7 +238,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         Meta(ge=0.001, le=1e7, description="a position further out, in any axis, is absurd and counts as lost [m]"),
     ] = 1000.0
     max_velocity_mps: Annotated[
-        float, Meta(ge=0.001, le=1e4, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
+        float, Meta(ge=0.001, le=1e7, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
     ] = 100.0
     gate_sigma: Annotated[
         float,
@@ -279,8 +279,10 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
     brake_gain_1ps: Annotated[
         float, Meta(ge=1e-6, le=1000, description="deceleration per predicted speed while braking [1/s]")
     ] = 1.5
-    brake_s: Annotated[float, Meta(ge=0, le=600, description="longest time of braking on the prediction [s]")] = 2.0
-    hold_s: Annotated[float, Meta(ge=0, le=3600, description="then zero acceleration for this long [s]")] = 3.0
+    brake_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="longest time of braking on the prediction [s]")] = (
+        2.0
+    )
+    hold_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="then zero acceleration for this long [s]")] = 3.0
     land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
     recover_samples: Annotated[
         int, Meta(ge=1, le=1000, description="fresh samples in a row before plans are flown again")
