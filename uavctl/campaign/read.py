@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
@@ -11,7 +10,7 @@ import msgspec
 import numpy as np
 
 from uavctl.campaign.compose import Campaign, Told, compose, flown, placed
-from uavctl.campaign.spec import CHUNK, MOST_CELLS, MOST_STEPS_AT_ONCE, TRUE, CampaignSpec
+from uavctl.campaign.spec import CHUNK, MOST_CELLS, MOST_DESIGNS, MOST_STEPS_AT_ONCE, TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
 from uavctl.config.bounds import oversized
 from uavctl.config.checks import dimensions
@@ -30,9 +29,9 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
     text = _text(path)
+    table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
     source = Source(str(path), key_lines(text))
     found: list[Problem] = []
-    table = parse_toml(text, str(path))
     told = Told(source)
     told.tell(oversized(table))
     if told.problems:
@@ -42,6 +41,9 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     if spec is None:
         raise ConfigError(told.problems)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)
+    told.tell(_sizes(spec))
+    if told.problems:  # the rest is work for each of them
+        raise ConfigError(told.problems)
     told.tell(_names(spec))
     name = spec.config if spec.config in presets() else str(path.parent / spec.config)
     base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
@@ -60,6 +62,21 @@ def _text(path: Path) -> str:
         raise ConfigError(tuple(f"{reason}; give the TOML file of a campaign" for reason in error.reasons)) from error
 
 
+def _sizes(spec: CampaignSpec) -> Iterator[Problem]:
+    """More than can be designed in minutes, or held in memory."""
+    together = min(spec.runs, CHUNK)
+    if spec.steps * together > MOST_STEPS_AT_ONCE:
+        reason = f"{spec.steps} steps of {together} runs are flown at once"
+        yield Problem("steps", reason, f"give so few that they are {MOST_STEPS_AT_ONCE} in all, or fewer runs")
+    designs = len(spec.controller) * len(spec.link)
+    if designs > MOST_DESIGNS:
+        yield Problem("controller", f"with the links there are {designs} designs", f"take fewer, {MOST_DESIGNS} in all")
+    cells = designs * len(spec.disturbance) * len(spec.plant)
+    if cells > MOST_CELLS:
+        reason = f"with links, disturbances and plants there are {cells} cells"
+        yield Problem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")
+
+
 def _names(spec: CampaignSpec) -> Iterator[Problem]:
     """Names that are taken twice, or that name nothing."""
     controllers, links = [one.name for one in spec.controller], [one.name for one in spec.link]
@@ -75,14 +92,6 @@ def _names(spec: CampaignSpec) -> Iterator[Problem]:
         for i, name in enumerate(names):
             if name in names[:i]:
                 yield Problem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
-    cells = math.prod(map(len, lists.values()))
-    together = spec.steps * min(spec.runs, CHUNK)
-    if together > MOST_STEPS_AT_ONCE:
-        reason = f"{spec.steps} steps of {min(spec.runs, CHUNK)} runs are flown at once"
-        yield Problem("steps", reason, f"give so many that they are {MOST_STEPS_AT_ONCE} in all, or fewer runs")
-    if cells > MOST_CELLS:
-        reason = f"with links, disturbances and plants there are {cells} cells"
-        yield Problem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")
     if TRUE in links:
         place = f"link[{links.index(TRUE)}].name"
         yield Problem(place, f'"{TRUE}" means the link that is flown on', "give it another name")

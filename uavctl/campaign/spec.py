@@ -18,7 +18,7 @@ Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
 MOST_OF_A_KIND = 100
-MOST_CELLS = 10_000
+MOST_DESIGNS, MOST_CELLS = 200, 10_000
 MOST_RUNS = 10_000_000
 # Part of the result: the last bits of a product depend on how many runs it is made for.
 CHUNK = 1000
