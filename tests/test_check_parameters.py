@@ -115,7 +115,7 @@ def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
     return value in map(float, numbers)
 
 
-OTHERS = {
+OTHERS: dict[int, dict[str, tuple[int, ...]]] = {
     3: {"EK3_SRC1_POSXY": (3, 6), "EK3_SRC1_YAW": (1, 6), "VISO_TYPE": (0, 1)},
     12: {"EKF2_EV_CTRL": (0, 1, 2, 8, 11, 15), "COM_RC_IN_MODE": (0, 4)},
 }
