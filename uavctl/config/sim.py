@@ -97,7 +97,7 @@ class WindConfig(Section, frozen=True, kw_only=True):
 class QuadrotorConfig(Section, frozen=True, kw_only=True):
     """The simulated quadrotor (docs/vehicle.md)."""
 
-    charge: Annotated[float, Meta(le=1, ge=0.001, description="charge of the battery at the start")] = 1.0
+    charge: Annotated[float, Meta(gt=0, le=1, description="charge of the battery at the start")] = 1.0
 
 
 class FaultConfig(Section, frozen=True, kw_only=True):
