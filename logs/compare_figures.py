@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.compare_side import Loaded
-from logs.flight_data import FALLBACK
 from logs.summary import Spread, position_error_m
 
 Value = int | float | None
@@ -82,7 +81,7 @@ def _rows(one: Loaded) -> Iterator[_Row]:
             "limits",
             "time in fallback",
             "s",
-            round(sum((b - a for a, b in flight.spans(FALLBACK)), 0.0), 9),
+            round(sum((b - a for a, b in flight.fallback_spans), 0.0), 9),
         ),
         ("state_violations", "limits", "state outside limits", "steps", s.state_violations),
         ("input_violations", "limits", "input outside limits", "steps", s.input_violations),

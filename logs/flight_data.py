@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from logs.design_view import DesignView, Floats, design_view
 from logs.topics import END, GOES_ON, RecorderNote
 from uavctl.data import (
+    ORDER_ACCEPTED,
     Checked,
     ControlMode,
     Decision,
@@ -24,6 +25,7 @@ from uavctl.data import (
     Header,
     LinkEstimate,
     LinkStats,
+    Order,
     Plan,
     PositionSample,
     Record,
@@ -35,11 +37,19 @@ from uavctl.data import (
     VehicleStatus,
 )
 from uavctl.errors import RecordingError
+from uavctl.flight.decide import MISSION_OVER
 
 R = TypeVar("R", bound=Record)
 
 FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
 FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
+
+
+class Landing(NamedTuple):
+    """When a landing began that was wanted [ns], and whether the operator ordered it or the mission ended in it."""
+
+    at_ns: int
+    ordered: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +140,35 @@ class FlightData:
     def stopped_ns(self) -> int | None:
         """When the operator asked for the hand-over [ns]; None if nobody did."""
         return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+
+    @cached_property
+    def landing(self) -> Landing | None:
+        """The landing that somebody wanted, if one began before the operator's stop and no plan was flown after it."""
+        after_ns = max((d.at_ns for d in self.flown if d.mode is ControlMode.TRACK), default=-1)
+        ordered = [
+            Landing(one.at_ns, ordered=True)
+            for one in self.events
+            if one.code == ORDER_ACCEPTED and one.text == Order.LAND.value
+        ]
+        due = [Landing(one.at_ns, ordered=False) for one in self.flown if one.reason == MISSION_OVER]
+        until_ns = self.decisions[-1].at_ns + 1 if self.stopped_ns is None else self.stopped_ns
+        return min((one for one in ordered + due if after_ns < one.at_ns < until_ns), default=None)
+
+    @cached_property
+    def fallen(self) -> tuple[Decision, ...]:
+        """Flown ticks of the fallback; its braking and holding before a landing that was wanted is none."""
+        wanted = self.landing
+        before = (one for one in self.flown if wanted is None or one.at_ns < wanted.at_ns)
+        return tuple(one for one in before if one.mode in FALLBACK)
+
+    @property
+    def fallback_spans(self) -> list[tuple[float, float]]:
+        """Spans of time [s] in which the fallback flew."""
+        spans = self.spans(FALLBACK)
+        if self.landing is None:
+            return spans
+        until_s = self._second(self.landing.at_ns)
+        return [(begun_s, min(ended_s, until_s)) for begun_s, ended_s in spans if begun_s < until_s]
 
     @property
     def part(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from logs.design_view import AXIS_NUMBER, DesignView, Floats
-from logs.flight_data import FALLBACK, FlightData
+from logs.flight_data import FlightData
 from logs.moving_limits import box_at
 from logs.summary import position_error_m, state_outside
 from logs.svg import Drawing, canvas, colour, dots
@@ -263,7 +263,7 @@ def choose_plans(flight: FlightData) -> list[Plan]:
 
 def shade_fallback(ax: Axes, flight: FlightData) -> None:
     """Spans of time in which the fallback flew."""
-    for begun_s, ended_s in flight.spans(FALLBACK):
+    for begun_s, ended_s in flight.fallback_spans:
         ax.axvspan(begun_s, ended_s, color=colour("fallback"), alpha=0.22, lw=0)
 
 

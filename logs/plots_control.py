@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from logs.design_view import Floats
 from logs.digits import duration
-from logs.flight_data import FALLBACK, FlightData
+from logs.flight_data import FlightData
 from logs.plots import DASHED, draw_path, shade_fallback, span, thin
 from logs.summary import decision_times_us, input_outside
 from logs.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, ramp, standalone, strokes
@@ -170,7 +170,7 @@ def picture(flight: FlightData) -> str:
         handles: list[Artist] = [*marks, limit]
         if flight.truths:
             handles += right.plot([], [], "|", ms=7, color=colour("lost"), label="position lost")
-        if flight.spans(FALLBACK):
+        if flight.fallback_spans:
             handles.append(Patch(color=colour("fallback"), alpha=0.22, lw=0, label="fallback"))
         one.figure.legend(handles=handles, loc="outside lower center", ncols=6)
     return standalone(one.svg, PICTURE_LABEL)

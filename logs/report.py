@@ -8,7 +8,7 @@ from pathlib import Path
 
 from logs import page, plots, plots_control, plots_link, plots_solver
 from logs.digits import number
-from logs.flight_data import FALLBACK, FlightData
+from logs.flight_data import FlightData
 from logs.outputs import write_whole
 from logs.page import Mark, Section
 from logs.path3d import path_3d
@@ -229,7 +229,7 @@ def _truth_mark(flight: FlightData) -> tuple[Mark, ...]:
 
 
 def _fallback_mark(flight: FlightData) -> tuple[Mark, ...]:
-    return (_FALLBACK,) if flight.spans(FALLBACK) else ()
+    return (_FALLBACK,) if flight.fallback_spans else ()
 
 
 def _config_name(config_toml: str) -> str | None:

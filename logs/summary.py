@@ -14,7 +14,7 @@ from rich.text import Text
 
 from logs.design_view import Floats
 from logs.digits import duration, number, percent_above
-from logs.flight_data import FALLBACK, FLOWN, FlightData
+from logs.flight_data import FLOWN, FlightData
 from logs.moving_limits import limits_at
 from uavctl.data import ControlMode, Matrix, SolveStatus, Vector
 
@@ -38,6 +38,8 @@ class Ending(StrEnum):
 
     FLYING = "flying"  # the recording ends in flight
     LANDED = "landed by the fallback"
+    ORDERED = "landed as ordered"
+    MISSION_OVER = "landed at the end of the mission"
     HANDED_OVER = "handed over by the operator"
     WAITING = "waiting"  # for positions, or for a vehicle that takes setpoints
 
@@ -54,7 +56,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     received: int  # positions: sent - lost when simulated, else samples accepted; in a part of a flight, those of it
     lost: int | None  # positions that the simulated channel lost; None for a real flight
     max_age: int  # largest age of information at a flown boundary [steps]
-    fallbacks: int  # entries into braking, holding or landing, but for the operator's stop
+    fallbacks: int  # entries into braking, holding or landing that nobody wanted
     state_violations: int  # flown boundaries with the state outside its set
     input_violations: int  # flown boundaries with the input outside its set
     slack_used: int  # flown plans in which a constraint or the terminal equality gave way
@@ -108,7 +110,7 @@ def summarise(
         received=max(received, accepted),  # the last truth may be older than the last position
         lost=lost,
         max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
-        fallbacks=_fallback_entries([d.mode for d in flight.flown]),
+        fallbacks=_fallback_entries(flight),
         state_violations=int(np.count_nonzero(state_outside(flight))),
         input_violations=int(np.count_nonzero(input_outside(flight))),
         slack_used=sum(
@@ -268,15 +270,18 @@ def count(amount: int, noun: str) -> str:
 def _ending(flight: FlightData) -> Ending:
     modes = [decision.mode for decision in flight.flown]
     if ControlMode.LAND in modes:  # for one tick; nobody flies after it
-        return Ending.LANDED
+        if flight.landing is None:
+            return Ending.LANDED
+        return Ending.ORDERED if flight.landing.ordered else Ending.MISSION_OVER
     if not modes or modes[-1] is ControlMode.WAIT:
         return Ending.WAITING
     return Ending.FLYING if flight.stopped_ns is None else Ending.HANDED_OVER
 
 
-def _fallback_entries(modes: list[ControlMode]) -> int:
-    entered = sum(b in FALLBACK and a not in FALLBACK for a, b in pairwise(modes))
-    return entered + (bool(modes) and modes[0] in FALLBACK)
+def _fallback_entries(flight: FlightData) -> int:
+    fallen = {d.tick for d in flight.fallen}
+    inside = [d.tick in fallen for d in flight.flown]
+    return sum(b and not a for a, b in pairwise([False, *inside]))
 
 
 def _outside(

@@ -7,7 +7,7 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from logs.digits import duration, number
-from logs.flight_data import FALLBACK, FLOWN, FlightData
+from logs.flight_data import FLOWN, FlightData
 from logs.moving_limits import box_at
 from logs.summary import Ending, FlightSummary, count, input_outside, position_error_m, state_outside
 from logs.topics import GOES_ON, RECOVERED
@@ -17,6 +17,11 @@ from uavctl.naming import severity, tell, worst
 _IN_FLIGHT = {
     ControlMode.BRAKE: "The recording ends while the fallback was braking.",
     ControlMode.HOLD: "The recording ends while the fallback held zero acceleration.",
+}
+_LANDED = {
+    Ending.LANDED: "The fallback had the vehicle land after",
+    Ending.ORDERED: "The operator ordered the landing; the vehicle was handed over to it after",
+    Ending.MISSION_OVER: "The mission was over; the vehicle was handed over to its own landing after",
 }
 
 # A target that moves by less than this share of its longest step only settles.
@@ -117,10 +122,10 @@ def _silence(flight: FlightData, s: FlightSummary) -> str:
 def _fallback(flight: FlightData, s: FlightSummary) -> str:
     if not s.fallbacks:
         return "The fallback was never needed."
-    spans = flight.spans(FALLBACK)
-    first = next(d for d in flight.flown if d.mode in FALLBACK)
+    spans = flight.fallback_spans
+    first = flight.fallen[0]
     total_s = sum(end - begin for begin, end in spans)
-    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.flown if d.mode in FALLBACK)]
+    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.fallen)]
     course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
     times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
     return (
@@ -230,13 +235,15 @@ def _trajectory(flight: FlightData) -> list[str]:
 
 def _ending(flight: FlightData, s: FlightSummary) -> str:
     last = flight.flown[-1]
-    if s.ended is Ending.LANDED:
+    if s.ended in _LANDED:
         landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
-        return f"The fallback had the vehicle land after {_seconds(flight, landed_ns)}."
+        return f"{_LANDED[s.ended]} {_seconds(flight, landed_ns)}."
     if s.ended is Ending.WAITING:
         return f"At the end the controller was waiting: {last.reason}."
     if flight.stopped_ns is not None:
         return f"The operator ended the flight after {_seconds(flight, flight.stopped_ns)}; {_hand_over(flight)}."
+    if flight.landing is not None and last.mode in _IN_FLIGHT:
+        return "The recording ends while the vehicle was brought to rest, to land."
     return _IN_FLIGHT.get(last.mode, "At the end a plan was being flown.")
 
 

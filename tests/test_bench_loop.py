@@ -51,6 +51,6 @@ def test_a_short_bench_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_a_daemon_that_does_not_start_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["bench", "--loop", "--seconds", "1", *NO_LIBRARY, "--set", f"log.free_bytes={2**60}"]) == 1
+    assert run(["bench", "--loop", "--seconds", "1", *NO_LIBRARY, "--set", f"log.free_bytes={10**15}"]) == 1
     assert "the daemon did not start" in capsys.readouterr().err
     assert run(["bench", "--loop", "--seconds", "0"]) == 2

@@ -13,7 +13,8 @@ from uavctl.campaign.chance import draw
 from uavctl.campaign.controllers import TUNING_FIRST, build, built
 from uavctl.campaign.links import newest
 from uavctl.campaign.setting import Met, met, problem_of, start_of
-from uavctl.campaign.tasks import CHUNK, tasks_of
+from uavctl.campaign.spec import CHUNK
+from uavctl.campaign.tasks import tasks_of
 from uavctl.campaign.world import fly
 from uavctl.cli.prepare import ready_library
 from uavctl.config import load_config

@@ -16,7 +16,7 @@ import pytest
 from campaign_rig import HEAD, controller, table
 from distributed import LocalCluster
 
-from uavctl.campaign.tasks import CHUNK
+from uavctl.campaign.spec import CHUNK
 from uavctl.cli import campaign_cmd
 from uavctl.cli.app import run
 
@@ -172,9 +172,9 @@ def test_another_campaign_does_not_go_on(spec: Path, flown: Path, capsys: pytest
 def test_fewer_runs_and_a_table_for_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wild = 'set = ["plant.b=[[1e200, 0], [1e200, 0], [0, 1e200], [0, 1e200]]"]'
+    wild = 'set = ["plant.a=[[1e7, 0, 0, 0], [0, 1e7, 0, 0], [0, 0, 1e7, 0], [0, 0, 0, 1e7]]"]'
     (tmp_path / "c.toml").write_text(
-        HEAD + "steps = 5\n" + controller("lqg") + table("plant", "as modelled") + table("plant", "wild", wild)
+        HEAD + "steps = 100\n" + controller("lqg") + table("plant", "as modelled") + table("plant", "wild", wild)
     )
     monkeypatch.chdir(tmp_path)
     assert run(["campaign", "c.toml", "--runs", "12", "--workers", "1"]) == 0

@@ -15,7 +15,8 @@ from patience import LIMIT_S, until
 from uavctl.campaign import pool
 from uavctl.campaign.pool import ONE_THREAD, processes
 from uavctl.campaign.run import fly_tasks
-from uavctl.campaign.tasks import CHUNK, Columns, Task, tasks_of
+from uavctl.campaign.spec import CHUNK
+from uavctl.campaign.tasks import Columns, Task, tasks_of
 from uavctl.errors import UsageError
 
 ORPHAN = """

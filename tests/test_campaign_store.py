@@ -11,8 +11,9 @@ from campaign_rig import cells, controller, read, table
 
 from uavctl.campaign.again import again
 from uavctl.campaign.cells import cells_of, document
+from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.campaign.tasks import CHUNK, Task, fly_task, lost, tasks_of
+from uavctl.campaign.tasks import Task, fly_task, lost, tasks_of
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UavctlError, UsageError
 

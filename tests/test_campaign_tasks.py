@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, table
 
-from uavctl.campaign import controllers, tasks
+from uavctl.campaign import controllers, spec
 from uavctl.campaign.controllers import build
 from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.setting import met
@@ -22,7 +22,7 @@ from uavctl.smpc.batch_smpc import BatchSmpc
 
 FIGURES = ("cost", "settled_cost", "mean_square_input", "largest_gap")
 # B of preset paper a million times stronger: whatever is asked for drives the state out of all numbers.
-WILD = 'set = ["plant.b=[[1e200, 0], [1e200, 0], [0, 1e200], [0, 1e200]]"]'
+WILD = 'set = ["plant.a=[[1e7, 0, 0, 0], [0, 1e7, 0, 0], [0, 0, 1e7, 0], [0, 0, 0, 1e7]]"]'
 
 
 def task(folder: Path, *parts: str) -> Task:
@@ -60,7 +60,7 @@ def test_a_controller_that_counts_nothing_has_no_gap(tmp_path: Path) -> None:
 
 
 def test_numbers_that_leave_all_bounds_are_told_as_an_error(tmp_path: Path) -> None:
-    columns = fly_task(task(tmp_path, "steps = 8\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)))
+    columns = fly_task(task(tmp_path, "steps = 60\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)))
     assert set(columns["error"]) == {"ended in numbers that are not finite"}
     assert all(np.isnan(columns[name]).all() for name in FIGURES)
     assert not columns["steps"].any() and not columns["ages"].any()
@@ -144,7 +144,7 @@ def never() -> bool:
 
 
 def several(folder: Path) -> list[Task]:
-    return list(tasks_of(cells(folder, f"runs = {5 * tasks.CHUNK}\n", controller("lqg"))))
+    return list(tasks_of(cells(folder, f"runs = {5 * spec.CHUNK}\n", controller("lqg"))))
 
 
 @pytest.mark.parametrize("deaths", [1, 2])

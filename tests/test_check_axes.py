@@ -10,10 +10,13 @@ import pytest
 from check_rig import Checked, Hand, S, look, twisted
 from mavlink_rig import packets
 
+from uavctl.check.axes import axis_items, compared
 from uavctl.check.item import State
 from uavctl.check.preflight import Preflight
+from uavctl.check.seen import Sample, Seen
 from uavctl.config import load_config
 from uavctl.loop import make_links
+from uavctl.mavlink.messages import Heartbeat
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 ORIGIN = "sim.start_position_m=[0.0,0.0,-0.01]"
@@ -284,3 +287,41 @@ def test_a_recorded_flight_is_a_right_example() -> None:
 @pytest.mark.parametrize("wrong", ["frame.convention=enu", "frame.yaw_deg=90", "frame.yaw_deg=180", "frame.yaw_deg=25"])
 def test_the_recorded_flight_in_a_wrong_frame_is_caught(wrong: str) -> None:
     assert recorded(wrong)["axes"].state is State.BAD
+
+
+def seen_with(autopilot: int, flags: int) -> Seen:
+    """A vehicle at rest whose estimator tells these flags, with positions of its own beside the cameras'."""
+    beat = Heartbeat(
+        system=1, component=1, vehicle_type=2, autopilot=autopilot, base_mode=0, custom_mode=0, system_status=3
+    )
+    seen = Seen(0, heartbeat=beat, estimator=flags)
+    for k in range(20):
+        at_ns = k * S // 10
+        seen.own.append((at_ns, (1.0, 2.0, -0.1)))
+        seen.samples.append(Sample(at_ns + 1, at_ns + 2, (1.0, 2.0, -0.1), None, "VISION_POSITION_ESTIMATE"))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "flags", "there"),
+    [
+        (12, 0x1EF, True),  # a PX4 that rests and fuses positions: it says CONST_POS_MODE all the same
+        (12, 0x16F, True),
+        (12, 0x0EF, False),  # nothing tells it where it is: it assumes that it stands
+        (12, 0x1E7, False),  # no horizontal position
+        (3, 0x33F, True),
+        (3, 0x1AF, False),  # an ArduPilot in this mode has no position
+    ],
+)
+def test_a_resting_px4_has_a_position_of_its_own(autopilot: int, flags: int, there: bool) -> None:
+    seen = seen_with(autopilot, flags)
+    assert compared(seen) is there
+    own = axis_items(seen, load_config("room"), [])[0]
+    assert own.name == "own position" and (own.state is State.GOOD) is there
+
+
+def test_another_origin_is_found_beside_a_resting_px4() -> None:
+    seen = seen_with(12, 0x1EF)
+    seen.own = [(at_ns, (1.0, 0.0, -0.1)) for at_ns, _ in seen.own]
+    axes = axis_items(seen, load_config("room"), [])[1]
+    assert axes.name == "axes" and axes.state is State.BAD

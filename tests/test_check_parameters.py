@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from itertools import product
+
 import pytest
 from autopilot_rig import EXTERNAL_ONLY
 from check_rig import Checked, Hand, look
 
 from sim.peers import Peers
 from uavctl.check.item import State
+from uavctl.check.parameters import RULES
 from uavctl.check.preflight import Preflight
+from uavctl.config import load_config
 from uavctl.loop import make_links
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -88,3 +93,47 @@ def test_parameters_that_are_never_told_do_not_forbid_a_flight() -> None:
     hand.rest(7.0)
     found = hand.done()
     assert found["COM_OBL_RC_ACT"].state is State.UNDETERMINED and not found.bad
+
+
+def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
+    """Whether a value is what the words ask for, as a person reads them."""
+    if want.startswith("any value"):
+        return True
+    if seconds := re.fullmatch(r"([\d.]+) s \(.*\) to ([\d.]+) s", want):
+        return float(seconds[1]) <= value <= float(seconds[2])
+    if climb := re.fullmatch(r"at most ([\d.]+) m, .*?(?:; at least ([\d.]+) m, .*)?", want):
+        return float(climb[2] or 0.0) <= value <= float(climb[1])
+    if bits := re.search(r"\(?bits (\d)(?:, (\d))? and (\d)", want):
+        mask = sum(1 << int(bit) for bit in bits.groups() if bit)
+        return not int(value) & mask if want.endswith("off") else int(value) & mask == mask
+    if want.startswith("1, or another"):
+        return value != 0
+    if "with a VISO_TYPE other than 0" in want:
+        return value == 6 and told["VISO_TYPE"] != 0
+    numbers = re.findall(r"(?:^|or )(\d+)", want)
+    assert numbers, want
+    return value in map(float, numbers)
+
+
+OTHERS: dict[int, dict[str, tuple[int, ...]]] = {
+    3: {"EK3_SRC1_POSXY": (3, 6), "EK3_SRC1_YAW": (1, 6), "VISO_TYPE": (0, 1)},
+    12: {"EKF2_EV_CTRL": (0, 1, 2, 8, 11, 15), "COM_RC_IN_MODE": (0, 4)},
+}
+
+
+@pytest.mark.parametrize("autopilot", [3, 12])
+@pytest.mark.parametrize("relay", ["false", "true"])
+def test_a_value_is_good_just_when_it_is_what_the_words_want(autopilot: int, relay: str) -> None:
+    config = load_config("room", [f"relay.enabled={relay}"])
+    judged, kinds = 0, set()
+    for others in product(*OTHERS[autopilot].values()):
+        told = dict(zip(OTHERS[autopilot], map(float, others), strict=True))
+        for rule in RULES[autopilot]:
+            for value in (0.0, 0.1, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 11.0, 15.0, 16.0, 48.0):
+                values = told | {rule.name: value}
+                verdict = rule.judge(value, values.get, config)
+                good = verdict.state is State.GOOD
+                assert good == is_wanted(verdict.want, value, values), (rule.name, value, told, verdict)
+                judged += 1
+                kinds.add((rule.name, good))
+    assert judged > 800 and kinds == {(rule.name, good) for rule in RULES[autopilot] for good in (True, False)}

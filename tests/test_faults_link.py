@@ -14,7 +14,7 @@ from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.peers import SourceConfig
-from uavctl.data import PositionSample, Setpoint, SetpointSource, Severity
+from uavctl.data import Event, PositionSample, Setpoint, SetpointSource, Severity
 from uavctl.mavlink import codec
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.encoder import Encoder
@@ -218,6 +218,34 @@ def test_row_19_deviating_answers_are_dropped_until_five_agree() -> None:
     assert link.stats(NOW).bad == {"timesync": 4}
     assert reply(link, NOW + 5 * SECOND, OFFSET - 300 * MS)
     assert link.stats(NOW).bad == {"timesync": 4}  # the fifth in a row is believed
+
+
+def told_while(link: Link, seconds: int, slow: Callable[[int], bool]) -> list[Event]:
+    """Events of a link whose peer answers each request in 2 ms, or in 40 ms where it is `slow` then [s]."""
+    found: list[Item] = []
+    for n in range(seconds):
+        at_ns = NOW + n * SECOND
+        for raw in (mavlink.MAVLink(None).decode(bytearray(data)) for data in link.due(at_ns)):
+            if raw.get_type() == "TIMESYNC":
+                trip_ns = (40 if slow(n) else 2) * MS
+                found += link.receive(CAMERA.send("timesync", at_ns + trip_ns // 2 - OFFSET, raw.ts1), at_ns + trip_ns)
+        found += link.receive(CAMERA.vision((at_ns - OFFSET) // 1000), at_ns + 50 * MS)
+    return [one for one in found if isinstance(one, Event)]
+
+
+def test_slow_answers_of_a_busy_machine_are_told_seldom_and_mildly_while_the_clock_is_known() -> None:
+    link = make_link()
+    told = told_while(link, 60, lambda n: n % 3 != 0)
+    assert link.stats(NOW).bad["timesync"] == 40
+    assert {(one.code, one.severity) for one in told} == {("timesync", Severity.INFO)}
+    assert len(told) <= 7 and sum(one.count for one in told) > 30
+    assert all("stays known" in one.text for one in told)
+
+
+def test_a_clock_that_is_not_known_any_more_is_a_warning() -> None:
+    told = told_while(make_link(), 40, lambda n: n >= 3)
+    assert [one.severity for one in told if one.code == "timesync"][-1] is Severity.WARNING
+    assert "not known" in told[-1].text and len(told) <= 5
 
 
 @pytest.mark.fault(19)

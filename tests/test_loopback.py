@@ -103,7 +103,7 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
         (["log", "replay", "nowhere.tlog"], 1, "No such file"),
         (["log", "recover", "nowhere.mcap", "x.mcap"], 1, "no such recording"),
         (["loopback", "--duration", "0.001"], 2, "shorter than a tick"),
-        (["loopback", "--seed", "-1"], 2, "sim.seed"),
+        (["loopback", "--seed", "-1"], 2, "--seed"),
         (["fly", "--duration", "0"], 2, "duration"),
         (["fly", "--vehicle", "carrier-pigeon"], 2, "carrier-pigeon"),
         (["sim", "--vehicle", "udpout://127.0.0.1"], 2, "udpout://127.0.0.1"),

@@ -15,23 +15,48 @@ from logs.summary import Spread, summarise
 from logs.words import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
-from uavctl.data import ControlMode, Decision, LinkStats, Record, StepInput
+from uavctl.data import (
+    ORDER_ACCEPTED,
+    ControlMode,
+    Decision,
+    Event,
+    LinkStats,
+    Order,
+    Record,
+    Severity,
+    StepInput,
+)
+from uavctl.flight.decide import MISSION_OVER
 
 TICK_S = room().tick_s
 
 
-def ended_in(modes: dict[int, ControlMode], stop_tick: int | None = None) -> str:
-    """Text of the page of a 4 s flight (ticks of 50 ms) whose modes change at the given ticks."""
+def ended_in(
+    modes: dict[int, ControlMode],
+    stop_tick: int | None = None,
+    order_tick: int | None = None,
+    due_tick: int | None = None,
+) -> str:
+    """Text of the page of a 4 s flight (ticks of 50 ms) whose modes change at the given ticks.
+
+    The operator stops it at `stop_tick`, or orders the landing at `order_tick`; the mission is over at `due_tick`.
+    """
 
     def change(record: Record) -> Record:
         if isinstance(record, StepInput) and stop_tick is not None:
             return msgspec.structs.replace(record, stop=record.tick >= stop_tick)
         if isinstance(record, Decision) and record.tick >= min(modes):
             mode = modes[max(tick for tick in modes if tick <= record.tick)]
-            return msgspec.structs.replace(record, mode=mode, reason="why not")
+            return msgspec.structs.replace(
+                record, mode=mode, reason=MISSION_OVER if record.tick == due_tick else "why not"
+            )
         return record
 
     items = [(t, at, change(r)) for t, at, r in fly(room(), 4.0)]
+    if order_tick is not None:
+        at_ns = next(r.at_ns for _, _, r in items if isinstance(r, Decision) and r.tick == order_tick)
+        order = Event(at_ns=at_ns, severity=Severity.INFO, code=ORDER_ACCEPTED, text=Order.LAND.value)
+        items.append(("/uavctl/event", at_ns, order))
     return " ".join(words_of(FlightData.from_records(items)).text)
 
 
@@ -63,6 +88,16 @@ def test_a_landing_is_told() -> None:
     assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s in all" in text
     assert "landed by the fallback" in text
     assert "operator" not in text
+
+
+@pytest.mark.parametrize(
+    ("ordered", "told"), [(True, "The operator ordered the landing"), (False, "The mission was over")]
+)
+def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> None:
+    text = ended_in(HAND_OVER, order_tick=40 if ordered else None, due_tick=None if ordered else 40)
+    assert told in text and f"{51 * TICK_S:g} s" in text
+    assert "The fallback was never needed." in text
+    assert "fallback had the vehicle land" not in text and "by the fallback" not in text
 
 
 @pytest.mark.parametrize(

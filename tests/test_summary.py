@@ -15,8 +15,23 @@ from synthetic_scene import paper, room
 from logs.digits import number, percent_above
 from logs.flight_data import FALLBACK, FlightData
 from logs.summary import FlightSummary, Spread, render, spread, summarise
-from uavctl.data import ControlMode, Decision, Estimate, Plan, Record, SolveStatus, StepInput, Timing, Truth
+from uavctl.data import (
+    ORDER_ACCEPTED,
+    ControlMode,
+    Decision,
+    Estimate,
+    Event,
+    Order,
+    Plan,
+    Record,
+    Severity,
+    SolveStatus,
+    StepInput,
+    Timing,
+    Truth,
+)
 from uavctl.errors import RecordingError
+from uavctl.flight.decide import MISSION_OVER
 
 DT_NS = 1_000_000_000
 EMPTY_COV = tuple((0.0,) * 4 for _ in range(4))
@@ -313,6 +328,45 @@ def test_virtual_time_has_no_lateness(late_ns: tuple[int, ...], virtual: bool) -
 def test_unmeasured_ticks_are_not_called_virtual() -> None:
     assert not flight(decision(0)).virtual_time
     assert "not measured" in shown(figures(decision(0)))
+
+
+def landing(*names: str, order_at: int | None = None, due_at: int | None = None) -> FlightData:
+    """One decision a second in these modes; the operator orders the landing, or the mission is over, at a tick."""
+    events = [] if order_at is None else [order_of(order_at, Order.LAND)]
+    ticks = [decision(k, ControlMode(name)) for k, name in enumerate(names)]
+    told = [msgspec.structs.replace(one, reason=MISSION_OVER) if one.tick == due_at else one for one in ticks]
+    return flight(*events, *told, truth(0, (0.0,) * 4))
+
+
+def order_of(k: int, order: Order) -> Event:
+    return Event(at_ns=k * DT_NS, severity=Severity.INFO, code=ORDER_ACCEPTED, text=order.value)
+
+
+@pytest.mark.parametrize(
+    ("flown", "fallbacks", "spans", "ended"),
+    [
+        (landing("track", "brake", "hold", "land", "stopped", order_at=1), 0, [], "landed as ordered"),
+        (landing("track", "brake", "hold", "land", "stopped", due_at=1), 0, [], "landed at the end of the mission"),
+        # Positions were lost before the order: that was the fallback, until then.
+        (landing("track", "brake", "brake", "hold", "land", order_at=2), 1, [(1.0, 2.0)], "landed as ordered"),
+        (landing("track", "brake", "track", "brake", "land", order_at=3), 1, [(1.0, 2.0)], "landed as ordered"),
+        # The pilot took over on the way down and gave the vehicle back: what comes after is another matter.
+        (landing("track", "brake", "wait", "track", "brake", "land", order_at=1), 2, None, "landed by the fallback"),
+        (landing("track", "brake", "hold", order_at=1), 0, [], "flying"),
+    ],
+)
+def test_a_landing_that_was_wanted_is_no_fallback(
+    flown: FlightData, fallbacks: int, spans: list[tuple[float, float]] | None, ended: str
+) -> None:
+    s = summarise(flown, wall_s=1.0)
+    assert (s.fallbacks, s.ended.value) == (fallbacks, ended)
+    assert spans is None or flown.fallback_spans == spans
+    assert ended in shown(s)
+
+
+def test_another_order_is_no_landing() -> None:
+    held = flight(order_of(1, Order.HOLD), *landing("track", "brake", "hold", "land").decisions, truth(0, (0.0,) * 4))
+    assert summarise(held, wall_s=1.0).ended.value == "landed by the fallback"
 
 
 def test_the_end_is_in_the_table() -> None:

@@ -15,8 +15,9 @@ from uavctl.campaign.cells import cell_of, told
 from uavctl.campaign.compose import campaign_of
 from uavctl.campaign.controllers import LibraryFor
 from uavctl.campaign.setting import met
+from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.store import DOCUMENT, first_difference
-from uavctl.campaign.tasks import CHUNK, Task, flown
+from uavctl.campaign.tasks import Task, flown
 from uavctl.campaign.world import Flown
 from uavctl.config import Config
 from uavctl.config.types import PlantConfig

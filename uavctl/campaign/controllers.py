@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from uavctl.build import build_design, build_plant, build_solver
@@ -35,6 +36,7 @@ from uavctl.smpc.risk import kappa
 
 # Runs that a PID is tuned on: beyond the last index that a campaign can fly.
 TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
+TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies them all
 
 LibraryFor = Callable[[Config, Design], StoredLibrary | None]
 
@@ -150,6 +152,7 @@ def _decider(design: Design, library: Library | None, solver: Solver) -> Decider
 
 def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
     """The gains that suit what the PID believes in, from where the campaign starts."""
+    spec = msgspec.structs.replace(spec, steps=min(spec.steps, TUNING_STEPS))
     believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
     meets = met(believed, TUNING_FIRST, TUNING_RUNS)
     start = start_of(spec, config)

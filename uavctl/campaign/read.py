@@ -10,9 +10,11 @@ import msgspec
 import numpy as np
 
 from uavctl.campaign.compose import Campaign, Told, compose, flown, placed
-from uavctl.campaign.spec import TRUE, CampaignSpec
+from uavctl.campaign.spec import CHUNK, MOST_CELLS, MOST_DESIGNS, MOST_STEPS_AT_ONCE, TRUE, CampaignSpec
 from uavctl.config import Config, Source, dump_config, load, presets
+from uavctl.config.bounds import oversized
 from uavctl.config.checks import dimensions
+from uavctl.config.data_file import DataFileError, read_text
 from uavctl.config.index import key_lines
 from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
@@ -27,14 +29,21 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
     text = _text(path)
+    table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
     source = Source(str(path), key_lines(text))
     found: list[Problem] = []
-    spec = cast("CampaignSpec | None", decode(CampaignSpec, parse_toml(text, str(path)), "", found, {}))
     told = Told(source)
+    told.tell(oversized(table))
+    if told.problems:
+        raise ConfigError(told.problems)
+    spec = cast("CampaignSpec | None", decode(CampaignSpec, table, "", found, {}))
     told.tell(found)
     if spec is None:
         raise ConfigError(told.problems)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)
+    told.tell(_sizes(spec))
+    if told.problems:  # the rest is work for each of them
+        raise ConfigError(told.problems)
     told.tell(_names(spec))
     name = spec.config if spec.config in presets() else str(path.parent / spec.config)
     base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
@@ -48,11 +57,24 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError((f"{path}: cannot be read ({error.strerror}); give the TOML file of a campaign",)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError((f"{path}: is not UTF-8 text; save it as UTF-8",)) from error
+        return read_text(path)
+    except DataFileError as error:
+        raise ConfigError(tuple(f"{reason}; give the TOML file of a campaign" for reason in error.reasons)) from error
+
+
+def _sizes(spec: CampaignSpec) -> Iterator[Problem]:
+    """More than can be designed in minutes, or held in memory."""
+    together = min(spec.runs, CHUNK)
+    if spec.steps * together > MOST_STEPS_AT_ONCE:
+        reason = f"{spec.steps} steps of {together} runs are flown at once"
+        yield Problem("steps", reason, f"give so few that they are {MOST_STEPS_AT_ONCE} in all, or fewer runs")
+    designs = len(spec.controller) * len(spec.link)
+    if designs > MOST_DESIGNS:
+        yield Problem("controller", f"with the links there are {designs} designs", f"take fewer, {MOST_DESIGNS} in all")
+    cells = designs * len(spec.disturbance) * len(spec.plant)
+    if cells > MOST_CELLS:
+        reason = f"with links, disturbances and plants there are {cells} cells"
+        yield Problem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")
 
 
 def _names(spec: CampaignSpec) -> Iterator[Problem]:

@@ -9,14 +9,20 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Floats, Rows, Section
+from uavctl.config.section import LARGEST_PLANT, LARGEST_SEED, Floats, Rows, Section
 
 TRUE = "true"  # a controller that believes in the link it flies on
 
 Kind = Literal["smpc", "lqg", "packetised", "worst-case-delay", "hold-last", "zero-on-loss", "pid"]
 Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
-Overrides = tuple[str, ...]
+Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
+MOST_OF_A_KIND = 100
+MOST_DESIGNS, MOST_CELLS = 200, 10_000
+MOST_RUNS = 10_000_000
+# Part of the result: the last bits of a product depend on how many runs it is made for.
+CHUNK = 1000
+MOST_STEPS_AT_ONCE = 2_000_000  # their states are held in memory
 
 
 class ControllerSpec(Section, frozen=True, kw_only=True):
@@ -34,6 +40,7 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
         float,
         Meta(
             ge=0,
+            le=1000,
             description="with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, "
             "in standard deviations of one step's disturbance",
         ),
@@ -58,8 +65,10 @@ class DisturbanceSpec(Section, frozen=True, kw_only=True):
             "of the last one's. All have the plant's covariance W, times scale²"
         ),
     ] = "gaussian"
-    scale: Annotated[float, Meta(ge=0, description="factor of W's standard deviations")] = 1.0
-    bias: Annotated[float, Meta(description="constant that is added, in standard deviations of W")] = 0.0
+    scale: Annotated[float, Meta(ge=0, le=1e6, description="factor of W's standard deviations")] = 1.0
+    bias: Annotated[float, Meta(ge=-1e6, le=1e6, description="constant that is added, in standard deviations of W")] = (
+        0.0
+    )
     memory: Annotated[float, Meta(ge=0, lt=1, description="with `gusts`: correlation of a step with the next")] = 0.0
 
 
@@ -73,8 +82,13 @@ class PlantSpec(Section, frozen=True, kw_only=True):
 class TuningSpec(Section, frozen=True, kw_only=True):
     """What a user would set otherwise for some controllers on the links that they believe in."""
 
-    controllers: Annotated[tuple[str, ...], Meta(min_length=1, description="names of [[controller]]s")]
-    links: Annotated[tuple[str, ...], Meta(min_length=1, description="names of [[link]]s that they believe in")]
+    controllers: Annotated[
+        tuple[str, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[controller]]s")
+    ]
+    links: Annotated[
+        tuple[str, ...],
+        Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[link]]s that they believe in"),
+    ]
     set: Annotated[Overrides, Meta(min_length=1, description="overrides of the design; they win over the controller's")]
 
 
@@ -88,16 +102,30 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
     set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
     steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
-    runs: Annotated[int, Meta(ge=1, le=10_000_000, description="runs of each cell")] = 1000
-    master: Annotated[int, Meta(ge=0, description="seed: run i's draws come from (master, i), in every cell")] = 0
-    start: Annotated[Floats, Meta(description="state (n_x) in which every run starts; else sim.start_*")] = ()
-    start_box: Annotated[
-        Rows, Meta(description="[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box")
+    runs: Annotated[int, Meta(ge=1, le=MOST_RUNS, description="runs of each cell")] = 1000
+    master: Annotated[
+        int, Meta(ge=0, le=LARGEST_SEED, description="seed: run i's draws come from (master, i), in every cell")
+    ] = 0
+    start: Annotated[
+        Floats, Meta(max_length=LARGEST_PLANT, description="state (n_x) in which every run starts; else sim.start_*")
     ] = ()
-    controller: Annotated[tuple[ControllerSpec, ...], Meta(description="controllers")]
-    link: Annotated[tuple[LinkSpec, ...], Meta(description="links")] = (LinkSpec(name="as configured"),)
-    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(description="disturbances")] = (
+    start_box: Annotated[
+        Rows,
+        Meta(
+            max_length=2,
+            description="[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box",
+        ),
+    ] = ()
+    controller: Annotated[tuple[ControllerSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="controllers")]
+    link: Annotated[tuple[LinkSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="links")] = (
+        LinkSpec(name="as configured"),
+    )
+    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="disturbances")] = (
         DisturbanceSpec(name="gaussian"),
     )
-    plant: Annotated[tuple[PlantSpec, ...], Meta(description="plants")] = (PlantSpec(name="as modelled"),)
-    tuning: Annotated[tuple[TuningSpec, ...], Meta(description="settings of controllers on some links")] = ()
+    plant: Annotated[tuple[PlantSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="plants")] = (
+        PlantSpec(name="as modelled"),
+    )
+    tuning: Annotated[
+        tuple[TuningSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="settings of controllers on some links")
+    ] = ()

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from uavctl.campaign.cells import Cell
 from uavctl.campaign.controllers import Recipe, built
 from uavctl.campaign.setting import Setting, met
+from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.world import Flown, fly
 from uavctl.smpc.batch_smpc import Tally
-
-# Part of the result: the last bits of a product depend on how many runs it is made for.
-CHUNK = 1000
 
 Columns = dict[str, NDArray[np.generic]]
 

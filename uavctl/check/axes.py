@@ -21,7 +21,9 @@ _TILT_DEG = 25.0  # between the two attitudes
 _MOVE_TOLERANCE_M, _MOVE_PART = 0.05, 0.15
 _ASKED_TOLERANCE_PART = 0.6  # of the way that a person was asked to move the body
 _HORIZONTAL = 8 | 16  # ESTIMATOR_STATUS_FLAGS: position relative, or absolute
-_CONSTANT = 128  # it assumes that it stands
+_CONSTANT = 128  # it assumes that it stands; PX4 says so of every vehicle that rests, whatever it knows
+_AIDED = 256  # PX4: something tells it where it is
+_PX4 = 12  # MAV_AUTOPILOT
 _WANT = "the same axes, unit and handedness as the vehicle's own"
 _MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
 
@@ -50,7 +52,10 @@ def compared(seen: Seen) -> bool:
 
 def _has_position(seen: Seen) -> bool:
     flags = seen.estimator
-    return flags is None or bool(flags & _HORIZONTAL and not flags & _CONSTANT)
+    if flags is None:
+        return True
+    stands = flags & _CONSTANT and not (seen.autopilot == _PX4 and flags & _AIDED)
+    return bool(flags & _HORIZONTAL and not stands)
 
 
 def _own(seen: Seen, pairs: list[tuple[Vec3, Vec3]]) -> Item:

@@ -39,10 +39,10 @@ def _clock(name: str, trips: RoundTrips | None, unanswered: tuple[State, str]) -
     value += "" if drift is None else f", drift {drift:+.0f} ppm"
     if trips.rejected > _REJECTED * len(ordered):
         hint = "a slow or busy link: offsets of such answers are not believed, ages are less certain"
-        return item(name, State.NOTE, value, _WANT, hint)
+        return item(name, State.NOTE, value, f"{_WANT}, and few answers rejected", hint)
     if drift is not None and abs(drift) > _DRIFT_PPM:
         hint = "the drift is followed; a real clock keeps 100 ppm, so this is a simulator, or a computer short of time"
-        return item(name, State.NOTE, value, _WANT, hint)
+        return item(name, State.NOTE, value, f"{_WANT}, and a drift of at most {_DRIFT_PPM:g} ppm", hint)
     return item(name, State.GOOD, value, _WANT)
 
 

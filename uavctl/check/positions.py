@@ -70,15 +70,18 @@ def _period_s(captured_s: list[float]) -> float | None:
 
 def _rate(captured_s: list[float], period_s: float | None, config: Config) -> Item:
     wanted_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
-    want = f"at least {wanted_hz:.3g} Hz (source.rate_hz, or one each plant.dt_s)"
+    least_hz, why = _RATE_PART * wanted_hz, f"{_RATE_PART:.0%} of source.rate_hz, or of one each plant.dt_s"
+    if period_s is None:
+        least_hz, why = least_hz * (1.0 - config.link.loss), f"{why}, less link.loss"
+    want = f"at least {least_hz:.3g} Hz ({why})"
     if len(captured_s) <= _ENOUGH:
         value = f"only {len(captured_s)} positions came"
         return item("position rate", State.BAD, value, want, "listen longer, or see why")
     arrived_hz = (len(captured_s) - 1) / max(captured_s[-1] - captured_s[0], 1e-9)
     if period_s is None:
-        good, value = arrived_hz >= _RATE_PART * wanted_hz * (1.0 - config.link.loss), "irregular captures"
+        good, value = arrived_hz >= least_hz, "irregular captures"
     else:
-        good, value = 1.0 / period_s >= _RATE_PART * wanted_hz, f"{1.0 / period_s:.3g} Hz captured"
+        good, value = 1.0 / period_s >= least_hz, f"{1.0 / period_s:.3g} Hz captured"
     return judged(
         "position rate",
         good=good,
@@ -109,9 +112,13 @@ def _age(seen: Seen, config: Config) -> Item:
     value = f"median {ages_s[len(ages_s) // 2] * 1e3:.1f} ms, 95 % within {p95_s * 1e3:.1f} ms{note}"
     # Ages count in steps: one within Δt is 0, whatever the link was said to take.
     step_s = (config.schedule.late + 1) * config.plant.dt_s
-    want = f"95 % within {limit_s * 1e3:.1f} ms (link.delay_s + link.jitter_s), never over {step_s * 1e3:.0f} ms"
+    worst_s = max(limit_s, step_s)
+    want = (
+        f"95 % within {(limit_s + _AGE_TOLERANCE_S) * 1e3:.1f} ms (link.delay_s + link.jitter_s, and "
+        f"{_AGE_TOLERANCE_S * 1e3:g} ms), never over {worst_s * 1e3:.0f} ms"
+    )
     hint = "design for the delay that is there: raise link.delay_s or link.jitter_s (then schedule.late), or the link"
-    if p95_s > max(limit_s, step_s):
+    if p95_s > worst_s:
         return item("position age", State.BAD, value, want, hint)
     state = State.GOOD if p95_s <= limit_s + _AGE_TOLERANCE_S else State.NOTE
     return item("position age", state, value, want, hint)
@@ -136,6 +143,8 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     # Two standard deviations: fewer than one right set-up in forty is told that it loses more than it does.
     surely = loss - 2.0 * math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
     hint = "design for the loss that is there (link.loss, link.model), or better the link"
+    if surely <= expected < loss:
+        value += ", which is within the chance of so few"
     return judged(name, good=surely <= expected, value=value, want=want, hint=hint)
 
 

@@ -74,7 +74,12 @@ def _armed(seen: Seen, *, takes_off: bool) -> Item:
 def _landed(seen: Seen) -> Item:
     told = {None: "not told", True: "on the ground", False: "in the air"}[seen.landed]
     state = State.GOOD if seen.landed else State.NOTE
-    return item("landed", state, told, "on the ground", "what it does not tell cannot be waited for")
+    hint = (
+        "a flight with --arm --takeoff begins on the ground"
+        if seen.landed is False
+        else "what it does not tell cannot be waited for"
+    )
+    return item("landed", state, told, "on the ground", hint)
 
 
 def _battery(seen: Seen, config: Config) -> Item:

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from uavctl import __version__
 from uavctl.cli.common import messages
-from uavctl.errors import UavctlError, UsageError
+from uavctl.errors import ConfigError, UavctlError, UsageError
 
 _EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
 130 interrupted.
@@ -25,6 +25,9 @@ app = App(
     version=__version__,
     suppress_keyboard_interrupt=False,
 )
+
+_MOST_SHOWN = 30  # problems of a configuration
+_LONGEST_HALF = 500  # characters of a problem at either end
 
 # A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
 _COMMANDS = {
@@ -59,12 +62,28 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         imported()
         result = command(*bound.args, **bound.kwargs)
     except CycloptsError as error:
-        return _refuse(str(error), UsageError.exit_code)
+        return _refuse([str(error)], UsageError.exit_code)
+    except ConfigError as error:
+        return _refuse(error.problems, error.exit_code)
     except UavctlError as error:
-        return _refuse(str(error), error.exit_code)
+        return _refuse(str(error).split("\n"), error.exit_code)
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # a file that no command foresaw: a full disk, a name that is too long
+        return _refuse([f"{error.filename or 'system'}: {error.strerror or error}"], UavctlError.exit_code)
     return result if isinstance(result, int) else 0
 
 
-def _refuse(text: str, exit_code: int) -> int:
-    messages().print(f"[bold red]error:[/] {escape(text)}", soft_wrap=True)
+def _refuse(problems: Sequence[str], exit_code: int) -> int:
+    shown = [_shown(problem) for problem in problems[:_MOST_SHOWN]]
+    if len(problems) > _MOST_SHOWN:
+        shown.append(f"{len(problems) - _MOST_SHOWN} more")
+    messages().print(f"[bold red]error:[/] {escape(chr(10).join(shown))}", soft_wrap=True)
     return exit_code
+
+
+def _shown(text: str) -> str:
+    """One line of a length that a person reads, and nothing in it that a terminal would take for an order."""
+    if len(text) > 2 * _LONGEST_HALF:
+        text = f"{text[:_LONGEST_HALF]} … {text[-_LONGEST_HALF:]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

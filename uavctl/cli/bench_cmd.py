@@ -19,7 +19,7 @@ from uavctl.bench.plot import bench_svg
 from uavctl.bench.run import Advance
 from uavctl.build import build_design, build_spec
 from uavctl.cli.bench_loop import bench_loop
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, located, messages
 from uavctl.errors import UsageError
 
 _REFRESH_S = 0.2
@@ -30,18 +30,22 @@ def bench(
     states: Annotated[
         int,
         Parameter(
-            help="number of states; the slow methods answer the first of them", validator=validators.Number(gte=1)
+            help="number of states; the slow methods answer the first of them",
+            validator=validators.Number(gte=1, lte=100_000),
         ),
     ] = DEFAULT_SIZES.states,
-    seed: Annotated[int, Parameter(help="seed of states and policies", validator=validators.Number(gte=0))] = 0,
+    seed: Annotated[int, Parameter(help="seed of states and policies", validator=SEED)] = 0,
     plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
     loop: Annotated[
         bool, Parameter(negative=(), help="measure the whole control loop on real UDP instead, beside an empty one")
     ] = False,
-    seconds: Annotated[float, Parameter(help="with --loop: length of a run [s]", validator=POSITIVE)] = 60.0,
+    seconds: Annotated[float, Parameter(help="with --loop: length of a run [s]", validator=SPAN_S)] = 60.0,
     runs: Annotated[
         int,
-        Parameter(help="with --loop: runs without --realtime, and as many with it", validator=validators.Number(gte=1)),
+        Parameter(
+            help="with --loop: runs without --realtime, and as many with it",
+            validator=validators.Number(gte=1, lte=1000),
+        ),
     ] = 5,
     common: Common = DEFAULTS,
 ) -> int:
@@ -49,8 +53,8 @@ def bench(
     if loop:
         return bench_loop(common, seconds, runs)
     loaded = common.load()
-    if plot is not None and not plot.parent.is_dir():
-        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
+    if plot is not None:
+        _check_plot(plot)
     with located(loaded):
         design = build_design(loaded.config)
         loss = build_spec(loaded.config).link.outage(1)
@@ -60,6 +64,22 @@ def bench(
         plot.write_text(bench_svg(result, loaded.config.name), encoding="utf-8")
     common.show(result, lambda: bench_picture(result, loaded.config.name))
     return 0
+
+
+def _check_plot(plot: Path) -> None:
+    """Refuse a file that cannot be written, before minutes of measuring.
+
+    Raises:
+        UsageError: There is no such folder, or the name is that of something else.
+    """
+    try:
+        there, taken = plot.parent.is_dir(), plot.exists() and not plot.is_file()
+    except OSError as error:
+        raise UsageError(f"--plot: {error.strerror}; give another name") from error
+    if not there:
+        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
+    if taken:
+        raise UsageError(f"--plot: {plot} is not a file; give another name")
 
 
 @contextmanager

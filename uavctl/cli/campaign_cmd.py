@@ -30,11 +30,12 @@ from uavctl.campaign.page import write_report
 from uavctl.campaign.pool import Crew, cluster, processes
 from uavctl.campaign.read import read_campaign
 from uavctl.campaign.run import fly_tasks
+from uavctl.campaign.spec import MOST_RUNS
 from uavctl.campaign.statistics import CellSummary, summarise
 from uavctl.campaign.store import Store
 from uavctl.campaign.tasks import Columns, Task, tasks_of
 from uavctl.cli import INTERRUPTED, refly_cmd
-from uavctl.cli.common import Common, messages
+from uavctl.cli.common import WORKERS, Common, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.cli.prepare import ready_library
 
@@ -55,11 +56,12 @@ def campaign(
     spec: Annotated[Path, Parameter(help="TOML file of the campaign; with --refly its folder", show_default=False)],
     *,
     runs: Annotated[
-        int | None, Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1))
+        int | None,
+        Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1, lte=MOST_RUNS)),
     ] = None,
     workers: Annotated[
         int | None,
-        Parameter(help="processes that fly; else one for each processor", validator=validators.Number(gte=1)),
+        Parameter(help="processes that fly; else one for each processor", validator=WORKERS),
     ] = None,
     dask: Annotated[str | None, Parameter(help="fly on the workers of the Dask scheduler at this address")] = None,
     out: Annotated[Path | None, Parameter(help="folder of the results; else a new one below flights/")] = None,

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from uavctl.check.item import Item, State, item, judged, refusals
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.config.security import warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError
@@ -45,7 +45,7 @@ def check(
         str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
     ] = None,
     seconds: Annotated[
-        float | None, Parameter(help="how long to listen [s]; else check.seconds", validator=POSITIVE)
+        float | None, Parameter(help="how long to listen [s]; else check.seconds", validator=SPAN_S)
     ] = None,
     move: Annotated[
         bool, Parameter(negative=(), help="ask for movements of the body by hand, which show every axis")

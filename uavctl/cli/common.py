@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from uavctl.config import Loaded, explain, load
+from uavctl.config.section import LARGEST_SEED, LONGEST_S
 from uavctl.errors import ConfigError, DesignError
 
 _FILE_WIDTH = 120
@@ -68,10 +70,32 @@ class Common:
             Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(picture())
 
 
+def can_be_read(type_: object, path: object) -> None:
+    """Refuse a path that a recording cannot be at: a pipe would be waited for, a device has no end.
+
+    Raises:
+        ValueError: It is one, or a name that the system does not take.
+    """
+    del type_
+    for one in path if isinstance(path, tuple) else (path,):
+        try:
+            mode = Path(str(one)).stat().st_mode
+        except FileNotFoundError:
+            continue  # told by who reads it
+        except OSError as error:
+            raise ValueError(f"{error.strerror}; give a recording") from error
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ValueError("it is a pipe or a device; give a recording")
+
+
 DEFAULTS = Common()
-Flight = Annotated[Path, Parameter(help="the recording")]
+Flight = Annotated[Path, Parameter(help="the recording", validator=can_be_read)]
 Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
-POSITIVE = validators.Number(gt=0)
+SPAN_S = validators.Number(gt=0, lte=LONGEST_S)
+HEIGHT_M = validators.Number(gt=0, lte=1000)
+SEED = validators.Number(gte=0, lte=LARGEST_SEED)
+WORKERS = validators.Number(gte=1, lte=1024)
+PORT = validators.Number(gte=1, lte=65535)
 
 
 def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:

@@ -32,7 +32,7 @@ def design(
         bool, Parameter(negative=(), show_default=False, help="make the design under each risk allocation, and compare")
     ] = False,
     states: Annotated[
-        int, Parameter(help="seeded states in either comparison", validator=validators.Number(gte=1))
+        int, Parameter(help="seeded states in either comparison", validator=validators.Number(gte=1, lte=10_000))
     ] = 60,
     common: Common = DEFAULTS,
 ) -> int:

@@ -13,7 +13,7 @@ from logs.recorder import Recorder
 from logs.summary import render
 from uavctl.build import build_design
 from uavctl.cli.before_arming import checked_before_arming, record_items
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
+from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
 from uavctl.cli.engagement import (
     Engagement,
     check_places,
@@ -54,11 +54,11 @@ def fly(
         str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
     ] = None,
     duration: Annotated[
-        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=POSITIVE)
+        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=SPAN_S)
     ] = None,
     arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
     takeoff: Annotated[
-        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=POSITIVE)
+        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
     ] = None,
     goto: Annotated[
         str | None,

@@ -19,7 +19,7 @@ from logs.outputs import spare_recording, write_whole
 from logs.reader import header, lacks_end, read
 from logs.tlog import read_tlog
 from uavctl.build import build_design
-from uavctl.cli.common import DEFAULTS, Common, messages, warn
+from uavctl.cli.common import DEFAULTS, Common, can_be_read, messages, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -30,7 +30,7 @@ from uavctl.identify.result import Identification, identify
 
 
 def identify_command(
-    flight: Annotated[Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog")],
+    flight: Annotated[Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=can_be_read)],
     /,
     *,
     common: Common = DEFAULTS,

@@ -15,15 +15,15 @@ from logs.compare import Comparison, compare
 from logs.compare_page import write_page
 from logs.compare_side import Side, load_all
 from logs.compare_words import difference, for_people, label, likeness, measured, parameter
-from uavctl.cli.common import Common, messages
+from uavctl.cli.common import Common, can_be_read, messages
 from uavctl.cli.wide_table import Column, WideTable
 
 
 def compare_command(
-    first: Annotated[Path, Parameter(help="the recording that the others are compared with")],
-    second: Annotated[Path, Parameter(help="another one")],
+    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=can_be_read)],
+    second: Annotated[Path, Parameter(help="another one", validator=can_be_read)],
     /,
-    *more: Annotated[Path, Parameter(help="and more")],
+    *more: Annotated[Path, Parameter(help="and more", validator=can_be_read)],
     out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
     json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
 ) -> int:

@@ -24,7 +24,7 @@ from sim.script import Script
 from sim.server import Ready, serve_in_child
 from sim.world import World
 from uavctl.build import build_design
-from uavctl.cli.common import DEFAULTS, POSITIVE, Common, located, messages
+from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
 from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_verdict
 from uavctl.cli.flying import (
     Live,
@@ -56,12 +56,14 @@ def loopback(
     *,
     common: Common = DEFAULTS,
     udp: Annotated[bool, Parameter(negative=(), help="real UDP sockets and real time, else lockstep")] = False,
-    duration: Annotated[float | None, Parameter(help="length of the flight [s]; else duration_s")] = None,
-    seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed")] = None,
+    duration: Annotated[
+        float | None, Parameter(help="length of the flight [s]; else duration_s", validator=SPAN_S)
+    ] = None,
+    seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed", validator=SEED)] = None,
     arm: Annotated[bool, Parameter(negative=(), help="begin on the ground, disarmed; needs --takeoff")] = False,
     takeoff: Annotated[
         float | None,
-        Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=POSITIVE),
+        Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M),
     ] = None,
     goto: Annotated[
         str | None, Parameter(help="x,y,z in local NED [m]: fly there and stay", allow_leading_hyphen=True)

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from logs.digits import percent_above
 from uavctl.build import build_design, build_spec
-from uavctl.cli.common import Common, located, messages
+from uavctl.cli.common import SEED, WORKERS, Common, located, messages
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.paper.assess import assess
@@ -28,16 +28,16 @@ from uavctl.paper.result import Claim, Complexity, Depth, DesignTried, VariantRe
 from uavctl.paper.run import HERE_UP_TO, Advance, Flights, fly_all
 from uavctl.paper.variants import PRESET, PRINTED, VARIANTS, Variant
 
-_COUNT = validators.Number(gte=1)
+_RUNS = validators.Number(gte=1, lte=1_000_000)
 # Beyond, a second design would take minutes more to say the same of the claims.
 BOTH_UP_TO = 20_000
 
 
 def paper(
     *,
-    runs: Annotated[int, Parameter(help="number of runs", validator=_COUNT)] = 200,
-    steps: Annotated[int, Parameter(help="steps of a run", validator=validators.Number(gte=4))] = 50,
-    seed: Annotated[int, Parameter(help="seed of every random draw", validator=validators.Number(gte=0))] = 0,
+    runs: Annotated[int, Parameter(help="number of runs", validator=_RUNS)] = 200,
+    steps: Annotated[int, Parameter(help="steps of a run", validator=validators.Number(gte=4, lte=10_000))] = 50,
+    seed: Annotated[int, Parameter(help="seed of every random draw", validator=SEED)] = 0,
     tau: Annotated[
         Literal[4, 3] | None,
         Parameter(
@@ -50,7 +50,7 @@ def paper(
         int | None,
         Parameter(
             help=f"processes for more than {HERE_UP_TO} runs; all cores by default. They change no figure",
-            validator=_COUNT,
+            validator=WORKERS,
             show_default=False,
         ),
     ] = None,

@@ -29,7 +29,7 @@ from logs.topics import HEADER, RecorderNote
 from logs.views import Views
 from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
-from uavctl.cli.common import Common, Flight, Json, messages, warn
+from uavctl.cli.common import SEED, Common, Flight, Json, messages, warn
 from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
@@ -68,7 +68,9 @@ def whatif(
             "changes a key of link",
         ),
     ] = (),
-    seed: Annotated[int | None, Parameter(help="seed of a simulated link; else the recorded sim.seed")] = None,
+    seed: Annotated[
+        int | None, Parameter(help="seed of a simulated link; else the recorded sim.seed", validator=SEED)
+    ] = None,
     model: Annotated[
         Path | None, Parameter(help="TOML file whose [plant] answers to other setpoints, as of `uavctl identify`")
     ] = None,

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from uavctl.config import log, mission_checks, peer_checks, security, sim_checks
+from uavctl.config.link import LONGEST_DELAY_S
 from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem as Problem
+from uavctl.config.section import LARGEST, Open
 from uavctl.config.types import (
     CostConfig,
     EstimatorConfig,
-    Floats,
     LimitsConfig,
     LinkConfig,
     PlantConfig,
@@ -32,6 +33,7 @@ _MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", "position_index", "velocity
 _DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
 _AXES = ("north", "east", "down")
 _SUM = 1e-4  # shares are written rounded
+_TICKS_TRIED = 10_000
 _RELATIVE = 1e-9  # asymmetry and negative eigenvalues below this share of W's size are rounding
 
 
@@ -48,7 +50,7 @@ def check(sections: Mapping[str, Section | tuple[Section, ...]]) -> Iterator[Pro
             yield from check_one(*(sections[name] for name in names))
 
 
-def _length(key: str, values: Floats | tuple[int, ...], wanted: int, meaning: str) -> Iterator[Problem]:
+def _length(key: str, values: Open | tuple[int, ...], wanted: int, meaning: str) -> Iterator[Problem]:
     if len(values) != wanted:
         yield Problem(key, f"has {len(values)} entries, {meaning} = {wanted}", f"give {wanted} numbers")
 
@@ -140,6 +142,9 @@ def _sets(plant: PlantConfig, sets: SetsConfig) -> Iterator[Problem]:
         yield from _length(f"sets.{kind}_lower", lower, size, name)
         yield from _length(f"sets.{kind}_upper", upper, size, name)
         for i, (low, high) in enumerate(zip(lower, upper, strict=False)):
+            for name, side in ((f"sets.{kind}_lower[{i}]", low), (f"sets.{kind}_upper[{i}]", high)):
+                if math.isfinite(side) and abs(side) > LARGEST:
+                    yield Problem(name, f"{side:g} is beyond {LARGEST:g}", "give a smaller number, or inf for no limit")
             if not low < high:
                 yield Problem(
                     f"sets.{kind}_lower[{i}]",
@@ -152,8 +157,6 @@ def _cost(plant: PlantConfig, cost: CostConfig) -> Iterator[Problem]:
     n_x, n_u = dimensions(plant)
     yield from _length("cost.state", cost.state, n_x, "n_x")
     yield from _length("cost.input", cost.input, n_u, "number of axes")
-    if any(weight < 0 for weight in cost.state):
-        yield Problem("cost.state", "a weight is negative", "give numbers >= 0")
     if any(weight <= 0 for weight in cost.input):
         yield Problem("cost.input", "a weight is not positive, so the cost is not strictly convex", "give numbers > 0")
 
@@ -208,7 +211,7 @@ def _link(link: LinkConfig) -> Iterator[Problem]:
         yield from sim_checks.spans(f"link.{name}", getattr(link, name))
 
 
-def _gaps(gaps: Floats) -> Iterator[Problem]:
+def _gaps(gaps: Open) -> Iterator[Problem]:
     todo = "give the shares of the measured runs of 0, 1, 2 … lost packets"
     if not gaps:
         yield Problem("link.gaps", 'is missing, and model "empirical" needs it', todo)
@@ -216,21 +219,25 @@ def _gaps(gaps: Floats) -> Iterator[Problem]:
         yield Problem("link.gaps", f"the entries add up to {math.fsum(gaps):.6g}, probabilities of all runs to 1", todo)
 
 
-def _trace(delays: Floats) -> Iterator[Problem]:
+def _trace(delays: Open) -> Iterator[Problem]:
     if not delays:
         yield Problem("link.trace_file", 'is missing, and model "trace" needs it', "give a file, or link.trace_s")
     elif all(math.isinf(delay) for delay in delays):
         yield Problem("link.trace_s", "every packet is lost", "give a trace in which some arrive")
     for i, delay in enumerate(delays):
-        if delay < 0.0:
-            yield Problem(f"link.trace_s[{i}]", f"{delay:g} is not a delay", "give seconds, or inf for a lost packet")
+        if not (0.0 <= delay <= LONGEST_DELAY_S or math.isinf(delay)) or delay < 0.0:
+            yield Problem(
+                f"link.trace_s[{i}]",
+                f"{delay:g} is not a delay",
+                f"give seconds, at most {LONGEST_DELAY_S:g}, or inf for a lost packet",
+            )
 
 
 def _tick(plant: PlantConfig, daemon: DaemonConfig) -> Iterator[Problem]:
     tick_ns, dt_ns = round(daemon.tick_s * 1e9), round(plant.dt_s * 1e9)
     if tick_ns < 1 or dt_ns % tick_ns:
         least = math.ceil(dt_ns / max(tick_ns, 1))
-        count = next((n for n in range(least, dt_ns) if dt_ns % n == 0), 1)
+        count = next((n for n in range(least, least + _TICKS_TRIED) if dt_ns % n == 0), least)
         yield Problem(
             "daemon.tick_s",
             f"{daemon.tick_s:g} s does not divide plant.dt_s = {plant.dt_s:g} s",

@@ -9,19 +9,22 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from uavctl.config.bounds import oversized
 from uavctl.config.data_file import DataFileError, read_lines
 from uavctl.config.index import key_lines
 from uavctl.config.load import decode, parse_toml
 from uavctl.config.problem import Problem
 from uavctl.config.section import Section
-from uavctl.config.sim import FaultConfig
+from uavctl.config.sim import MOST_FAULTS, FaultConfig
 from uavctl.config.sim_checks import faults
 from uavctl.config.source import Source
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
 
 Check = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[Problem]]
-_Faults = Annotated[tuple[FaultConfig, ...], Meta(description="what happens in the course of a flight")]
+_Faults = Annotated[
+    tuple[FaultConfig, ...], Meta(max_length=MOST_FAULTS, description="what happens in the course of a flight")
+]
 
 
 class _FaultFile(Section, frozen=True, kw_only=True):
@@ -46,7 +49,9 @@ def with_faults(config: Config, path: Path, check: Check) -> Config:
     except DataFileError as error:
         raise ConfigError(error.reasons) from error
     found: list[Problem] = []
-    script = decode(_FaultFile, parse_toml(text, str(path)), "", found, {})
+    table = parse_toml(text, str(path))
+    found.extend(oversized(table))
+    script = None if found else decode(_FaultFile, table, "", found, {})
     given = script.fault if isinstance(script, _FaultFile) else ()
     found.extend(faults("fault", given, config.sim.plant))
     found.extend(check(config.sim.autopilot, given, "fault"))

@@ -22,30 +22,32 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     ground_s: Annotated[
         float,
         Meta(
-            gt=0,
             le=600,
+            ge=0.1,
             description="time that the vehicle and the positions are given to get ready, and then the mode, and then "
             "arming [s]",
         ),
     ] = 60.0
     fresh_s: Annotated[
-        float, Meta(gt=0, le=5, description="nothing is armed while the newest position is older than this [s]")
+        float, Meta(le=5, ge=0.001, description="nothing is armed while the newest position is older than this [s]")
     ] = 1.0
     climb_s: Annotated[
-        float, Meta(gt=0, le=120, description="time for the vehicle's own climb; then it is asked to land [s]")
+        float, Meta(le=120, ge=0.1, description="time for the vehicle's own climb; then it is asked to land [s]")
     ] = 20.0
     reached: Annotated[
-        float, Meta(gt=0, le=1, description="share of the take-off height at which the climb counts as done")
+        float, Meta(le=1, ge=0.01, description="share of the take-off height at which the climb counts as done")
     ] = 0.9
     engage_s: Annotated[
         float,
-        Meta(gt=0, le=60, description="time for the external mode in the air; after a take-off, then it must land [s]"),
+        Meta(
+            le=60, ge=0.1, description="time for the external mode in the air; after a take-off, then it must land [s]"
+        ),
     ] = 5.0
     land_s: Annotated[
-        float, Meta(gt=0, le=600, description="time from the landing mode to disarmed, after a take-off of ours [s]")
+        float, Meta(le=600, ge=0.1, description="time from the landing mode to disarmed, after a take-off of ours [s]")
     ] = 60.0
     disarm_s: Annotated[
-        float, Meta(gt=0, le=60, description="a vehicle that has landed and stays armed so long is disarmed [s]")
+        float, Meta(le=60, ge=0.1, description="a vehicle that has landed and stays armed so long is disarmed [s]")
     ] = 5.0
     origin_deg_m: Annotated[
         Position,

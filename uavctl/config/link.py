@@ -6,13 +6,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Floats, Section, Spans
+from uavctl.config.section import LONGEST_PATH, MOST_SPANS, Open, Section, Spans
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 # Each run length is a state of the design's chain.
 LONGEST_RUN = 100
 # A recording holds its configuration.
 LONGEST_TRACE = 20_000
+LONGEST_DELAY_S = 60.0
 
 
 class LinkConfig(Section, frozen=True, kw_only=True):
@@ -39,9 +40,10 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     probability: Annotated[
         tuple[Probability, ...],
         Meta(
+            max_length=10_000,
             description="with `bernoulli`: known ahead, in place of `loss`: probability that a packet of step k "
             "arrives, k = 0, 1, …, the last one repeated; step k's packets are those of the Δt that ends at k Δt. The "
-            "design, which is one for the whole flight, counts for t steps ahead on the least of those from t on"
+            "design, which is one for the whole flight, counts for t steps ahead on the least of those from t on",
         ),
     ] = ()
     gaps: Annotated[
@@ -55,13 +57,14 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     trace_file: Annotated[
         str,
         Meta(
+            max_length=LONGEST_PATH,
             description="with `trace`: CSV file beside this one (given on the command line: in the folder there) with "
             "one line for each packet in the order of sending: its delay in s, nothing or `inf` for a lost one; of "
-            "several columns, the one headed `delay_s`"
+            "several columns, the one headed `delay_s`",
         ),
     ] = ""
     trace_s: Annotated[
-        Floats,
+        Open,
         Meta(
             max_length=LONGEST_TRACE,
             description="with `trace`: the same delays as a list [s]; after the last packet the first one's follows. "
@@ -80,10 +83,16 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         float,
         Meta(ge=0, le=1, description="with `gilbert-elliott`: loss in the bad state (`loss` applies in the good one)"),
     ] = 1.0
-    delay_s: Annotated[float, Meta(ge=0, description="constant delay of a packet, but with `trace` [s]")] = 0.0
+    delay_s: Annotated[
+        float, Meta(ge=0, le=LONGEST_DELAY_S, description="constant delay of a packet, but with `trace` [s]")
+    ] = 0.0
     jitter_s: Annotated[
         float,
-        Meta(ge=0, description="uniform extra delay from 0 to this, likewise [s]; packets may overtake others"),
+        Meta(
+            ge=0,
+            le=LONGEST_DELAY_S,
+            description="uniform extra delay from 0 to this, likewise [s]; packets may overtake others",
+        ),
     ] = 0.0
     duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
     corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
@@ -93,16 +102,22 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     ] = 0.0
     blackout: Annotated[
         Spans,
-        Meta(description="spans [from_s, to_s] since the start in which every packet is lost [s]"),
+        Meta(
+            max_length=MOST_SPANS, description="spans [from_s, to_s] since the start in which every packet is lost [s]"
+        ),
     ] = ()
     held: Annotated[
         Spans,
         Meta(
+            max_length=MOST_SPANS,
             description="spans [from_s, to_s] since the start in which nothing arrives; what was to arrive comes at "
-            "the end, all at once and in the order of arrival [s]"
+            "the end, all at once and in the order of arrival [s]",
         ),
     ] = ()
     uplink_blackout: Annotated[
         Spans,
-        Meta(description="spans [from_s, to_s] since the start in which nothing that we send reaches the vehicle [s]"),
+        Meta(
+            max_length=MOST_SPANS,
+            description="spans [from_s, to_s] since the start in which nothing that we send reaches the vehicle [s]",
+        ),
     ] = ()

@@ -16,7 +16,9 @@ import msgspec
 from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
+from uavctl.config.bounds import DEEPEST, LONGEST_KEY, excess, oversized
 from uavctl.config.checks import Problem, check
+from uavctl.config.data_file import DataFileError, read_text
 from uavctl.config.dump import dump_config as dump_config
 from uavctl.config.index import key_lines
 from uavctl.config.link import LinkConfig
@@ -41,6 +43,9 @@ _WORDS = {
 _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; everything else is finite
 _LONGEST_VALUE = 40
 _UNKNOWN = "unknown key"
+_MOST_UNKNOWN = 10  # keys of a table that are told one by one
+_MOST_PROBLEMS = 50
+MOST_OVERRIDES = 1000
 
 
 @dataclass(frozen=True)
@@ -80,9 +85,13 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     """
     table = parse_toml(text, file)
     problems: list[str] = []
+    if len(overrides) > MOST_OVERRIDES:
+        raise ConfigError((f"--set: is given {len(overrides)} times, at most {MOST_OVERRIDES} are taken; use a file",))
     applied = tuple(_override(table, override, problems) for override in overrides)
     source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
-    found: list[Problem] = []
+    found: list[Problem] = list(oversized(table))
+    if found:
+        raise ConfigError((*problems, *map(source.tell, found)))
     sections: dict[str, Decoded] = {}
     config = decode(Config, table, "", found, sections)
     mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
@@ -93,7 +102,9 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
         sections |= {"mission": mission, "link": link}
         source = replace(source, elsewhere=of_mission | of_link)
     found.extend(check(sections))
-    problems.extend(source.tell(problem) for problem in found)
+    problems.extend(source.tell(problem) for problem in found[:_MOST_PROBLEMS])
+    if len(found) > _MOST_PROBLEMS:
+        problems.append(f"{file}: {len(found) - _MOST_PROBLEMS} more; mend these first")
     if problems or config is None:
         raise ConfigError(tuple(problems))
     return Loaded(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
@@ -106,7 +117,7 @@ def explain(source: Source, error: DesignError) -> str:
 
 def find_nearest(name: str, names: Sequence[str]) -> str:
     """A hint at the name that was meant, to be put after a wrong one; empty if none is close."""
-    match = difflib.get_close_matches(name, names, n=1)
+    match = difflib.get_close_matches(name, names, n=1) if len(name) <= LONGEST_KEY else []
     return f' (nearest valid name "{match[0]}")' if match else ""
 
 
@@ -115,8 +126,10 @@ def _read(name_or_path: str) -> tuple[str, str]:
         entry = resources.files("uavctl") / "presets" / f"{name_or_path}.toml"
         return str(entry), entry.read_text(encoding="utf-8")
     try:
-        return name_or_path, Path(name_or_path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
+        return name_or_path, read_text(Path(name_or_path))
+    except DataFileError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise ConfigError(tuple(f"{reason}; give a TOML file" for reason in error.reasons)) from error
         known = presets()
         raise ConfigError(
             (
@@ -124,18 +137,17 @@ def _read(name_or_path: str) -> tuple[str, str]:
                 f"give a TOML file, or a preset: {', '.join(known)}",
             )
         ) from error
-    except OSError as error:
-        raise ConfigError((f"{name_or_path}: cannot be read ({error.strerror}); give a TOML file",)) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError((f"{name_or_path}: is not UTF-8 text; save it as UTF-8",)) from error
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
     """The table of a TOML text.
 
     Raises:
-        ConfigError: It is no TOML; file and line are named.
+        ConfigError: It is no TOML, or more than any file of ours; file and line are named.
     """
+    beyond = excess(text)
+    if beyond is not None:
+        raise ConfigError((f"{file}:{beyond[0]}: {beyond[1]}; mend the file",))
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -144,6 +156,8 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         line = place["line"] if place and place["line"] else str(text.count("\n") + 1)
         reason = _SYNTAX_PLACE.sub("", message)
         raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; mend the line",)) from error
+    except ValueError as error:  # a whole number of thousands of digits
+        raise ConfigError((f"{file}:1: TOML: {error}; mend the number",)) from error
 
 
 def _override(table: dict[str, Any], text: str, problems: list[str]) -> tuple[str, str] | None:
@@ -152,6 +166,9 @@ def _override(table: dict[str, Any], text: str, problems: list[str]) -> tuple[st
     parts = path.strip().split(".")
     if not equals or not all(parts):
         problems.append(f"--set {text}: is not an override; write key.path=value, as in link.loss=0.3")
+        return None
+    if len(parts) > DEEPEST or excess(value) is not None:
+        problems.append(f"--set {text}: is nested more than {DEEPEST} deep, or too long; no key is")
         return None
     inner = table
     for depth, part in enumerate(parts[:-1], 1):
@@ -167,7 +184,7 @@ def _override_value(text: str) -> object:
     """A value as TOML writes it; what is none is a string without its quotes."""
     try:
         parsed = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         return text
     return parsed["value"] if len(parsed) == 1 else text
 
@@ -178,7 +195,10 @@ def decode(
     """Decode one table; its problems go to `found`, whole first-level sections to `sections`."""
     fields = {field.encode_name: field for field in msgspec.structs.fields(section)}
     before = len(found)
-    found.extend(_unknown(path + key, key, tuple(fields), path) for key in table if key not in fields)
+    unknown = [key for key in table if key not in fields]
+    found.extend(_unknown(path + key, key, tuple(fields), path) for key in unknown[:_MOST_UNKNOWN])
+    if len(unknown) > _MOST_UNKNOWN:
+        found.append(Problem(path + unknown[_MOST_UNKNOWN], f"{_UNKNOWN}, and {len(unknown)} in all", "remove them"))
     values: dict[str, Any] = {}
     for name, field in fields.items():
         key, value = path + name, table.get(name)
@@ -186,6 +206,9 @@ def decode(
             if field.default is NODEFAULT:
                 found.append(_missing(key, field))
         elif (one := element(field.type)) is not None and isinstance(value, list):
+            if (problem := _too_many(key, value, field)) is not None:
+                found.append(problem)
+                continue
             tables = tuple(_decode_element(one, table, f"{key}[{i}]", found) for i, table in enumerate(value))
             decoded = tuple(one for one in tables if one is not None)
             if len(decoded) == len(tables):
@@ -204,6 +227,13 @@ def decode(
             found.append(Problem(key, f"expected a table, got {_short(value)}", f"write [{key}] and its keys below"))
     usable = all(problem.reason.startswith(_UNKNOWN) for problem in found[before:])
     return section(**values) if usable else None
+
+
+def _too_many(key: str, tables: Sequence[object], field: FieldInfo) -> Problem | None:
+    most = next((meta.max_length for meta in get_args(field.type)[1:] if isinstance(meta, msgspec.Meta)), None)
+    if most is None or len(tables) <= most:
+        return None
+    return Problem(key, f"has {len(tables)} tables", f"give at most {most}")
 
 
 def _decode_element(section: type[Section], value: object, path: str, found: list[Problem]) -> Section | None:
@@ -233,6 +263,10 @@ def _missing(key: str, field: FieldInfo) -> Problem:
 def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
     """What is wrong with a value by its type, if anything."""
     todo = f"give {type_text(field.type)}: {description(field)}"
+    for path, number in _numbers(key, value):
+        if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):
+            yield Problem(path, f"{number} is not a finite number", todo)
+            return
     try:
         msgspec.convert(value, field.type)
     except msgspec.ValidationError as error:
@@ -243,10 +277,6 @@ def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
         for number in re.findall(r"\[(\d+)\]", path):
             got = cast("Sequence[object]", got)[int(number)]
         yield Problem(key + path, _reason(_DECODE_PLACE.sub("", message), got, field), todo)
-    else:
-        for path, number in _numbers(key, value):
-            if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):
-                yield Problem(path, f"{number} is not a finite number", todo)
 
 
 def _reason(message: str, got: object, field: FieldInfo) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Position, Section
+from uavctl.config.section import LONGEST_URL, Position, Section
 
 CAMERAS = ("natnet:",)  # URLs of camera systems that are listened to without a bridge
 CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
@@ -41,6 +41,7 @@ class SourceConfig(Section, frozen=True, kw_only=True):
         ],
         Meta(
             min_length=1,
+            max_length=10,
             description="messages that are taken; LOCAL_POSITION_NED is the vehicle's own estimate only if named",
         ),
     ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
@@ -49,7 +50,11 @@ class SourceConfig(Section, frozen=True, kw_only=True):
     ] = 0
     rate_hz: Annotated[
         float,
-        Meta(ge=0, description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]"),
+        Meta(
+            ge=0,
+            le=1000,
+            description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]",
+        ),
     ] = 0.0
 
 
@@ -57,22 +62,28 @@ class ClockConfig(Section, frozen=True, kw_only=True):
     """The source's clock."""
 
     latency_s: Annotated[
-        float, Meta(ge=0, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]")
+        float,
+        Meta(ge=0, le=60, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]"),
     ] = 0.0
-    window_s: Annotated[float, Meta(gt=0, description="window of the sliding minimum of (received − stamp) [s]")] = 10.0
-    future_tolerance_s: Annotated[float, Meta(ge=0, description="a stamp further in the future is refused [s]")] = 0.02
+    window_s: Annotated[
+        float, Meta(ge=0.001, le=600, description="window of the sliding minimum of (received − stamp) [s]")
+    ] = 10.0
+    future_tolerance_s: Annotated[
+        float, Meta(ge=0, le=60, description="a stamp further in the future is refused [s]")
+    ] = 0.02
 
 
 class DaemonConfig(Section, frozen=True, kw_only=True):
     """The control loop and its connections."""
 
-    tick_s: Annotated[float, Meta(gt=0, le=0.1, description="time between setpoints; divides Δt [s]")]
-    vehicle: Annotated[str, Meta(description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
+    tick_s: Annotated[float, Meta(le=0.1, ge=0.001, description="time between setpoints; divides Δt [s]")]
+    vehicle: Annotated[str, Meta(max_length=LONGEST_URL, description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
     mocap: Annotated[
         str,
         Meta(
+            max_length=LONGEST_URL,
             description="URL of the source of positions; the same URL as the vehicle's is one connection. "
-            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)"
+            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)",
         ),
     ] = "udpin://0.0.0.0:14560"
     system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245

@@ -12,9 +12,9 @@ from uavctl.config.section import Section
 class CheckConfig(Section, frozen=True, kw_only=True):
     """`uavctl check`, and what it has to say before `uavctl fly --arm` arms (docs/check.md)."""
 
-    seconds: Annotated[float, Meta(gt=0, le=600, description="how long positions and vehicle are listened to [s]")] = (
-        8.0
-    )
+    seconds: Annotated[
+        float, Meta(le=600, ge=0.001, description="how long positions and vehicle are listened to [s]")
+    ] = 8.0
     wait_s: Annotated[
         float,
         Meta(
@@ -32,19 +32,28 @@ class CheckConfig(Section, frozen=True, kw_only=True):
         ),
     ] = True
     offset_m: Annotated[
-        float, Meta(gt=0, description="largest distance between the vehicle's own position and the cameras' [m]")
+        float,
+        Meta(ge=0.001, le=1e6, description="largest distance between the vehicle's own position and the cameras' [m]"),
     ] = 0.5
-    move_m: Annotated[float, Meta(gt=0, description="shortest movement of the body that shows axes [m]")] = 0.3
+    move_m: Annotated[
+        float, Meta(ge=0.001, le=1000, description="shortest movement of the body that shows axes [m]")
+    ] = 0.3
     yaw_deg: Annotated[
-        float, Meta(gt=0, le=45, description="largest turn between the cameras' north and the vehicle's [deg]")
+        float, Meta(le=45, ge=0.01, description="largest turn between the cameras' north and the vehicle's [deg]")
     ] = 10.0
     margin_m: Annotated[
-        float, Meta(ge=0, description="how far outside the limits of `sets` a vehicle may stand before a flight [m]")
+        float,
+        Meta(ge=0, le=1000, description="how far outside the limits of `sets` a vehicle may stand before a flight [m]"),
     ] = 0.25
-    battery_v: Annotated[float, Meta(ge=0, description="least voltage of the battery; 0 does not judge it [V]")] = 0.0
+    battery_v: Annotated[
+        float, Meta(ge=0, le=1000, description="least voltage of the battery; 0 does not judge it [V]")
+    ] = 0.0
     accept: Annotated[
         tuple[str, ...],
-        Meta(description="names of items that may fail: they are told, and arming is not refused for them"),
+        Meta(
+            max_length=100,
+            description="names of items that may fail: they are told, and arming is not refused for them",
+        ),
     ] = ()
 
 
@@ -56,4 +65,6 @@ class RelayConfig(Section, frozen=True, kw_only=True):
         Literal["vision-position-estimate", "odometry"],
         Meta(description="as which MAVLink message, in local NED; PX4 and ArduPilot take both"),
     ] = "vision-position-estimate"
-    rate_hz: Annotated[float, Meta(gt=0, description="at most so many a second; the newest are sent [1/s]")] = 50.0
+    rate_hz: Annotated[
+        float, Meta(ge=0.1, le=1000, description="at most so many a second; the newest are sent [1/s]")
+    ] = 50.0

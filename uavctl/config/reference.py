@@ -49,7 +49,8 @@ def type_text(annotation: Any) -> str:
     """A field's type with its limits, in words."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return type_text(arguments[0]) + "".join(_limits(meta) for meta in arguments[1:] if isinstance(meta, Meta))
+        metas = [meta for meta in arguments[1:] if isinstance(meta, Meta)]
+        return type_text(arguments[0]) + "".join(_limits(meta, _unit(arguments[0])) for meta in metas)
     if origin is Literal:
         return " or ".join(f'"{choice}"' for choice in arguments)
     if origin in (Union, types.UnionType):
@@ -77,14 +78,25 @@ def render() -> str:
     return "\n".join((_HEAD, *tables(Config, "")))
 
 
-def _limits(meta: Meta) -> str:
-    bounds = [f"{sign} {value:g}" for sign, value in _bounds(meta) if value is not None]
+def _unit(annotation: Any) -> str:
+    """What a length counts."""
+    return "characters" if annotation is str else "entries"
+
+
+def _limits(meta: Meta, unit: str) -> str:
+    bounds = [
+        f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in _bounds(meta) if value is not None
+    ]
     lengths = [
         f"{word} {value}"
-        for word, value in (("entries: at least", meta.min_length), ("at most", meta.max_length))
+        for word, value in ((f"{unit}: at least", meta.min_length), (_most(meta, unit), meta.max_length))
         if value is not None
     ]
     return f" ({', '.join(bounds + lengths)})" if bounds or lengths else ""
+
+
+def _most(meta: Meta, unit: str) -> str:
+    return f"{unit}: at most" if meta.min_length is None else "at most"
 
 
 def _bounds(meta: Meta) -> tuple[tuple[str, float | None], ...]:

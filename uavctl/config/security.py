@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from uavctl.config.peers import CAMERAS, DaemonConfig
 from uavctl.config.problem import Problem
-from uavctl.config.section import Section
+from uavctl.config.section import LONGEST_PATH, Section
 
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
 
@@ -22,14 +22,16 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
     key_file: Annotated[
         str,
         Meta(
+            max_length=LONGEST_PATH,
             description="file of the signing key, from `/` or `~` on, readable by its owner only (`uavctl key new` "
-            "makes one); empty neither signs nor verifies"
+            "makes one); empty neither signs nor verifies",
         ),
     ] = ""
     require: Annotated[
         tuple[Literal["vehicle", "mocap"], ...],
         Meta(
             min_length=1,
+            max_length=2,
             description="connections on which, with a key, only signed frames are taken and ours are signed; one for "
             'both roles is the "vehicle"',
         ),
@@ -39,18 +41,23 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
     ] = 0
     peer_link_ids: Annotated[
         tuple[Annotated[int, Meta(ge=0, le=255)], ...],
-        Meta(description="link ids that peers may sign with; none takes the first that each one uses"),
+        Meta(max_length=256, description="link ids that peers may sign with; none takes the first that each one uses"),
     ] = ()
     allow: Annotated[
         tuple[str, ...],
         Meta(
+            max_length=1000,
             description="addresses and networks that UDP datagrams are taken from, as in "
-            '`["192.168.7.20", "10.0.0.0/24"]`; none takes anybody\'s'
+            '`["192.168.7.20", "10.0.0.0/24"]`; none takes anybody\'s',
         ),
     ] = ()
     max_datagrams_per_s: Annotated[
         int,
-        Meta(ge=100, description="datagrams a second that are taken of one sender (address and port); UDP only [1/s]"),
+        Meta(
+            ge=100,
+            le=1_000_000,
+            description="datagrams a second that are taken of one sender (address and port); UDP only [1/s]",
+        ),
     ] = 2000
 
 

@@ -6,19 +6,27 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.section import Position, Section, Spans
+from uavctl.config.section import LARGEST_SEED, LONGEST_S, MOST_SPANS, Position, Section, Spans, Wind
+
+MOST_FAULTS = 1000
 
 
 class CameraConfig(Section, frozen=True, kw_only=True):
     """Simulated motion capture."""
 
-    rate_hz: Annotated[float, Meta(gt=0, description="samples a second [1/s]")]
-    phase_s: Annotated[float, Meta(ge=0, description="time of the first sample; then every 1/rate_hz [s]")] = 0.0
-    noise_std_m: Annotated[float, Meta(ge=0, description="noise of a position, each axis [m]")] = 0.0
-    latency_s: Annotated[float, Meta(ge=0, description="processing time in the cameras, before the link [s]")] = 0.0
+    rate_hz: Annotated[float, Meta(ge=0.01, le=1000, description="samples a second [1/s]")]
+    phase_s: Annotated[
+        float, Meta(ge=0, le=LONGEST_S, description="time of the first sample; then every 1/rate_hz [s]")
+    ] = 0.0
+    noise_std_m: Annotated[float, Meta(ge=0, le=1000, description="noise of a position, each axis [m]")] = 0.0
+    latency_s: Annotated[
+        float, Meta(ge=0, le=60, description="processing time in the cameras, before the link [s]")
+    ] = 0.0
     jitter_s: Annotated[
         float,
-        Meta(ge=0, description="uniform extra processing time from 0 to this [s]; samples may overtake each other"),
+        Meta(
+            ge=0, le=60, description="uniform extra processing time from 0 to this [s]; samples may overtake each other"
+        ),
     ] = 0.0
     clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
     clock_drift_ppm: Annotated[
@@ -26,25 +34,36 @@ class CameraConfig(Section, frozen=True, kw_only=True):
         Meta(ge=-1e5, le=1e5, description="what the cameras' clock gains [millionths]; recorded: 1e4 to 3e4"),
     ] = 0.0
     occluded: Annotated[
-        Spans, Meta(description="spans [from_s, to_s] since the start in which the vehicle is not seen: no samples [s]")
+        Spans,
+        Meta(
+            max_length=MOST_SPANS,
+            description="spans [from_s, to_s] since the start in which the vehicle is not seen: no samples [s]",
+        ),
     ] = ()
     occlusions_per_s: Annotated[
-        float, Meta(ge=0, description="random occlusions beside those: how many a second begin while it is seen [1/s]")
+        float,
+        Meta(
+            ge=0, le=100, description="random occlusions beside those: how many a second begin while it is seen [1/s]"
+        ),
     ] = 0.0
-    occlusion_s: Annotated[float, Meta(gt=0, description="their mean length; lengths are exponential [s]")] = 0.5
+    occlusion_s: Annotated[
+        float, Meta(ge=0.001, le=LONGEST_S, description="their mean length; lengths are exponential [s]")
+    ] = 0.5
     swapped: Annotated[
         Spans,
         Meta(
+            max_length=MOST_SPANS,
             description="spans [from_s, to_s] since the start in which another body is taken for the vehicle: it "
-            "stands still at other_body_m, level, its nose north [s]"
+            "stands still at other_body_m, level, its nose north [s]",
         ),
     ] = ()
     other_body_m: Annotated[Position, Meta(description="position of that other body, local NED [m]")] = (0.0, 0.0, 0.0)
     frozen: Annotated[
         Spans,
         Meta(
+            max_length=MOST_SPANS,
             description="spans [from_s, to_s] since the start in which the last sample's pose is repeated, to the last "
-            "bit, with new stamps [s]"
+            "bit, with new stamps [s]",
         ),
     ] = ()
     message: Annotated[
@@ -56,7 +75,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
 class WindConfig(Section, frozen=True, kw_only=True):
     """Wind of the simulated quadrotor: steady, with Dryden gusts (docs/vehicle.md)."""
 
-    velocity_mps: Annotated[Position, Meta(description="steady wind: velocity of the air, local NED [m/s]")] = (
+    velocity_mps: Annotated[Wind, Meta(description="steady wind: velocity of the air, local NED [m/s]")] = (
         0.0,
         0.0,
         0.0,
@@ -70,7 +89,9 @@ class WindConfig(Section, frozen=True, kw_only=True):
             "[m/s]",
         ),
     ] = 0.0
-    height_m: Annotated[float, Meta(gt=0, description="height for which the gusts' scales are taken [m]")] = 2.0
+    height_m: Annotated[
+        float, Meta(ge=0.01, le=1000, description="height for which the gusts' scales are taken [m]")
+    ] = 2.0
 
 
 class QuadrotorConfig(Section, frozen=True, kw_only=True):
@@ -82,7 +103,7 @@ class QuadrotorConfig(Section, frozen=True, kw_only=True):
 class FaultConfig(Section, frozen=True, kw_only=True):
     """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
-    at_s: Annotated[float, Meta(ge=0, description="when, since the start [s]")]
+    at_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="when, since the start [s]")]
     kind: Annotated[
         Literal[
             "blackout",
@@ -106,8 +127,8 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "pilot changes the autopilot's mode with the stick"
         ),
     ]
-    for_s: Annotated[float, Meta(ge=0, description="length of a span [s]")] = 0.0
-    velocity_mps: Annotated[Position, Meta(description="of the air from then on, with `wind`, local NED [m/s]")] = (
+    for_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="length of a span [s]")] = 0.0
+    velocity_mps: Annotated[Wind, Meta(description="of the air from then on, with `wind`, local NED [m/s]")] = (
         0.0,
         0.0,
         0.0,
@@ -116,12 +137,15 @@ class FaultConfig(Section, frozen=True, kw_only=True):
     name: Annotated[
         str,
         Meta(
+            max_length=100,
             description="of the parameter, or of the mode as the autopilot calls it; of the axes: `turned-90`, "
             "`turned-180`, `turned-270`, `mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, "
-            "`millimetres`, `kilometres`, or `right`"
+            "`millimetres`, `kilometres`, or `right`",
         ),
     ] = ""
-    value: Annotated[float, Meta(description="of the parameter, or the noise's standard deviation [m]")] = 0.0
+    value: Annotated[
+        float, Meta(ge=-1e9, le=1e9, description="of the parameter, or the noise's standard deviation [m]")
+    ] = 0.0
 
 
 class SimConfig(Section, frozen=True, kw_only=True):
@@ -140,17 +164,19 @@ class SimConfig(Section, frozen=True, kw_only=True):
     autopilot: Annotated[
         Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
     ] = "px4"
-    fault: Annotated[tuple[FaultConfig, ...], Meta(description="what happens in the course of a flight")] = ()
+    fault: Annotated[
+        tuple[FaultConfig, ...], Meta(max_length=MOST_FAULTS, description="what happens in the course of a flight")
+    ] = ()
     system_id: Annotated[int, Meta(ge=1, le=250, description="MAVLink system id of the simulated vehicle")] = 1
-    seed: Annotated[int, Meta(ge=0, description="seed of every random draw")] = 0
+    seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
-    start_velocity_mps: Annotated[Position, Meta(description="velocity at the start, local NED [m/s]")] = (
+    start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (
         0.0,
         0.0,
         0.0,
     )
     setpoint_timeout_s: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
+        Annotated[float, Meta(ge=0.01, le=3600)] | None,
         Meta(
             description="silence after which setpoints count as gone [s]; without it the autopilot's own: 1 s with PX4 "
             "(COM_OF_LOSS_T), 3 s with ArduPilot (GUID_TIMEOUT)"

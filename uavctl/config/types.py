@@ -17,12 +17,15 @@ from uavctl.config.mission import FenceConfig as FenceConfig
 from uavctl.config.mission import MissionConfig as MissionConfig
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.preflight import CheckConfig, RelayConfig
+from uavctl.config.section import LARGEST_PLANT, LONGEST_S, Open, Weights
 from uavctl.config.section import Floats as Floats
 from uavctl.config.section import Position as Position
 from uavctl.config.section import Rows as Rows
 from uavctl.config.section import Section as Section
 from uavctl.config.security import SecurityConfig as SecurityConfig
 from uavctl.config.sim import SimConfig
+
+Delay = Annotated[int, Meta(le=60)]
 
 
 class PlantConfig(Section, frozen=True, kw_only=True):
@@ -32,7 +35,7 @@ class PlantConfig(Section, frozen=True, kw_only=True):
         Literal["matrices", "drag-lag"],
         Meta(description="`matrices`: a, b, e, w as given; `drag-lag`: made from drag_1ps, lag_s, gain, wind_std_mps2"),
     ]
-    dt_s: Annotated[float, Meta(gt=0, description="time step Δt [s]")]
+    dt_s: Annotated[float, Meta(ge=0.001, le=100, description="time step Δt [s]")]
     axes: Annotated[
         tuple[Literal["north", "east", "down"], ...],
         Meta(
@@ -41,47 +44,60 @@ class PlantConfig(Section, frozen=True, kw_only=True):
             description="axes of local NED that the plant moves in, in the order of its states",
         ),
     ]
-    a: Annotated[Rows, Meta(description="A (n_x, n_x), with model `matrices`")] = ()
-    b: Annotated[Rows, Meta(description="B (n_x, n_u), with model `matrices`")] = ()
-    e: Annotated[Rows, Meta(description="E (n_x, n_w), with model `matrices`")] = ()
-    w: Annotated[Rows, Meta(description="covariance W (n_w, n_w) of the disturbance, with model `matrices`")] = ()
+    a: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="A (n_x, n_x), with model `matrices`")] = ()
+    b: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="B (n_x, n_u), with model `matrices`")] = ()
+    e: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="E (n_x, n_w), with model `matrices`")] = ()
+    w: Annotated[
+        Rows,
+        Meta(max_length=LARGEST_PLANT, description="covariance W (n_w, n_w) of the disturbance, with model `matrices`"),
+    ] = ()
     position_index: Annotated[
-        tuple[int, ...], Meta(description="state index of each axis' position, with model `matrices`")
+        tuple[int, ...], Meta(max_length=3, description="state index of each axis' position, with model `matrices`")
     ] = ()
     velocity_index: Annotated[
-        tuple[int, ...], Meta(description="state index of each axis' velocity, with model `matrices`")
+        tuple[int, ...], Meta(max_length=3, description="state index of each axis' velocity, with model `matrices`")
     ] = ()
     accel_per_input: Annotated[
         Floats,
-        Meta(description="acceleration setpoint per unit of input, each axis [m/s² per unit], with model `matrices`"),
+        Meta(
+            max_length=3,
+            description="acceleration setpoint per unit of input, each axis [m/s² per unit], with model `matrices`",
+        ),
     ] = ()
-    drag_1ps: Annotated[Floats, Meta(description="drag c of each axis [1/s], with model `drag-lag`")] = ()
-    lag_s: Annotated[Floats, Meta(description="acceleration lag T of each axis [s], with model `drag-lag`")] = ()
+    drag_1ps: Annotated[Floats, Meta(max_length=3, description="drag c of each axis [1/s], with model `drag-lag`")] = ()
+    lag_s: Annotated[
+        Floats, Meta(max_length=3, description="acceleration lag T of each axis [s], with model `drag-lag`")
+    ] = ()
     gain: Annotated[
-        Floats, Meta(description="acceleration reached per acceleration asked for, with model `drag-lag`")
+        Floats, Meta(max_length=3, description="acceleration reached per acceleration asked for, with model `drag-lag`")
     ] = ()
     wind_std_mps2: Annotated[
         Floats,
         Meta(
-            description="standard deviation of the acceleration noise, constant over Δt [m/s²], with model `drag-lag`"
+            max_length=3,
+            description="standard deviation of the acceleration noise, constant over Δt [m/s²], with model `drag-lag`",
         ),
     ] = ()
 
 
 class SetsConfig(Section, frozen=True, kw_only=True):
-    """Admissible boxes X and U; `inf` leaves a side open."""
+    """Admissible boxes X and U; `inf` leaves a side open, any other number is 1e7 at most."""
 
-    state_lower: Annotated[Floats, Meta(description="lower limits of the states (n_x) [m, m/s, m/s²]")]
-    state_upper: Annotated[Floats, Meta(description="upper limits of the states (n_x) [m, m/s, m/s²]")]
-    input_lower: Annotated[Floats, Meta(description="lower limits of the inputs (n_u) [input units]")]
-    input_upper: Annotated[Floats, Meta(description="upper limits of the inputs (n_u) [input units]")]
+    state_lower: Annotated[
+        Open, Meta(max_length=LARGEST_PLANT, description="lower limits of the states (n_x) [m, m/s, m/s²]")
+    ]
+    state_upper: Annotated[
+        Open, Meta(max_length=LARGEST_PLANT, description="upper limits of the states (n_x) [m, m/s, m/s²]")
+    ]
+    input_lower: Annotated[Open, Meta(max_length=3, description="lower limits of the inputs (n_u) [input units]")]
+    input_upper: Annotated[Open, Meta(max_length=3, description="upper limits of the inputs (n_u) [input units]")]
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
     """Stage cost (3), diagonal weights."""
 
-    state: Annotated[Floats, Meta(description="diagonal of Q_x (n_x)")]
-    input: Annotated[Floats, Meta(description="diagonal of Q_u (n_u)")]
+    state: Annotated[Weights, Meta(max_length=LARGEST_PLANT, description="diagonal of Q_x (n_x)")]
+    input: Annotated[Weights, Meta(max_length=3, description="diagonal of Q_u (n_u)")]
 
 
 class SmpcConfig(Section, frozen=True, kw_only=True):
@@ -92,18 +108,24 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")]
     delta_u: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_u of the input constraints")]
     delta_tau: Annotated[float, Meta(gt=0, lt=1, description="threshold δ_τ of Assumption 4.1")]
-    k_tau: Annotated[Rows, Meta(description="terminal gain K_τ (n_u, n_x)")]
+    k_tau: Annotated[Rows, Meta(max_length=3, description="terminal gain K_τ (n_u, n_x)")]
     slack_linear: Annotated[
-        float, Meta(gt=0, description="exact penalty of a state-constraint slack, linear [cost per unit]")
+        float, Meta(ge=1e-6, le=1e12, description="exact penalty of a state-constraint slack, linear [cost per unit]")
     ]
-    slack_quadratic: Annotated[float, Meta(gt=0, description="the same, quadratic [cost per unit²]")]
+    slack_quadratic: Annotated[float, Meta(ge=1e-6, le=1e12, description="the same, quadratic [cost per unit²]")]
     offset_weight: Annotated[
-        float, Meta(gt=0, description="l1 weight T that pulls the artificial reference to the target [cost per unit]")
+        float,
+        Meta(
+            ge=1e-6,
+            le=1e12,
+            description="l1 weight T that pulls the artificial reference to the target [cost per unit]",
+        ),
     ]
     terminal_weight: Annotated[
         float,
         Meta(
-            gt=0,
+            ge=1e-6,
+            le=1e12,
             description="l1 weight of a missed terminal equality, when no equilibrium is in reach [cost per unit]",
         ),
     ] = 1e5
@@ -117,12 +139,15 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
         Meta(description="`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"),
     ] = "fixed"
     delays: Annotated[
-        int | tuple[int, ...], Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]")
+        Delay | Annotated[tuple[Delay, ...], Meta(max_length=60)],
+        Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]"),
     ] = 0
     gamma_max: Annotated[float, Meta(gt=0, lt=1, description="`search` and `greedy` keep every γ at or below this")] = (
         0.985
     )
-    search_states: Annotated[Rows, Meta(description="states (n_x each) over whose mean cost `search` minimises")] = ()
+    search_states: Annotated[
+        Rows, Meta(max_length=200, description="states (n_x each) over whose mean cost `search` minimises")
+    ] = ()
     joint: Annotated[
         bool,
         Meta(
@@ -193,37 +218,45 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     """Kalman filter."""
 
     position_std_m: Annotated[
-        float, Meta(gt=0, description="least standard deviation believed of a position sample, each axis [m]")
+        float,
+        Meta(ge=1e-9, le=100, description="least standard deviation believed of a position sample, each axis [m]"),
     ]
     velocity_std_mps: Annotated[
-        float, Meta(gt=0, description="standard deviation of a velocity sample, each axis [m/s]")
+        float, Meta(ge=1e-9, le=100, description="standard deviation of a velocity sample, each axis [m/s]")
     ] = 0.05
     initial_std: Annotated[
         float,
-        Meta(gt=0, description="standard deviation of the states that the first sample does not show [m/s, m/s²]"),
+        Meta(
+            ge=1e-9,
+            le=1000,
+            description="standard deviation of the states that the first sample does not show [m/s, m/s²]",
+        ),
     ] = 0.5
-    window_s: Annotated[float, Meta(gt=0, description="samples later than this are dropped [s]")] = 2.0
+    window_s: Annotated[float, Meta(ge=0.001, le=60, description="samples later than this are dropped [s]")] = 2.0
     max_position_m: Annotated[
-        float, Meta(gt=0, description="a position further out, in any axis, is absurd and counts as lost [m]")
+        float,
+        Meta(ge=0.001, le=1e7, description="a position further out, in any axis, is absurd and counts as lost [m]"),
     ] = 1000.0
     max_velocity_mps: Annotated[
-        float, Meta(gt=0, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
+        float, Meta(ge=0.001, le=1e7, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
     ] = 100.0
     gate_sigma: Annotated[
         float,
         Meta(
-            gt=0,
+            ge=0.001,
+            le=1e6,
             description="a position further from the prediction than this many standard deviations, gate_m, and what "
             "inputs can have done since the newest one, counts as lost",
         ),
     ] = 6.0
     gate_m: Annotated[
-        float, Meta(ge=0, description="margin of that for what the model does not know, as gusts [m]")
+        float, Meta(ge=0, le=1e6, description="margin of that for what the model does not know, as gusts [m]")
     ] = 0.3
     bias_drift: Annotated[
         float,
         Meta(
             ge=0,
+            le=1000,
             description="standard deviation of what an unknown acceleration that stays (wind, uncompensated drag, an "
             "error of the hover thrust) gains in a second, each input; the filter estimates it, and it is flown "
             "against; 0: there is none, as printed [input units/√s]",
@@ -233,6 +266,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         float,
         Meta(
             ge=0,
+            le=1000,
             description="largest part of it that is flown against, and what plans leave free of each input for that; "
             "with bias_drift above 0 [input units]",
         ),
@@ -242,17 +276,22 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
 class FallbackConfig(Section, frozen=True, kw_only=True):
     """What takes over when the age of information reaches H."""
 
-    brake_gain_1ps: Annotated[float, Meta(gt=0, description="deceleration per predicted speed while braking [1/s]")] = (
-        1.5
+    brake_gain_1ps: Annotated[
+        float, Meta(ge=1e-6, le=1000, description="deceleration per predicted speed while braking [1/s]")
+    ] = 1.5
+    brake_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="longest time of braking on the prediction [s]")] = (
+        2.0
     )
-    brake_s: Annotated[float, Meta(ge=0, description="longest time of braking on the prediction [s]")] = 2.0
-    hold_s: Annotated[float, Meta(ge=0, description="then zero acceleration for this long [s]")] = 3.0
+    hold_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="then zero acceleration for this long [s]")] = 3.0
     land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
-    recover_samples: Annotated[int, Meta(ge=1, description="fresh samples in a row before plans are flown again")] = 3
+    recover_samples: Annotated[
+        int, Meta(ge=1, le=1000, description="fresh samples in a row before plans are flown again")
+    ] = 3
     jump_s: Annotated[
         float,
         Meta(
-            gt=0,
+            ge=0.001,
+            le=60,
             description="positions that the vehicle cannot have come to, and that agree for this long, are a source "
             "that moved: brake and land, and plans are not flown again [s]",
         ),
@@ -265,10 +304,12 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
     accel_mps2: Annotated[
         Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")
     ]
-    slew_mps3: Annotated[float, Meta(gt=0, description="largest change of a setpoint in a second, each axis [m/s³]")]
+    slew_mps3: Annotated[
+        float, Meta(ge=1e-6, le=1e6, description="largest change of a setpoint in a second, each axis [m/s³]")
+    ]
 
 
-Bound = Annotated[float, Meta(gt=0)] | None
+Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
@@ -301,8 +342,8 @@ class EnvelopeConfig(Section, frozen=True, kw_only=True):
 class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
-    name: Annotated[str, Meta(description="name of the configuration")]
-    duration_s: Annotated[float, Meta(gt=0, description="length of a loopback flight [s]")]
+    name: Annotated[str, Meta(max_length=100, description="name of the configuration")]
+    duration_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="length of a loopback flight [s]")]
     plant: PlantConfig
     sets: SetsConfig
     cost: CostConfig
@@ -327,4 +368,4 @@ class Config(Section, frozen=True, kw_only=True):
     security: SecurityConfig = SecurityConfig()
     log: LogConfig = LogConfig()
     mission: MissionConfig = MissionConfig()
-    fence: Annotated[tuple[FenceConfig, ...], Meta(description="limits that change in flight")] = ()
+    fence: Annotated[tuple[FenceConfig, ...], Meta(max_length=50, description="limits that change in flight")] = ()

@@ -48,6 +48,7 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
     mute: bool = False  # nothing may be sent in this tick
 
 
+MISSION_OVER = "the mission is over: landing"
 _FINAL = {
     End.BARRED: "positions jumped and are not believed any more",
     End.LET_GO: "what is seen cannot be",
@@ -127,7 +128,7 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     state = replace(state, mission=mission)
     if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
-        return _fall(state, landing, tick, inp, controller, "the mission is over: landing")
+        return _fall(state, landing, tick, inp, controller, MISSION_OVER)
     choice = _replan(state, mission, base, tick, controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:

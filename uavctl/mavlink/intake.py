@@ -73,6 +73,10 @@ class PositionIntake:
         wanted = self._latest_address if address is None else address
         return None if wanted is None else self._round_trips.get(wanted)
 
+    def knows_clocks(self, at_ns: int) -> bool:
+        """Whether every peer that answers has given an answer lately by which its clock is known."""
+        return all(trips.offset_ns(at_ns) is not None for trips in self._round_trips.values())
+
     def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to a TIMESYNC request."""
         trips = self._round_trips.get(address)

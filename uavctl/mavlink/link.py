@@ -16,7 +16,7 @@ from uavctl.mavlink.clocksync import RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import BadBytes
-from uavctl.mavlink.intake import PositionIntake
+from uavctl.mavlink.intake import SLOW_ANSWER, PositionIntake
 from uavctl.mavlink.messages import Ack, Message, Position, Text, TimeSync
 from uavctl.mavlink.modes import HABITS
 from uavctl.mavlink.relay import Relay
@@ -35,6 +35,7 @@ OPEN_REQUESTS = 8  # requests whose answers are still taken
 # Others' requests that are answered within a time: a flood of them makes none of answers, and takes no tick its time.
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
+SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
 UNANSWERED = "timesync-flood"
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
@@ -79,6 +80,8 @@ class Link:
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
+        self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
+        self._slow_told_ns: int | None = None
         self._resyncs_told = 0
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
@@ -311,7 +314,9 @@ class Link:
 
     def _count(self, reason: str, count: int = 1) -> None:
         self._bad[reason] += count
-        if reason not in _USUAL:
+        if reason == SLOW_ANSWER:
+            self._slow += count
+        elif reason not in _USUAL:
             self._untold[reason] += count
 
     def _tell(self, at_ns: int) -> tuple[Event, ...]:
@@ -321,11 +326,24 @@ class Link:
             self._resyncs_told = self._intake.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
+            self._slow_told_ns = at_ns
+            events.append(self._slow_answers(at_ns))
+            self._slow = 0
         if self._untold and (self._told_ns is None or at_ns - self._told_ns >= SECOND_NS):
             self._told_ns = at_ns
             events.extend(self._dropped(at_ns))
             self._untold.clear()
         return tuple(events)
+
+    def _slow_answers(self, at_ns: int) -> Event:
+        """Answers to TIMESYNC that a busy machine or link made too slow to measure by: no trouble while others do."""
+        known = self._intake.knows_clocks(at_ns)
+        text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
+            "stays known by the others" if known else "is not known by them any more"
+        )
+        severity = Severity.INFO if known else Severity.WARNING
+        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow)
 
     def _dropped(self, at_ns: int) -> list[Event]:
         events = []

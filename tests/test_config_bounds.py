@@ -1,0 +1,280 @@
+"""What is beyond all bounds is refused with its place before work begins: depths, lengths, magnitudes, files."""
+
+from __future__ import annotations
+
+import os
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+from config_mutants import CONFIG, Case, Mutants, bases, ranges
+
+from uavctl.campaign.read import read_campaign
+from uavctl.cli.app import run
+from uavctl.config import Config, dump_config, load, load_config, parse
+from uavctl.config.bounds import DEEPEST, LONGEST_LIST, MOST_BYTES, MOST_VALUES, excess
+from uavctl.config.data_file import DataFileError, read_text
+from uavctl.config.link import LONGEST_TRACE
+from uavctl.config.mission import TrajectoryConfig
+from uavctl.config.section import LONGEST_MOTION
+from uavctl.errors import ConfigError
+
+PAPER = dump_config(load_config("paper"))
+SEED, CONFIGS, LINES = 7, 120, 80
+FENCE = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [20.0]\n'
+
+
+def told(text: str, *overrides: str) -> tuple[str, ...]:
+    with pytest.raises(ConfigError) as caught:
+        parse(text, "my.toml", overrides)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize("brackets", ["[]", "{}"])
+@pytest.mark.parametrize("depth", [DEEPEST + 1, 500, 200_000])
+def test_deep_nesting_is_refused_with_its_line(brackets: str, depth: int) -> None:
+    opened = brackets[0] if brackets == "[]" else "{a="
+    text = PAPER + f"\n[extra]\ndeep = {opened * depth}1{brackets[1] * depth}\n"
+    (problem,) = told(text)
+    line = text.splitlines().index("[extra]") + 2
+    assert problem.startswith(f"my.toml:{line}: ") and f"more than {DEEPEST} deep" in problem
+
+
+@pytest.mark.parametrize("value", ["[" * 5000 + "]" * 5000, "{a=" * 5000 + "1" + "}" * 5000])
+def test_deep_nesting_of_an_override_is_refused(value: str) -> None:
+    (problem,) = told(PAPER, f"link.loss={value}")
+    assert problem.startswith("--set link.loss=") and "deep" in problem
+
+
+@pytest.mark.parametrize("parts", [DEEPEST + 1, 3000])
+def test_dotted_keys_are_as_deep_as_brackets(parts: int) -> None:
+    path = ".".join("a" * parts)
+    assert "deep" in told(f"{path} = 1\n" + PAPER)[0]
+    assert "deep" in told(PAPER, f"{path}=1")[0]
+
+
+def test_brackets_in_strings_and_comments_are_none() -> None:
+    assert excess(f'a = "{"[" * 50}"\nb = \'{"{" * 50}\'\n# {"[" * 50}\nc = """\n{"[" * 50}"""\n') is None
+    assert excess("a = [\n" * (DEEPEST + 1)) == (
+        DEEPEST + 1,
+        f"brackets are nested more than {DEEPEST} deep, or not closed",
+    )
+
+
+def test_long_texts_are_refused_before_they_are_read_as_toml() -> None:
+    (problem,) = told(f'name = "{"a" * MOST_BYTES}"\n')
+    assert problem.startswith("my.toml:1: ") and "characters" in problem
+    (problem,) = told("a = 1\n" * (MOST_VALUES + 1))  # a key that is there twice, were it read
+    assert f"more than {MOST_VALUES}" in problem
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("estimator.position_std_m=1e300", "estimator.position_std_m"),
+        ("link.delay_s=1e9", "link.delay_s"),
+        (f'name="{"a" * 2000}"', "name"),
+        ('name="a\\u001b[2J"', "name"),
+        (f"mission.waypoints=[{'[0,0,-1],' * 1001}]", "mission.waypoints"),
+        (f"mission.waypoints=[{'[0,0,-1],' * (LONGEST_LIST + 1)}]", "mission.waypoints"),
+        ("daemon.tick_s=1e-9", "daemon.tick_s"),
+        ("plant.dt_s=1e6", "plant.dt_s"),
+        (f"sim.seed={2**70}", "sim.seed"),
+        (f"sim.seed=0x{'f' * 5000}", "sim.seed"),
+        ("sets.state_upper=[1e300,8,50,8]", "sets.state_upper[0]"),
+        ("link.trace_s=[1e9]", "link.trace_s[0]"),
+        ("cost.input=[1e300,1]", "cost.input[0]"),
+        ("sim.camera.rate_hz=1e9", "sim.camera.rate_hz"),
+    ],
+)
+def test_what_no_key_takes_is_told_with_the_key(override: str, key: str) -> None:
+    model = ("link.model=trace",) if "trace_s" in override else ()
+    problems = told(PAPER, *model, override)
+    assert any(f": {key}: " in problem for problem in problems), problems
+
+
+def test_numbers_of_thousands_of_digits_are_refused() -> None:
+    assert told(PAPER + f"\n[x]\ny = {'9' * 5000}\n")[0].startswith("my.toml:")
+
+
+def test_more_fences_than_a_flight_has_are_refused_at_once() -> None:
+    most = PAPER.replace("fence = []\n", "") + FENCE * 50
+    assert len(parse(most, "my.toml").config.fence) == 50
+    assert "fence: has 51 tables; give at most 50" in told(most + FENCE)[0]
+
+
+def test_a_tick_that_divides_no_step_is_refused_after_few_tries() -> None:
+    # 99.999999937 s is 99999999937 ns, whose only divisors are large: no tick of a millisecond or more divides it.
+    problems = told(PAPER, "plant.dt_s=99.999999937", "daemon.tick_s=0.001")
+    assert any("daemon.tick_s: 0.001 s does not divide" in problem for problem in problems)
+
+
+def test_many_unknown_keys_are_told_in_short() -> None:
+    problems = told("\n".join(f"key{i} = 1" for i in range(5000)) + "\n" + PAPER)
+    assert len(problems) < 20 and any("5000 in all" in problem for problem in problems)
+
+
+def test_a_longest_trace_and_motion_still_make_a_configuration_that_can_be_read_back() -> None:
+    config = load_config("paper")
+    places = tuple((i / 3.0e-3 % 20.0, -i / 7.0e-3 % 20.0, 0.1 / 3.0) for i in range(LONGEST_MOTION))
+    motion = TrajectoryConfig(
+        times_s=tuple(i / 3.0 for i in range(LONGEST_MOTION)), positions_m=places, velocities_mps=places
+    )
+    trace = tuple(0.1 / 3.0 + i * 1e-9 / 3.0 for i in range(LONGEST_TRACE))
+    config = msgspec.structs.replace(
+        config,
+        mission=msgspec.structs.replace(config.mission, trajectory=motion),
+        link=msgspec.structs.replace(config.link, model="trace", trace_s=trace),
+    )
+    assert excess(dump_config(config)) is None
+
+
+def test_every_number_has_a_range() -> None:
+    found = dict(ranges(Config))
+    assert len(found) > 90
+    unbounded = [path for path, (low, high, _) in found.items() if not -1e16 < low < high < 1e16]
+    assert unbounded == []
+
+
+@pytest.mark.parametrize("depth", [DEEPEST + 1, 5000])
+def test_a_campaign_that_nests_deep_is_refused(depth: int, tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(f'name = "deep"\ndeep = {"[" * depth}{"]" * depth}\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"c.toml:2: brackets are nested more than {DEEPEST} deep"):
+        read_campaign(path)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    """A pipe that nobody writes to."""
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    return path
+
+
+@pytest.mark.parametrize("device", ["/dev/zero", "/dev/null"])
+def test_devices_are_not_read(device: str) -> None:
+    with pytest.raises(DataFileError, match="pipe or a device"):
+        read_text(Path(device))
+    with pytest.raises(ConfigError, match="pipe or a device"):
+        load(device)
+
+
+def test_a_pipe_is_not_waited_for(pipe: Path) -> None:
+    for read in (read_text, read_campaign):
+        with pytest.raises((DataFileError, ConfigError), match="pipe or a device"):
+            read(pipe)
+    with pytest.raises(ConfigError, match=r"mission\.trajectory\.file: .*pipe or a device"):
+        load("paper", [f"mission.trajectory.file={pipe}"])
+    assert run(["log", "info", str(pipe)]) == 2
+
+
+def test_a_long_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
+    path = tmp_path / "long.csv"
+    path.write_bytes(b"0" * (MOST_BYTES + 1))
+    with pytest.raises(DataFileError, match=f"longer than {MOST_BYTES}"):
+        read_text(path)
+
+
+# --- command lines ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["loopback", "--duration", "1e300"],
+        ["loopback", "--duration", "nan"],
+        ["loopback", "--seed", "-1"],
+        ["loopback", "--seed", "9" * 30],
+        ["loopback", "--arm", "--takeoff", "inf"],
+        ["fly", "--duration", "1e300"],
+        ["fly", "--live", "--live-port", "99999"],
+        ["check", "--seconds", "nan"],
+        ["paper", "--runs", "9" * 20],
+        ["paper", "--steps", "9" * 20],
+        ["bench", "--states", "9" * 20],
+        ["bench", "--plot", "a" * 5000],
+        ["design", "--synthesize", "--states", "9" * 20],
+        ["design", "--config", "a" * 5000],
+        ["design", "--set", "a=" + "b" * 100_000],
+        ["log", "info", "a" * 5000],
+        ["log", "compare", "a" * 5000, "b"],
+    ],
+)
+def test_odd_values_are_refused_in_one_short_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(words) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and told.count("\n") == 1 and len(told) < 1200
+
+
+def test_what_is_told_does_not_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["design", "--set", "a\nb\x1b[2J\u202e=1"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "\x1b[2J" not in told and "\u202e" not in told and r"\x1b[2J" in told
+
+
+def test_a_campaign_is_bounded_by_its_product(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    tables = "".join(f'[[controller]]\nname = "{i}"\nkind = "lqg"\n[[link]]\nname = "l{i}"\n' for i in range(100))
+    many = "".join(f'[[disturbance]]\nname = "{i}"\n' for i in range(10))
+    path.write_text('name = "big"\nconfig = "paper"\nsteps = 100000\n' + tables + many, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        read_campaign(path)
+    told = "\n".join(caught.value.problems)
+    assert "10000 designs" in told and "100000 cells" in told and "steps: 100000 steps of 1000 runs" in told
+
+
+# --- a slice of tools/fuzz_config.py ---------------------------------------------------------------------------------
+
+
+def lay_out(case: Case, folder: Path) -> None:
+    for name, content in case.files.items():
+        if content is None:
+            os.mkfifo(folder / name)
+        else:
+            data = content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
+            (folder / name).write_bytes(data)
+
+
+def quick(words: list[str]) -> list[str]:
+    """The same configuration without a flight, a socket or a policy library."""
+    if words[0] not in ("design", "solve"):
+        given = [word for pair in pairwise(words) if pair[0] == "--set" for word in pair]
+        words = ["design", "--config", CONFIG, *given]
+    return [*words, "--set", "solver.method=exact"]
+
+
+def test_a_slice_of_spoilt_configurations_ends_in_an_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mutants, codes = Mutants(SEED, bases()), set()
+    for number in range(CONFIGS):
+        case, folder = mutants.config(number), tmp_path / str(number)
+        folder.mkdir()
+        lay_out(case, folder)
+        monkeypatch.chdir(folder)
+        if CONFIG in case.files:
+            codes.add(run(quick(case.words)))  # whatever escapes is the finding
+            told = capsys.readouterr().err
+            assert re.fullmatch(r"(error: .{1,1100}\n(.{1,1100}\n)*)?", told), (number, case.note)
+    assert codes <= {0, 1, 2} and {0, 2} <= codes
+
+
+def test_a_slice_of_spoilt_command_lines_ends_in_an_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mutants, codes = Mutants(SEED, bases()), set()
+    for number in range(LINES):
+        case, folder = mutants.command_line(number), tmp_path / str(number)
+        if case.words[0] in ("design", "solve", "log", "ctl", "key"):
+            folder.mkdir()
+            lay_out(case, folder)
+            monkeypatch.chdir(folder)
+            codes.add(run(case.words))
+    capsys.readouterr()
+    assert codes <= {0, 1, 2} and 2 in codes
