@@ -38,6 +38,7 @@ from uavctl.data import (
 )
 from uavctl.errors import RecordingError
 from uavctl.flight.decide import MISSION_OVER
+from uavctl.flight.envelope import BREACHES
 
 R = TypeVar("R", bound=Record)
 
@@ -140,6 +141,11 @@ class FlightData:
     def stopped_ns(self) -> int | None:
         """When the operator asked for the hand-over [ns]; None if nobody did."""
         return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+
+    @cached_property
+    def breach(self) -> Event | None:
+        """What the envelope found that cannot be, for which the vehicle was let go."""
+        return next((one for one in self.events if one.code in BREACHES), None)
 
     @cached_property
     def landing(self) -> Landing | None:

@@ -38,6 +38,7 @@ class Ending(StrEnum):
 
     FLYING = "flying"  # the recording ends in flight
     LANDED = "landed by the fallback"
+    LET_GO = "let go by the envelope"
     ORDERED = "landed as ordered"
     MISSION_OVER = "landed at the end of the mission"
     HANDED_OVER = "handed over by the operator"
@@ -81,6 +82,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     final_error_m: float | None  # distance from the target at the last flown boundary
     recorder_dropped: int  # records that the disk was too slow for
     ended: Ending
+    let_go: str | None  # why the envelope let the vehicle go
     breaks_off: bool = False  # the recording was not closed in order
 
 
@@ -137,6 +139,7 @@ def summarise(
         final_error_m=float(error_m[-1]) if len(error_m) else None,
         recorder_dropped=recorder_dropped,
         ended=_ending(flight),
+        let_go=None if flight.breach is None else flight.breach.text,
         breaks_off=flight.breaks_off,
     )
 
@@ -214,6 +217,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     found = [
         ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
         ("Ended", f"{s.ended.value}; the recording breaks off" if s.breaks_off else s.ended.value),
+        *(() if s.let_go is None else (("Let go", s.let_go),)),
         ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
         ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),
@@ -269,6 +273,8 @@ def count(amount: int, noun: str) -> str:
 
 def _ending(flight: FlightData) -> Ending:
     modes = [decision.mode for decision in flight.flown]
+    if flight.breach is not None:
+        return Ending.LET_GO
     if ControlMode.LAND in modes:  # for one tick; nobody flies after it
         if flight.landing is None:
             return Ending.LANDED

@@ -235,6 +235,8 @@ def _trajectory(flight: FlightData) -> list[str]:
 
 def _ending(flight: FlightData, s: FlightSummary) -> str:
     last = flight.flown[-1]
+    if flight.breach is not None:
+        return f"The vehicle was let go after {_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}."
     if s.ended in _LANDED:
         landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
         return f"{_LANDED[s.ended]} {_seconds(flight, landed_ns)}."

@@ -67,6 +67,11 @@ class Flight(Protocol):
     link: LinkEstimate | None
     vehicle: VehicleStatus | None
 
+    @property
+    def let_go(self) -> str:
+        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        ...
+
 
 class HealthWatch:
     """Watches the control loop from its own thread; looks are cheap and take no lock.
@@ -98,6 +103,7 @@ class HealthWatch:
         self._worst_ns = 0  # of this second
         self._worst_before_ns = 0  # of the last one
         self._recording = "well"  # as last told
+        self._let_go = ""  # the same
 
     def after_tick(self, due: Due, lateness_ns: int) -> None:
         """The control loop has run a tick."""
@@ -106,6 +112,9 @@ class HealthWatch:
         self._now_ns = due.at_ns
         self._missed += due.missed
         self._worst_ns = max(self._worst_ns, lateness_ns)
+        if self._flight.let_go and not self._let_go:
+            self._let_go = self._flight.let_go
+            self._tell(f"error: the vehicle is let go: {self._let_go}")
         if due.at_ns - self._told_ns >= PERIOD_NS:
             self._told_ns = due.at_ns
             self._worst_before_ns, self._worst_ns = self._worst_ns, 0

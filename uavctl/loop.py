@@ -115,6 +115,11 @@ class ControlLoop:
         return self._hand_over.failure
 
     @property
+    def let_go(self) -> str:
+        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        return "" if self._state.breach is None else self._state.breach.text
+
+    @property
     def who_flies(self) -> State:
         """Where the hand-over stands."""
         return self._hand_over.state

@@ -84,6 +84,8 @@ class Engagement:
 
         The pilot, not we, sees to the end of a flight that the pilot began.
         """
+        if loop.let_go:
+            return f"the vehicle was let go: {loop.let_go}"
         if self.takes_off and loop.failure:
             return loop.failure
         if self.takes_off and not self.engaged:

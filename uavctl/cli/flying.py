@@ -182,13 +182,16 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
-    done = threading.Event()
+    done, told = threading.Event(), threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
         task = progress.add_task("waiting", total=duration_s)
 
         def show() -> None:
             while not done.wait(REFRESH_S):
                 decision = loop.decision
+                if loop.let_go and not told.is_set():
+                    told.set()
+                    progress.console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
                 if decision is not None:
                     line = _line(loop) + _alarm(recorder.status())
                     progress.update(task, completed=decision.tick * tick_s, description=line)

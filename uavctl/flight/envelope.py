@@ -37,6 +37,7 @@ RESPONSE = "envelope-response"
 VELOCITY = "envelope-velocity"
 SCATTER = "envelope-scatter"
 BRAKING = "envelope-braking"
+BREACHES = frozenset({OUTSIDE, RESPONSE, VELOCITY, SCATTER, BRAKING})
 
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
 SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge

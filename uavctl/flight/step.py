@@ -195,6 +195,8 @@ def _watched(
         intake.accepted,
         braking=state.mode is ControlMode.BRAKE,
     )
+    if tick.age_steps is None or tick.age_steps >= controller.horizon:
+        seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
     return watch(state.watching, seen, controller.envelope)
 
 
@@ -282,7 +284,7 @@ def _setpoint(
 
 
 def _breached(at_ns: int, breach: Breach) -> Event:
-    return Event(at_ns=at_ns, severity=Severity.ERROR, code=breach.code, text=f"{breach.text}: letting go")
+    return Event(at_ns=at_ns, severity=Severity.ERROR, code=breach.code, text=breach.text)
 
 
 def _restarted(at_ns: int) -> Event:
