@@ -41,9 +41,9 @@ class SignedWire(Wire):
         self.heard: deque[bytes] = deque(maxlen=5000)
         self.unsigned = 0
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         genuine = []
-        for data, at_ns in super().receive():
+        for data, at_ns in super().receive(everything=everything):
             signed = b"".join(self._sign(frame) for frame in frames(data))
             self.heard.append(signed)
             genuine.append((signed, at_ns))
@@ -90,7 +90,7 @@ class Flood(AttackBench):
         self.words = words
 
     def attack(self, wire: SignedWire, genuine: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
-        if wire is not self.wires["vehicle"]:
+        if wire is not self.wires["vehicle"] or not genuine:
             return genuine
         words = self.words or list(wire.heard)[:-1]
         flood = [(words[n % len(words)], self.now_ns) for n in range(1000)] if words else []
@@ -188,10 +188,21 @@ class Canned:
         self.refused: Counter[str] = Counter()
         self.answered: list[int] = []
 
+    known, unread = True, False
+
     def fileno(self) -> int:
         return -1
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
+        return ()
+
+    def lost(self) -> int:
+        return 0
+
+    def trust(self, index: int) -> None:
+        pass
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         return [(data, n) for n, data in enumerate(self._data)]
 
     def answer(self, index: int) -> None:
