@@ -115,6 +115,8 @@ WORDS: dict[str, Callable[[], Say]] = {
     "forged": lambda: _cycle(lambda n: SignedPeer(OTHER_KEY, 2**48 - 10**9 + n).heartbeat()),
     "foreign-heartbeat": lambda: _cycle(lambda n: _from(n).heartbeat()),
     "foreign-position": lambda: _cycle(_vision),
+    "one-source": lambda: lambda: Peer(77).vision(time.time_ns() // 1000),
+    "states-of-the-vehicle": lambda: _cycle(lambda _: Peer().heartbeat(base_mode=129 | 128)),
     "time-request": lambda: _cycle(lambda n: _from(n).send("timesync", 0, -n - 1)),
     "words-of-the-vehicle": lambda: _cycle(_text),
     "answers-of-the-vehicle": lambda: _cycle(_ack),
@@ -143,6 +145,10 @@ WORDS: dict[str, Callable[[], Say]] = {
     "incomplete": lambda: _cycle(lambda _: b"\xfd\xff" + bytes(5) + b"\x1e\0\0" + bytes(200)),
     "noise": lambda: _cycle(lambda n: hashlib.shake_128(b"%d" % n).digest(LARGEST)),
 }
+
+
+# Without a key these are what they say: the pilot's word, and positions. What a flight does then is no fault of it.
+BELIEVED_UNSIGNED = frozenset({"heartbeat", "one-source"})
 
 
 def flood(

@@ -257,7 +257,6 @@ class Stalled(Bench):
         return [name for name, waiting in self.arrived.items() if waiting]
 
 
-@pytest.mark.fault(25)
 @pytest.mark.parametrize("in_step", [False, True])
 @pytest.mark.parametrize("stall_ticks", [6, 20, 50])
 def test_after_a_stall_no_setpoint_goes_to_a_vehicle_that_the_pilot_has(stall_ticks: int, in_step: bool) -> None:
@@ -274,7 +273,6 @@ def test_after_a_stall_no_setpoint_goes_to_a_vehicle_that_the_pilot_has(stall_ti
     assert result.identical, result.first_difference
 
 
-@pytest.mark.fault(25)
 def test_where_the_system_kept_the_oldest_words_only_nothing_goes_out_until_the_vehicle_is_heard() -> None:
     bench = Stalled(50, room=550)  # of 1500: the take-over came later
     bench.fly(duration_s=8.0, stop_limit_s=0.0)

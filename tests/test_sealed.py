@@ -39,15 +39,24 @@ class SignedWire(Wire):
         self._stamp = STAMP
         self._their_door = Gate(Signing(SigningKey(KEY), 0, Stamps(), OFFSET_NS), stream=False)
         self.heard: deque[bytes] = deque(maxlen=5000)
-        self.unsigned = 0
+        self._signed: list[tuple[bytes, int]] = []
+        self.unsigned = self.copied = 0
 
     def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
-        genuine = []
-        for data, at_ns in super().receive(everything=everything):
+        self.speaks()
+        genuine, self._signed = self._signed, []
+        return self._attack(self, genuine)
+
+    def speaks(self) -> list[bytes]:
+        """What is on the wire and has not been read, as it will be."""
+        fresh = []
+        for data, at_ns in super().receive(everything=True):
             signed = b"".join(self._sign(frame) for frame in frames(data))
             self.heard.append(signed)
-            genuine.append((signed, at_ns))
-        return self._attack(self, genuine)
+            fresh.append(signed)
+            self._signed.append((signed, at_ns))
+        self.copied += len(fresh)
+        return fresh
 
     def _sign(self, frame: bytes) -> bytes:
         self._stamp += 7
@@ -148,6 +157,23 @@ def test_a_flood_changes_nothing_of_a_signed_flight(plain_flight: list[Any], wor
     assert last.bad[reason] > 10_000
     told = [event for event in bench.memory.of(Event) if event.code == "dropped"]
     assert 2 <= len(told) <= 7 and reason in told[-1].text  # once a second
+
+
+class Mirror(AttackBench):
+    """Somebody brings what the vehicle and the cameras say to the other one's port, before it comes to its own."""
+
+    def attack(self, wire: SignedWire, genuine: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
+        (other,) = (one for one in self.wires.values() if one is not wire)
+        waiting = [(data, self.now_ns) for data in other.speaks()]
+        return [*waiting, *genuine]
+
+
+@pytest.mark.fault(37)
+def test_genuine_frames_that_are_delivered_first_at_the_other_port_change_nothing(plain_flight: list[Any]) -> None:
+    bench = Mirror()
+    assert flown(bench) == plain_flight
+    assert sum(wire.copied for wire in bench.wires.values()) > 100
+    assert not refused(bench)
 
 
 @pytest.mark.fault(36)

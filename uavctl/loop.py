@@ -6,7 +6,7 @@ it learns and chooses goes to the sink, in the order in which it happened.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 
 from uavctl.config import Config
@@ -43,7 +43,7 @@ VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 MAX_ORDERS = 16  # that wait for one tick
-MAX_SAMPLES = 64  # of one tick, the newest: each costs the estimator its time
+MAX_SAMPLES = 32  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
 def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, Link]:
@@ -246,7 +246,7 @@ class ControlLoop:
         self.vehicle = next(iter(left or heard[::-1]), self.vehicle)
         if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
             self._unsure_since_ns = None
-        return tuple(samples[-MAX_SAMPLES:]), tuple(heard), tuple(words)
+        return _newest_of_each(samples), tuple(heard), tuple(words)
 
     def _record(self, out: StepOutput, at_ns: int) -> None:
         if out.estimate is not None:
@@ -314,6 +314,19 @@ class ControlLoop:
             self._next_stats_ns = at_ns + SECOND_NS
             for link in self._links.values():
                 self._put("/uavctl/link", at_ns, link.stats(at_ns))
+
+
+def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
+    """So many samples as a tick may look at, in order: a source that says much takes nothing of another's."""
+    if len(samples) <= MAX_SAMPLES:
+        return tuple(samples)
+    behind: Counter[str] = Counter()  # newer samples of the same source
+    ranks = [0] * len(samples)
+    for place in range(len(samples) - 1, -1, -1):
+        ranks[place] = behind[samples[place].source]
+        behind[samples[place].source] += 1
+    chosen = sorted(range(len(samples)), key=lambda place: (ranks[place], -place))[:MAX_SAMPLES]
+    return tuple(samples[place] for place in sorted(chosen))
 
 
 def _answered(
