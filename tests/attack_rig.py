@@ -32,6 +32,7 @@ from uavctl.data import ControlMode, Decision, Refused
 
 POSITION_CONTROL = 3 << 16
 SETPOINT, COMMAND = 84, 76
+ARMED, DISARMED = 129, 1  # base modes with a mode of the autopilot's own
 POSITIONS_HZ = 20.0
 NOISE_M = 0.003
 STARTS_S = 120.0
@@ -58,7 +59,7 @@ class FakeVehicle:
         stamp = int((time.time() - EPOCH_S) * SECOND)
         self._voice: Peer = SignedPeer(KEY, stamp) if signed else Peer()
         self._eyes: Peer = SignedPeer(KEY, stamp, 4, 17, 18) if signed else Peer(17, 18)
-        self.mode = OFFBOARD
+        self.mode, self.armed = OFFBOARD, True
         self.position, self.velocity = [0.0, 0.0, -1.2], [0.0, 0.0, 0.0]
         self._accel = (0.0, 0.0, 0.0)
         self.setpoints = 0
@@ -101,7 +102,7 @@ class FakeVehicle:
 
     def beat(self) -> None:
         """Tell the mode."""
-        self._send(self._vehicle, self._voice.heartbeat(custom_mode=self.mode, base_mode=129 | 0x80))
+        self._send(self._vehicle, self._voice.heartbeat(self.mode, ARMED if self.armed else DISARMED))
 
     def take_over(self) -> None:
         """Be the pilot who switches, and tell it."""
@@ -301,7 +302,9 @@ class Flight:
         return len(late), (late[-1] - woke_s if late else 0.0)
 
     def end(self) -> None:
-        """End the flight, and wait for the end of the recording."""
+        """End the flight: the vehicle is disarmed, and there is nothing to hand over."""
+        self.vehicle.armed = False
+        self.vehicle.beat()
         self.process.send_signal(signal.SIGTERM)
         self.vehicle.run(LIMIT_S, lambda: self.process.poll() is not None)
 

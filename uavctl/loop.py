@@ -43,7 +43,7 @@ VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 MAX_ORDERS = 16  # that wait for one tick
-MAX_SAMPLES = 32  # of one tick, the newest of each source in turn: each costs the estimator its time
+MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
 def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, Link]:

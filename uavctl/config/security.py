@@ -59,7 +59,7 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
     max_frames_per_s: Annotated[
         int,
         Meta(ge=100, description="the same for the frames in them, counted before any checksum or hash is taken [1/s]"),
-    ] = 1000
+    ] = 800
     max_bytes_per_s: Annotated[int, Meta(ge=10_000, description="the same for their bytes [1/s]")] = 200_000
 
 

@@ -35,7 +35,7 @@ class Rules:
 
     allow: tuple[str, ...] = ()
     max_per_s: float = 2000.0
-    max_frames_per_s: float = 1000.0
+    max_frames_per_s: float = 800.0
     max_bytes_per_s: float = 200_000.0
 
 
