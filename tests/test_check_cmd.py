@@ -157,10 +157,21 @@ class Wire:
         self._bench, self._name = bench, name
         self.answered = 0
 
+    known, unread = True, False
+
     def fileno(self) -> int:
         return -1
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
+        return ()
+
+    def lost(self) -> int:
+        return 0
+
+    def trust(self, index: int) -> None:
+        pass
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import pytest
 from loopback_rig import Memory, make_loop
+from mavlink_rig import OFFBOARD, Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
@@ -16,7 +17,7 @@ from sim.peers import Peers
 from uavctl.clock import Ticker
 from uavctl.config import load_config
 from uavctl.daemon import fly
-from uavctl.data import ControlMode, Datagram, Decision, LinkStats, Timing
+from uavctl.data import ControlMode, Datagram, Decision, Event, LinkStats, Outgoing, Refused, Timing
 from uavctl.errors import UavctlError
 from uavctl.transport import Connection
 
@@ -70,12 +71,25 @@ class Wire:
         self._bench, self._name = bench, name
         self.answered: list[int] = []
         self.sent: list[int] = []
+        self.words: list[tuple[int, str]] = []  # what was sent, and when
+        self.dropped = 0
         self.refused: Counter[str] = Counter()
+
+    known, unread = True, False
 
     def fileno(self) -> int:
         return -1
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
+        return ()
+
+    def lost(self) -> int:
+        return self.dropped
+
+    def trust(self, index: int) -> None:
+        pass
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 
@@ -84,6 +98,7 @@ class Wire:
 
     def send(self, data: bytes) -> None:
         self.sent.append(self._bench.now_ns)
+        self.words += [(self._bench.now_ns, message.get_type()) for message in decode(data)]
         self._bench.peers.receive(self._name, data, self._bench.now_ns)
 
     def close(self) -> None:
@@ -185,3 +200,93 @@ def test_a_closed_vehicle_link_ends_the_flight_with_what_to_do() -> None:
     with pytest.raises(UavctlError, match="closed by the other side"):
         bench.fly()
     assert not bench.memory.of(Decision)
+
+
+ON_HOLD = (4 << 16) | (3 << 24)
+
+
+def setpoint_times(bench: Bench) -> list[int]:
+    """When setpoints went out on the wire."""
+    return [at_ns for at_ns, name in bench.connections["vehicle"].words if name == "SET_POSITION_TARGET_LOCAL_NED"]
+
+
+class Stalled(Bench):
+    """The daemon stands still from the third second on; meanwhile the vehicle speaks, and the pilot takes over.
+
+    Args:
+        stall_ticks: how long.
+        room: what the system keeps; the newest is dropped.
+        in_step: it stands still between its last look and its setpoint.
+    """
+
+    def __init__(self, stall_ticks: int = 20, room: int = 10**6, *, in_step: bool = False) -> None:
+        super().__init__('solver.method="exact"')
+        self.stall_ns, self.room = stall_ticks * TICK_NS, room
+        self.woke_ns, self.silent_from_ns = 0, 3 * SECOND
+        self._in_step = in_step
+        if in_step:
+            self._tick, self.loop.tick = self.loop.tick, self.stalling_tick  # type: ignore[method-assign]
+
+    def stalling_tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> Iterator[Outgoing]:
+        for message in self._tick(tick, at_ns, missed_ticks, stop):
+            if not self.woke_ns and at_ns >= self.silent_from_ns and len(message.data) > 50:
+                self.stall()
+            yield message
+
+    def stall(self) -> None:
+        begun_ns = self.now_ns
+        self.now_ns = self.woke_ns = begun_ns + self.stall_ns
+        self.peers.advance(self.now_ns)  # deaf: what the vehicle says is ours
+        vehicle = Peer(1, 1)
+        backlog = []
+        for at_ns in range(begun_ns, self.now_ns, SECOND // 600):
+            mode = OFFBOARD if at_ns < begun_ns + self.stall_ns // 2 else ON_HOLD
+            beat = (at_ns - begun_ns) // (SECOND // 600) % 100 == 99  # six a second, as if it were many seconds
+            backlog.append(vehicle.heartbeat(mode) if beat else vehicle.send("attitude", 1, *[0.0] * 6))
+        kept = backlog[: self.room]
+        self.connections["vehicle"].dropped += len(backlog) - len(kept)
+        self.arrived["vehicle"] = [(data, self.now_ns) for data in kept]
+
+    def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
+        if not self._in_step and not self.woke_ns and self.now_ns >= self.silent_from_ns:
+            self.stall()
+            return ["vehicle"]
+        if not self.woke_ns:
+            return super().wait(connections, deadline_ns)
+        self.now_ns = max(self.now_ns, deadline_ns)
+        return [name for name, waiting in self.arrived.items() if waiting]
+
+
+@pytest.mark.parametrize("in_step", [False, True])
+@pytest.mark.parametrize("stall_ticks", [6, 20, 50])
+def test_after_a_stall_no_setpoint_goes_to_a_vehicle_that_the_pilot_has(stall_ticks: int, in_step: bool) -> None:
+    bench = Stalled(stall_ticks, in_step=in_step)
+    bench.fly(duration_s=8.0, stop_limit_s=0.0)
+    times = setpoint_times(bench)
+    assert bench.woke_ns and len(times) > 20 and max(times) < bench.woke_ns
+    assert bench.connections["vehicle"].dropped == 0
+    told = [event.text for event in bench.memory.of(Event) if event.code == "hand-over"]
+    assert "released" in told[-1]
+    withheld = sum(one.counts.get("withheld", 0) for one in bench.memory.of(Refused))
+    assert (withheld > 0) == in_step
+    result = replay(iter(bench.memory.entries), lambda sink: make_loop(bench.config, sink))
+    assert result.identical, result.first_difference
+
+
+def test_where_the_system_kept_the_oldest_words_only_nothing_goes_out_until_the_vehicle_is_heard() -> None:
+    bench = Stalled(50, room=550)  # of 1500: the take-over came later
+    bench.fly(duration_s=8.0, stop_limit_s=0.0)
+    assert bench.connections["vehicle"].dropped > 900
+    assert max(setpoint_times(bench)) < bench.woke_ns
+    assert sum(one.counts.get("overrun", 0) for one in bench.memory.of(Refused)) > 900
+    result = replay(iter(bench.memory.entries), lambda sink: make_loop(bench.config, sink))
+    assert result.identical, result.first_difference
+
+
+def test_a_backlog_that_is_never_read_to_its_end_lets_nothing_out() -> None:
+    bench = Bench()
+    bench.connections["vehicle"].unread = True
+    bench.fly(duration_s=3.0, stop_limit_s=0.0)
+    assert {name for _, name in bench.connections["vehicle"].words} <= {"TIMESYNC"}  # answers alone
+    assert sum(one.counts.get("withheld", 0) for one in bench.memory.of(Refused)) > 20
+    assert len(bench.memory.of(Decision)) > 50  # it ticks on, and would end if it were asked to

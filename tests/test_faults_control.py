@@ -34,7 +34,7 @@ from flight_rig import (
 )
 
 from uavctl.data import ControlMode, PositionSample, StepInput
-from uavctl.flight.samples import STAMP_TOLERANCE_NS
+from uavctl.flight.estimator import LATEST_STAMP_NS
 
 TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
@@ -214,7 +214,7 @@ def test_row_12_values_at_their_limits_count() -> None:
 @pytest.mark.parametrize(
     ("captured_ns", "code"),
     [
-        (boundary_ns(2) + STAMP_TOLERANCE_NS + 1, "sample-future"),
+        (boundary_ns(2) + LATEST_STAMP_NS + 1, "sample-future"),
         (boundary_ns(2) + 3600 * 10**9, "sample-future"),
         (2**32 * MS, "sample-future"),
         (2**63 - 1, "sample-future"),

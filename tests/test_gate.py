@@ -6,6 +6,7 @@ import pytest
 from mavlink_rig import SECOND, Peer, make_link, read, samples, statuses
 from signing_rig import KEY, OTHER_KEY, STAMP, SignedPeer, make_gate, seal, unknown
 
+from uavctl.mavlink.codec import StreamDecoder
 from uavctl.mavlink.framing import MAX_FAILED
 from uavctl.mavlink.signing import NEWEST_STAMP, Refusal, Signing
 
@@ -78,6 +79,26 @@ def test_a_hostile_datagram_costs_a_bounded_number_of_hashes(monkeypatch: pytest
     monkeypatch.setattr(Signing, "verify", verify)
     gate.admit(bytes((0xFD, 0, 1)) * 1300, 0)
     assert len(hashes) <= MAX_FAILED + 1
+
+
+@pytest.mark.parametrize("size", [64, 4096])
+def test_a_hostile_stream_costs_a_bounded_number_of_checksums(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    looks = 0
+
+    def fits(frame: bytes, shape: object) -> bool:
+        nonlocal looks
+        looks += 1
+        return False
+
+    decoder, data = StreamDecoder(), b"\xfe" * 65_536
+    with monkeypatch.context() as patch:
+        patch.setattr("uavctl.mavlink.framing._checksum_fits", fits)
+        for at in range(0, len(data), size):
+            decoder.push(data[at : at + size])
+    assert looks <= (MAX_FAILED + 1) * len(data) // size
+    for _ in range(20):
+        found = decoder.push(Peer().heartbeat())
+    assert len(found.messages) == 1  # in step again
 
 
 def test_a_stream_is_cut_anywhere() -> None:

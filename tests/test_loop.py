@@ -5,12 +5,15 @@ from __future__ import annotations
 from itertools import pairwise
 
 from loopback_rig import Memory, make_loop
+from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
+from logs.replay import replay
 from sim.peers import Peers
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Event, Setpoint, SetpointSource
+from uavctl.data import ControlMode, Datagram, Event, Setpoint, SetpointSource, StepInput
+from uavctl.loop import MAX_SAMPLES
 
 TICK_NS = 50_000_000
 OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)
@@ -78,6 +81,46 @@ def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() ->
     rig.run(40)
     rig.heartbeat(HOLD_MODE, late_ns=20_000_000)  # came after the tick's grid time, before the tick ran
     assert SETPOINT not in rig.run(2, deaf=True)
+
+
+def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes_behind_it() -> None:
+    rig = Rig()
+    rig.run(40)
+    for n in range(500):  # what a stall has kept; the tick's own time is before all of it
+        rig.heartbeat(HOLD_MODE if n == 250 else OFFBOARD, late_ns=20_000_000 + n)
+    assert SETPOINT not in rig.run(60, deaf=True)
+    assert any("released" in event.text for event in rig.memory.of(Event))
+
+
+def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again() -> None:
+    rig = Rig('solver.method="exact"')
+    rig.run(40)
+    rig.loop.refused("mocap", {"overrun": 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
+    assert rig.run(5, deaf=True).count(SETPOINT) == 5
+    rig.heartbeat(OFFBOARD)
+    rig.loop.refused("vehicle", {"overrun": 3}, rig.tick * TICK_NS)
+    silent = rig.run(20, deaf=True)
+    assert not {SETPOINT, LAND} & set(silent)
+    rig.heartbeat(OFFBOARD, late_ns=1)
+    assert rig.run(20, deaf=True).count(SETPOINT) == 20
+    rig.loop.refused("vehicle", {"overrun": 1}, rig.tick * TICK_NS)
+    rig.heartbeat(HOLD_MODE, late_ns=1)
+    assert SETPOINT not in rig.run(60, deaf=True)
+    result = replay(iter(rig.memory.entries), lambda sink: make_loop(rig.config, sink))
+    assert result.identical, result.first_difference
+
+
+def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
+    rig = Rig()
+    rig.run(40)
+    cameras = Peer(17, 18), Peer(17, 19)
+    for n in range(1000):
+        rig.loop.receive("mocap", cameras[n == 900].vision(10**6 + 40 * n), rig.tick * TICK_NS - 1000 + n)
+    rig.run(1, deaf=True)
+    newest = rig.memory.of(StepInput)[-1].samples
+    assert len(newest) == MAX_SAMPLES and newest[-1].received_ns == rig.tick * TICK_NS - TICK_NS - 1
+    assert [one.received_ns for one in newest] == sorted(one.received_ns for one in newest)
+    assert [one.source for one in newest].count("VISION_POSITION_ESTIMATE 17/19") == 1
 
 
 def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_own_failsafe() -> None:

@@ -7,7 +7,8 @@ from flight_rig import HORIZON, MS, START_NS, make_controller, sample
 
 from uavctl.data import PositionSample, StepInput
 from uavctl.flight.estimator import begin
-from uavctl.flight.samples import STAMP_TOLERANCE_NS, Intake, Trust, take
+from uavctl.flight.estimator import LATEST_STAMP_NS
+from uavctl.flight.samples import Intake, Trust, take
 
 CONTROLLER = make_controller()
 
@@ -69,11 +70,11 @@ def test_refused_samples_do_not_count() -> None:
 
 def test_a_stamp_within_the_tolerance_after_the_arrival_counts_as_captured_at_the_arrival() -> None:
     arrival_ns = START_NS + 440 * MS
-    intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS, arrival_ns)])])
+    intake = taken([(450, [sample(arrival_ns + LATEST_STAMP_NS, arrival_ns)])])
     assert (len(intake.accepted), intake.history.captured_ns) == (1, arrival_ns)
 
 
 def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_tick() -> None:
     arrival_ns = START_NS + 440 * MS
-    intake = taken([(450, [sample(arrival_ns + STAMP_TOLERANCE_NS + 1, arrival_ns)])])
+    intake = taken([(450, [sample(arrival_ns + LATEST_STAMP_NS + 1, arrival_ns)])])
     assert (len(intake.accepted), [why for _, why in intake.refused]) == (0, ["sample-future"])

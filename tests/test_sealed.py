@@ -39,15 +39,24 @@ class SignedWire(Wire):
         self._stamp = STAMP
         self._their_door = Gate(Signing(SigningKey(KEY), 0, Stamps(), OFFSET_NS), stream=False)
         self.heard: deque[bytes] = deque(maxlen=5000)
-        self.unsigned = 0
+        self._signed: list[tuple[bytes, int]] = []
+        self.unsigned = self.copied = 0
 
-    def receive(self) -> list[tuple[bytes, int]]:
-        genuine = []
-        for data, at_ns in super().receive():
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        self.speaks()
+        genuine, self._signed = self._signed, []
+        return self._attack(self, genuine)
+
+    def speaks(self) -> list[bytes]:
+        """What is on the wire and has not been read, as it will be."""
+        fresh = []
+        for data, at_ns in super().receive(everything=True):
             signed = b"".join(self._sign(frame) for frame in frames(data))
             self.heard.append(signed)
-            genuine.append((signed, at_ns))
-        return self._attack(self, genuine)
+            fresh.append(signed)
+            self._signed.append((signed, at_ns))
+        self.copied += len(fresh)
+        return fresh
 
     def _sign(self, frame: bytes) -> bytes:
         self._stamp += 7
@@ -90,7 +99,7 @@ class Flood(AttackBench):
         self.words = words
 
     def attack(self, wire: SignedWire, genuine: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
-        if wire is not self.wires["vehicle"]:
+        if wire is not self.wires["vehicle"] or not genuine:
             return genuine
         words = self.words or list(wire.heard)[:-1]
         flood = [(words[n % len(words)], self.now_ns) for n in range(1000)] if words else []
@@ -150,6 +159,23 @@ def test_a_flood_changes_nothing_of_a_signed_flight(plain_flight: list[Any], wor
     assert 2 <= len(told) <= 7 and reason in told[-1].text  # once a second
 
 
+class Mirror(AttackBench):
+    """Somebody brings what the vehicle and the cameras say to the other one's port, before it comes to its own."""
+
+    def attack(self, wire: SignedWire, genuine: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
+        (other,) = (one for one in self.wires.values() if one is not wire)
+        waiting = [(data, self.now_ns) for data in other.speaks()]
+        return [*waiting, *genuine]
+
+
+@pytest.mark.fault(37)
+def test_genuine_frames_that_are_delivered_first_at_the_other_port_change_nothing(plain_flight: list[Any]) -> None:
+    bench = Mirror()
+    assert flown(bench) == plain_flight
+    assert sum(wire.copied for wire in bench.wires.values()) > 100
+    assert not refused(bench)
+
+
 @pytest.mark.fault(36)
 def test_who_signs_nothing_is_never_flown() -> None:
     bench = AttackBench()
@@ -188,10 +214,21 @@ class Canned:
         self.refused: Counter[str] = Counter()
         self.answered: list[int] = []
 
+    known, unread = True, False
+
     def fileno(self) -> int:
         return -1
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
+        return ()
+
+    def lost(self) -> int:
+        return 0
+
+    def trust(self, index: int) -> None:
+        pass
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         return [(data, n) for n, data in enumerate(self._data)]
 
     def answer(self, index: int) -> None:

@@ -19,7 +19,17 @@ from signing_rig import (
     sign,
 )
 
-from uavctl.mavlink.signing import NEWEST_STAMP, Refusal, Signing, SigningKey, Stamps, stamp_at, without_signature
+from uavctl.mavlink.signing import (
+    MAX_STREAMS,
+    NEWEST_STAMP,
+    SKEW,
+    Refusal,
+    Signing,
+    SigningKey,
+    Stamps,
+    stamp_at,
+    without_signature,
+)
 
 MINUTE = 60 * SECOND
 
@@ -146,12 +156,26 @@ def test_link_ids_of_peers_can_be_given() -> None:
 
 
 @pytest.mark.fault(37)
-def test_a_frame_of_one_connection_is_none_of_another() -> None:
+def test_genuine_frames_that_somebody_brings_elsewhere_first_are_not_old_here() -> None:
     stamps = Stamps()
-    one, other = make_signing(stamps), make_signing(stamps)
-    frame = SignedPeer().heartbeat()
-    assert one.verify(frame, 0) is None
-    assert other.verify(frame, 0) is Refusal.REPLAYED
+    here, elsewhere = make_signing(stamps), make_signing(stamps)
+    peer = SignedPeer()
+    for _ in range(100):
+        frame = peer.heartbeat()
+        assert elsewhere.verify(frame, 0) is None
+        assert here.verify(frame, 0) is None
+        assert {one.verify(frame, 0) for one in (here, elsewhere)} == {Refusal.REPLAYED}
+
+
+@pytest.mark.fault(37)
+def test_old_frames_of_one_connection_are_none_of_another() -> None:
+    stamps = Stamps()
+    here, elsewhere = make_signing(stamps), make_signing(stamps)
+    old, new = SignedPeer(), SignedPeer(stamp=STAMP + SKEW + 100)
+    kept = [old.heartbeat() for _ in range(10)]
+    assert here.verify(new.heartbeat(), 0) is None
+    assert {elsewhere.verify(frame, 0) for frame in kept} == {Refusal.REPLAYED}
+    assert elsewhere.verify(new.heartbeat(), 0) is None
 
 
 @pytest.mark.fault(37)
@@ -214,14 +238,17 @@ def test_pymavlink_is_locked_out_by_it() -> None:
     assert sum(taken(genuine.heartbeat()) for _ in range(1000)) == 0
 
 
-def test_streams_are_bounded() -> None:
+@pytest.mark.fault(37)
+def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
     stamps = Stamps()
     signing = make_signing(stamps)
-    verdicts = [signing.verify(SignedPeer(system=n).heartbeat(), 0) for n in range(1, 66)]
-    assert verdicts == [None] * 64 + [Refusal.STREAMS]
-    assert signing.verify(SignedPeer(system=1, stamp=STAMP + 9).heartbeat(), 0) is None
-    stamps.streams[99, 1, 3] = STAMP  # however it came to be too full
-    assert signing.verify(SignedPeer(system=100).heartbeat(), 0) is Refusal.STREAMS
+    first = [SignedPeer(system=1 + n // 250, component=1 + n % 250, stamp=STAMP + n).heartbeat() for n in range(300)]
+    assert {signing.verify(frame, 0) for frame in first} == {None}
+    assert len(stamps.streams) == len(signing._newest) == MAX_STREAMS
+    assert {signing.verify(frame, 0) for frame in first} == {Refusal.REPLAYED}  # also of those that are not kept
+    late = SignedPeer(system=1, component=1, stamp=STAMP + 1000, link_id=9)
+    assert signing.verify(late.heartbeat(), 0) is None  # one that was not kept may have another link id
+    assert len(signing._links) <= MAX_STREAMS
 
 
 @pytest.mark.parametrize("secret", [b"", KEY[:-1], KEY + b"x", bytes(32)])

@@ -4,17 +4,35 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 
 import pytest
+from attacker import WORDS
+from mavlink_rig import Peer
 from patience import LIMIT_S
 from test_transport import FRAME, LIMIT_NS, Clock, port_of
 
+from uavctl.mavlink import framing
 from uavctl.transport import PEER_SILENCE_NS, Connection, Rules, open_connection, wait
-from uavctl.transport.rules import BURST, MAX_KNOWN, MAX_SENDERS, SILENCE_NS, AllowList, RateCap
+from uavctl.transport.rules import (
+    MAX_KNOWN,
+    MAX_SENDERS,
+    STRANGER_BURST,
+    TRUSTED_BURST,
+    VEHICLE_BURST,
+    VEHICLE_TIMES,
+    Address,
+    AllowList,
+    Budgets,
+    frames_in,
+)
 
 SECOND = 1_000_000_000
+BURST = round(STRANGER_BURST[0])
+ONE, VEHICLE, CAMERAS = ("192.0.2.1", 1), ("192.0.2.1", 14540), ("192.0.2.1", 14560)
+HEARTBEATS = Peer(99).heartbeat() * 195
 
 
 @contextmanager
@@ -65,41 +83,132 @@ def test_forged_addresses_do_not_fill_the_memory() -> None:
     assert len(rules._known) <= MAX_KNOWN
 
 
+def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[Budgets, Counter[str]]:
+    refused: Counter[str] = Counter()
+    return Budgets(Rules((), per_s, frames_per_s), refused), refused
+
+
+def take(one: Budgets, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
+    return one.take(senders, [data] * len(senders), at_ns)
+
+
 @pytest.mark.fault(39)
 def test_a_sender_gets_its_rate_and_the_newest_of_each_batch() -> None:
-    cap, one = RateCap(1000.0), ("192.0.2.1", 1)
-    assert cap.take([one] * 100, 0) == [False] * (100 - BURST) + [True] * BURST
-    assert cap.take([one] * 10, 5_000_000) == [False] * 5 + [True] * 5
-    assert cap.take([one] * 10, 5_000_000) == [False] * 10
-    assert sum(sum(cap.take([one] * 20, 10_000_000 + n * 1_000_000)) for n in range(1000)) == 1004
-    assert cap.take([one] * 100, 100 * SECOND).count(True) == BURST  # nothing is saved up beyond a burst
-    assert cap.take([], 0) == []
+    cap, refused = budgets()
+    assert take(cap, [ONE] * 100, 0) == [False] * (100 - BURST) + [True] * BURST
+    assert take(cap, [ONE] * 10, 5_000_000) == [False] * 5 + [True] * 5
+    assert take(cap, [ONE] * 10, 5_000_000) == [False] * 10
+    assert sum(sum(take(cap, [ONE] * 20, 10_000_000 + n * 1_000_000)) for n in range(1000)) == 1004
+    assert take(cap, [ONE] * 100, 100 * SECOND).count(True) == BURST  # nothing is saved up beyond a burst
+    assert take(cap, [], 0) == []
+    assert set(refused) == {"too-many"}
+
+
+@pytest.mark.fault(39)
+def test_frames_and_bytes_are_counted_and_not_datagrams_alone() -> None:
+    """A sender within its datagrams: as many frames as it may send are looked at, and no more bytes are handed on."""
+    for data in (Peer(99).heartbeat() * 5, Peer(99).odometry(1) * 5, HEARTBEATS, b"\xfe" * 4096):
+        cap, refused = budgets(2000.0)
+        frames = size = 0
+        for n in range(2000):  # a second
+            if take(cap, [ONE], n * 500_000, data) == [True]:
+                frames, size = frames + frames_in(data), size + len(data)
+        assert frames <= 1000 + STRANGER_BURST[1] and size <= 200_000 + STRANGER_BURST[2]
+        assert set(refused) == {"too-much"}
+
+
+@pytest.mark.fault(39)
+@pytest.mark.parametrize("kind", WORDS)
+def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: Counter[str] = Counter()
+
+    def fits(frame: bytes, shape: object) -> bool:
+        looks["checksum"] += 1
+        return real(frame, shape)
+
+    def verify(frame: bytes) -> str:
+        looks["hash"] += 1
+        return "forged"
+
+    real: Callable[..., bool] = framing._checksum_fits
+    monkeypatch.setattr(framing, "_checksum_fits", fits)
+    monkeypatch.setattr("attacker.MANY", 3)
+    say = WORDS[kind]()
+    for _ in range(3):
+        data = say()
+        looks.clear()
+        framing.scan(data, final=True)
+        framing.scan(data, final=True, verify=verify)
+        assert max(looks["checksum"], looks["hash"], 1) <= frames_in(data) <= len(data) // 8 + 65
 
 
 @pytest.mark.fault(39)
 def test_a_flooder_takes_nothing_of_another_sender_s_share() -> None:
-    cap, flooder, other = RateCap(1000.0), ("192.0.2.1", 1), ("192.0.2.1", 2)
+    cap, _ = budgets()
+    flooder, other = ("192.0.2.1", 1), ("192.0.2.1", 2)
     for n in range(500):
         batch = [flooder] * 20 + [other] + [flooder] * 20
-        verdicts = cap.take(batch, n * 2_000_000)
-        assert verdicts[20]
-    assert cap.take([flooder] * 5, 499 * 2_000_000) == [False] * 5
+        assert take(cap, batch, n * 2_000_000)[20]
+    assert take(cap, [flooder] * 5, 499 * 2_000_000) == [False] * 5
 
 
 @pytest.mark.fault(39)
-def test_forged_senders_share_what_one_has_and_early_ones_keep_theirs() -> None:
-    cap, vehicle = RateCap(1000.0), ("192.0.2.1", 14540)
-    assert cap.take([vehicle], 0) == [True]
+def test_strangers_share_what_one_has_and_take_nothing_of_vehicle_and_cameras() -> None:
+    cap, refused = budgets()
+    cap.answer(VEHICLE, 0)
+    cap.trust(CAMERAS, 0)
     passed = 0
     for n in range(1000):  # a second, twenty new ports a millisecond
-        at_ns = n * 1_000_000
-        verdicts = cap.take([("192.0.2.1", 20 * n + port) for port in range(20)] + [vehicle], at_ns)
-        assert verdicts[-1]
-        passed += sum(verdicts[:-1])
-    assert passed <= (MAX_SENDERS + 1) * BURST + 1000
-    later_ns = 2 * SECOND + SILENCE_NS
-    assert cap.take([("192.0.2.9", 1)], later_ns) == [True]  # a place has become free
-    assert len(cap._budgets) == 1
+        strangers: list[Address] = [("192.0.2.1", 20_000 + 20 * n + port) for port in range(20)]
+        verdicts = take(cap, [*strangers, VEHICLE, VEHICLE, VEHICLE, CAMERAS], n * 1_000_000)
+        assert all(verdicts[20:])
+        passed += sum(verdicts[:20])
+    assert 1000 <= passed <= 2 * BURST + 1000
+    assert refused["too-many"] == 20_000 - passed
+    assert len(cap._strangers) <= MAX_SENDERS
+
+
+@pytest.mark.fault(39)
+def test_a_later_vehicle_is_heard_beside_sixteen_flooders() -> None:
+    cap, _ = budgets()
+    flooders: list[Address] = [("192.0.2.1", port) for port in range(16)]
+    for n in range(5000):
+        take(cap, flooders * 2, n * 1_000_000, HEARTBEATS[:21])
+    for n in range(20):  # once a second, as a heartbeat among other words
+        at_ns = 6 * SECOND + n * SECOND
+        for k in range(100):
+            take(cap, flooders * 2, at_ns - (100 - k) * 1_000_000, HEARTBEATS[:21])
+        assert take(cap, [*flooders, VEHICLE, *flooders], at_ns, b"\xfd" * 40)[16]
+
+
+@pytest.mark.fault(39)
+def test_a_backlog_of_the_vehicle_s_is_read_whole_and_ends_with_its_newest_state() -> None:
+    cap, refused = budgets()
+    cap.answer(VEHICLE, 0)
+    assert all(take(cap, [VEHICLE] * 1500, 0, Peer().send("attitude", 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+    # Beyond any stall: what may be its state counts before all else, the newest first.
+    words = [Peer().heartbeat(), *[bytes((0xFD, 9, 0, 0, 0, 1, 1, 30, 0, 0)) + bytes(11)] * 100_000]
+    taken = cap.take([VEHICLE] * len(words), words, 1)
+    assert taken[0] and not taken[1] and taken[-1]
+    assert sum(taken) <= VEHICLE_BURST[1]
+    assert refused["too-many"] + refused["too-much"] == len(words) - sum(taken)
+    assert VEHICLE_TIMES * Rules().max_frames_per_s >= 3 * 600.0  # a real one says so much; bytes may look like frames
+
+
+@pytest.mark.fault(39)
+def test_those_who_are_trusted_share_their_budget_fairly() -> None:
+    cap, _ = budgets()
+    loud: list[Address] = [("192.0.2.1", port) for port in range(8)]
+    for one in (*loud, CAMERAS):
+        cap.trust(one, 0)
+    take(cap, loud * 1000, 0)
+    assert all(take(cap, [*loud * 50, CAMERAS], n * 10_000_000)[-1] for n in range(1, 100))
+    for port in range(100):  # forged ones, each of which passed once for a source
+        cap.trust(("192.0.2.2", port), SECOND)
+    assert take(cap, [CAMERAS], SECOND) == [True]
+    assert TRUSTED_BURST > STRANGER_BURST
 
 
 @pytest.mark.fault(39)
@@ -210,8 +319,101 @@ def test_a_connected_socket_has_its_cap_too() -> None:
     ):
         connection.send(b"hello")
         _, address = vehicle.recvfrom(64)
-        for _ in range(100):
-            vehicle.sendto(FRAME, address)
+        data = b"\xfd" * 4096
+        most = int(VEHICLE_BURST[1]) // frames_in(data)
+        for _ in range(most + 10):
+            vehicle.sendto(data, address)
+            connection.receive()
         while wait({"it": connection}, time.monotonic_ns() + 50_000_000):
             connection.receive()
-        assert connection.refused == {"too-many": 100 - BURST}
+        assert connection.refused == {"too-much": 10}
+
+
+def known(connection: Connection, who: socket.socket) -> None:
+    """Make somebody the vehicle."""
+    who.sendto(FRAME, ("127.0.0.1", port_of(connection)))
+    assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
+    assert connection.receive()
+    connection.answer(0)
+
+
+@pytest.mark.fault(39)
+def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
+    with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
+        known(connection, vehicle)
+        to = ("127.0.0.1", port_of(connection))
+        for _ in range(20_000):  # nobody reads: the system drops the newest
+            flooder.sendto(FRAME, to)
+        for n in range(200):
+            vehicle.sendto(b"%d" % n, to)
+        got = [data for data, _ in connection.receive(everything=True)]
+        assert [data for data in got if data != FRAME] == [b"%d" % n for n in range(200)]
+        assert not connection.unread and connection.known
+        assert connection.lost() == 0
+        connection.send(b"setpoint")
+        assert vehicle.recv(64) == b"setpoint"
+
+
+@pytest.mark.fault(39)
+def test_what_the_system_dropped_of_the_vehicle_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("uavctl.transport.udp.OWN_BUFFER_BYTES", 4096)
+    with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
+        known(connection, vehicle)
+        for _ in range(1000):
+            vehicle.sendto(FRAME, ("127.0.0.1", port_of(connection)))
+        got = len(connection.receive(everything=True))
+        assert connection.lost() == 1000 - got > 0
+
+
+def test_what_came_before_the_own_socket_counts_first() -> None:
+    with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
+        to = ("127.0.0.1", port_of(connection))
+        for n in range(300):
+            vehicle.sendto(b"\xfd%d" % n, to)
+        got = connection.receive()
+        connection.answer(0)
+        vehicle.sendto(b"\xfdlast", to)
+        got += connection.receive(everything=True)
+        numbers = [data for data, _ in got]
+        assert numbers[-1] == b"\xfdlast"
+        assert numbers[:-1] == sorted(numbers[:-1], key=lambda one: int(one[1:]))
+
+
+def test_the_port_stays_ours_and_one_who_is_silent_gives_up_the_own_socket() -> None:
+    clock = Clock()
+    with closing(open_connection("udpin://127.0.0.1:0", clock)) as connection, peer() as vehicle:
+        known(connection, vehicle)
+        assert len(connection.filenos()) == 2
+        with socket.socket(type=socket.SOCK_DGRAM) as other:
+            other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+            with pytest.raises(OSError, match="in use"):
+                other.bind(("127.0.0.1", port_of(connection)))
+        for _ in range(20):
+            with peer() as camera:
+                camera.sendto(FRAME, ("127.0.0.1", port_of(connection)))
+                assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
+                assert connection.receive()
+                connection.trust(0)
+            assert len(connection.filenos()) <= 9
+            clock.now_ns += SECOND
+        clock.now_ns += 10 * SECOND
+        with peer() as camera:
+            camera.sendto(FRAME, ("127.0.0.1", port_of(connection)))
+            assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
+            assert connection.receive()
+            connection.trust(0)
+        assert len(connection.filenos()) == 3  # vehicle and camera
+
+
+def test_where_the_system_does_not_tell_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("uavctl.transport.udp._SO_MEMINFO", 9999)
+    monkeypatch.delattr("socket.SO_REUSEPORT")
+    with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
+        known(connection, vehicle)
+        assert len(connection.filenos()) == 1 and connection.lost() == 0
+        to = ("127.0.0.1", port_of(connection))
+        for _ in range(200):
+            flooder.sendto(b"x", to)
+        vehicle.sendto(b"\xfdlast", to)
+        assert connection.receive(everything=True)[-1][0] == b"\xfdlast"
+        assert not connection.unread

@@ -9,7 +9,7 @@ from uavctl.config.peers import DaemonConfig
 from uavctl.data import VehicleStatus
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.vehicle import ALONE_NS
+from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS
 
 NOW = 1000 * SECOND
 WRAP_MS = 2**32
@@ -104,3 +104,26 @@ def test_a_heartbeat_of_starting_up_after_one_of_being_up_is_a_restart() -> None
 def test_another_component_s_clock_is_not_the_vehicle_s() -> None:
     link, _ = heard()
     assert not events(link.receive(Peer(1, 191).local_position(5), NOW + SECOND))
+
+
+@pytest.mark.fault(16)
+def test_with_an_id_that_is_configured_no_other_vehicle_takes_its_place() -> None:
+    link = make_link(daemon=DaemonConfig(tick_s=0.05, vehicle_system_id=7))
+    for n in range(100):
+        assert not statuses(link.receive(Peer(1 + n % 6, 1).heartbeat(), NOW + n * SECOND))
+    assert len(statuses(link.receive(Peer(7, 1).heartbeat(), NOW + 100 * SECOND))) == 1
+    assert link.vehicle == (7, 1)
+    assert link.stats(NOW).bad == {"second-vehicle": 100}
+
+
+@pytest.mark.fault(16)
+def test_a_vehicle_that_is_gone_from_the_ground_gives_its_place_and_one_in_the_air_never_does() -> None:
+    for armed in (False, True):
+        link, first, other = make_link(), Peer(9, 1), Peer(1, 1)
+        link.receive(first.heartbeat(base_mode=1 | (128 if armed else 0)), NOW)
+        assert not statuses(link.receive(other.heartbeat(), NOW + GONE_NS))
+        found = statuses(link.receive(other.heartbeat(), NOW + GONE_NS + 1))
+        assert bool(found) == (not armed)
+        assert link.vehicle == ((9, 1) if armed else (1, 1))
+        if found:  # nothing is armed that was ordered for the first one
+            assert not found[0].alone and found[0].boots == 1

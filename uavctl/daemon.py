@@ -11,9 +11,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from uavctl.clock import Due, Ticker, monotonic_ns
 from uavctl.errors import UavctlError
 from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
+from uavctl.mavlink.link import OVERRUN
 from uavctl.transport import Connection, wait
 
-PAUSE_NS = 1_000_000  # after a read that gave nothing
+PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
+STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
+FRESH_NS = 150_000_000  # a look is so old at most when a setpoint goes out
+MAX_LOOKS = 10  # at a backlog, before a tick
+WITHHELD = "withheld"
 
 
 def fly(
@@ -50,11 +55,12 @@ def fly(
     first_ns: int | None = None
     stop_ns: int | None = None
     refusals = _Refusals(loop, connections)
+    reader = _Reader(loop, connections, now)
     try:
         while not loop.finished:
             due = ticker.next()
             while True:
-                heard = _receive(loop, connections, wait_for(connections, due.at_ns))
+                heard = reader.read(wait_for(connections, due.at_ns))
                 if now() >= due.at_ns:
                     break
                 if not heard:  # a flood: take what comes by the handful, not each by itself
@@ -64,6 +70,7 @@ def fly(
                     f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
                     "the vehicle's own failsafe has it. See to the link and start again"
                 )
+            reader.read_everything()
             due = ticker.overslept(due)
             started_ns = now()
             first_ns = due.at_ns if first_ns is None else first_ns
@@ -72,8 +79,14 @@ def fly(
                 stop_ns = due.at_ns
             if stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9:
                 break
+            withheld = 0
             for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):
+                if message.link == VEHICLE and not reader.fresh:
+                    withheld += 1  # who has the vehicle may have changed since the look
+                    continue
                 connections[message.link].send(message.data)
+            if withheld:
+                loop.refused(VEHICLE, {WITHHELD: withheld}, now())
             loop.timing(due.tick, due.at_ns, started_ns - due.at_ns, now() - due.at_ns)
             refusals.tell(due.at_ns)
             for follow in after_tick:
@@ -81,6 +94,64 @@ def fly(
     finally:
         refusals.tell(now(), last=True)
     return stop_ns is not None
+
+
+class _Reader:
+    """Hands on what arrives, and knows how old the last look is at what the vehicle says."""
+
+    def __init__(self, loop: ControlLoop, connections: Mapping[str, Connection], now: Callable[[], int]) -> None:
+        self._loop, self._connections, self._now = loop, connections, now
+        self._looked_ns = now()  # when the last read ended
+        self._whole_ns: int | None = None  # when the last read began after which nothing was left
+        self._lost = dict.fromkeys(connections, 0)
+
+    @property
+    def fresh(self) -> bool:
+        """Whether everything has been read that the vehicle had said a moment ago."""
+        return self._whole_ns is not None and self._now() - self._whole_ns <= FRESH_NS
+
+    def read(self, names: Iterable[str], *, everything: bool = False) -> bool:
+        """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
+        began_ns = self._now()
+        stalled = began_ns - self._looked_ns > STALL_NS
+        heard = False
+        for name in names:
+            connection = self._connections[name]
+            arrived = connection.receive(everything=everything or stalled)
+            heard = heard or (bool(arrived) and connection.known)
+            for index, (data, received_ns) in enumerate(arrived):
+                self._hand_on(name, index, data, received_ns)
+        self._look_at_losses(stalled)
+        self._looked_ns = self._now()
+        return heard
+
+    def read_everything(self) -> None:
+        """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
+        for _ in range(MAX_LOOKS):
+            began_ns = self._now()
+            self.read(self._connections, everything=True)
+            if not self._connections[VEHICLE].unread:
+                self._whole_ns = began_ns
+                if self.fresh:
+                    return
+
+    def _hand_on(self, name: str, index: int, data: bytes, received_ns: int) -> None:
+        connection = self._connections[name]
+        answers = self._loop.receive(name, data, received_ns)
+        if self._loop.heard_vehicle:  # cameras or a ground station may share the port
+            connection.answer(index)
+        elif self._loop.heard_source:
+            connection.trust(index)
+        for answer in answers:
+            self._connections[answer.link].send(answer.data)
+
+    def _look_at_losses(self, stalled: bool) -> None:
+        """Tell what the system dropped while nobody looked. A flood's losses are told by nobody, and change nothing."""
+        for name, connection in self._connections.items():
+            before, lost = self._lost[name], connection.lost()
+            self._lost[name] = lost
+            if stalled and lost > before:
+                self._loop.refused(name, {OVERRUN: lost - before}, self._now())
 
 
 class _Refusals:
@@ -102,18 +173,3 @@ class _Refusals:
             if new:
                 self._told[name] = refused
                 self._loop.refused(name, dict(new), at_ns)
-
-
-def _receive(loop: ControlLoop, connections: Mapping[str, Connection], names: Iterable[str]) -> bool:
-    """Hand on what has arrived on the named connections; False if nothing was worth it."""
-    heard = False
-    for name in names:
-        connection = connections[name]
-        for index, (data, received_ns) in enumerate(connection.receive()):
-            heard = True
-            answers = loop.receive(name, data, received_ns)
-            if loop.heard_vehicle:  # cameras or a ground station may share the port
-                connection.answer(index)
-            for answer in answers:
-                connections[answer.link].send(answer.data)
-    return heard

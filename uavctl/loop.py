@@ -6,7 +6,7 @@ it learns and chooses goes to the sink, in the order in which it happened.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 
 from uavctl.config import Config
@@ -33,7 +33,7 @@ from uavctl.data import (
 )
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
 from uavctl.mavlink.hand_over import HAND_OVER_ORDERS, HandOver
-from uavctl.mavlink.link import Link
+from uavctl.mavlink.link import OVERRUN, Link
 from uavctl.mavlink.messages import Ack, Message, Text
 from uavctl.mavlink.mode import LEAVES_NONE, Sending, State
 from uavctl.mavlink.relay import Relay
@@ -44,6 +44,7 @@ VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 MAX_ORDERS = 16  # that wait for one tick
+MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
 def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, Link]:
@@ -89,7 +90,9 @@ class ControlLoop:
         self._inbox: deque[tuple[int, PositionSample | VehicleStatus | VehicleMotion | Ack | Text]] = deque()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
+        self._unsure_since_ns: int | None = None  # what the vehicle said then was lost unread
         self.heard_vehicle = False  # whether the last datagram came from the vehicle that is flown
+        self.heard_source = False  # whether it held a position of a source that has spoken for a while
         self.vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self.decision: Decision | None = None
@@ -130,13 +133,13 @@ class ControlLoop:
         return None if self.who_flies is State.WAITING else self.who_flies not in LEAVES_NONE
 
     def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
-        """Take one datagram that arrived at `at_ns`; ticks before that time will not see it.
+        """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing.
 
         Returns:
             What is to be sent at once: answers to requests for our time, never anything that moves the vehicle.
         """
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
-        self.heard_vehicle = False
+        self.heard_vehicle = self.heard_source = False
         source = self._links[link]
         for item in source.receive(data, at_ns):
             self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
@@ -145,12 +148,19 @@ class ControlLoop:
             else:
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
+                self.heard_source = source.settled
                 self._relay.take(item, source.attitude)
         return tuple([self._send(link, answer, at_ns) for answer in source.answers()])
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
-        """Take the word of a connection that it has dropped something unread."""
+        """Take the word of a connection that it has dropped something unread.
+
+        Where that was the vehicle's, it may have been that the pilot has taken over: nothing that moves the vehicle is
+        sent until it is heard again.
+        """
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
+        if link == VEHICLE and OVERRUN in counts:
+            self._unsure_since_ns = at_ns
         for event in self._links[link].refused(counts, at_ns):
             self._put("/uavctl/event", at_ns, event)
 
@@ -220,22 +230,33 @@ class ControlLoop:
     def _take_due(
         self, at_ns: int
     ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[Ack | Text, ...]]:
-        """What arrived up to `at_ns`: samples, vehicle states, of which the newest is taken over, and words."""
+        """Samples that arrived up to `at_ns`, and all that the vehicle has said: its newest state is taken over.
+
+        What it says counts in a late tick too, when it came after the time of the tick: it may be that the pilot flies.
+        That he does is not overtaken by a later word in the same backlog.
+        """
         samples: list[PositionSample] = []
         heard: list[VehicleStatus] = []
         words: list[Ack | Text] = []
-        while self._inbox and self._inbox[0][0] <= at_ns:
-            item = self._inbox.popleft()[1]
+        waiting: deque[tuple[int, PositionSample | VehicleStatus | VehicleMotion | Ack | Text]] = deque()
+        for received_ns, item in self._inbox:
             if isinstance(item, VehicleStatus):
-                self.vehicle = item
                 heard.append(item)
             elif isinstance(item, VehicleMotion):
                 self._motion = item
-            elif isinstance(item, PositionSample):
+            elif not isinstance(item, PositionSample):
+                words.append(item)
+            elif received_ns <= at_ns:
                 samples.append(item)
             else:
-                words.append(item)
-        return tuple(samples), tuple(heard), tuple(words)
+                waiting.append((received_ns, item))
+        self._inbox = waiting
+        flown = self._hand_over.state is State.ENGAGED
+        left = [status for status in heard if flown and self._hand_over.has_left(status)]
+        self.vehicle = next(iter(left or heard[::-1]), self.vehicle)
+        if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
+            self._unsure_since_ns = None
+        return _newest_of_each(samples), tuple(heard), tuple(words)
 
     def _record(self, out: StepOutput, at_ns: int) -> None:
         if out.estimate is not None:
@@ -256,11 +277,11 @@ class ControlLoop:
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
         link = self._links[VEHICLE]
-        takes = told.sending is not Sending.NOTHING and not self._pilot_took_over()
-        if takes and out.setpoint is not None:
+        sure = self._unsure_since_ns is None
+        if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
             yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
-        if told.ask is not None:
+        if sure and told.ask is not None:
             yield self._send(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns)
         if self._hand_over.ours and self._hand_over.state in (State.READY, State.MODE, State.ARMING):
             for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
@@ -292,12 +313,6 @@ class ControlLoop:
             commands=inp.commands,
         )
 
-    def _pilot_took_over(self) -> bool:
-        """Whether a heartbeat that came after this late tick's grid time says that the vehicle is no longer ours."""
-        flown = self._hand_over.state is State.ENGAGED
-        late = [item for _, item in self._inbox if isinstance(item, VehicleStatus)]
-        return flown and any(self._hand_over.has_left(item) for item in late)
-
     def _send(self, link: str, data: bytes, at_ns: int) -> Outgoing:
         self._put(raw_topic(link, outgoing=True), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=True, data=data))
         return Outgoing(link=link, data=data)
@@ -309,6 +324,19 @@ class ControlLoop:
             self._next_stats_ns = at_ns + SECOND_NS
             for link in self._links.values():
                 self._put("/uavctl/link", at_ns, link.stats(at_ns))
+
+
+def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
+    """So many samples as a tick may look at, in order: a source that says much takes nothing of another's."""
+    if len(samples) <= MAX_SAMPLES:
+        return tuple(samples)
+    behind: Counter[str] = Counter()  # newer samples of the same source
+    ranks = [0] * len(samples)
+    for place in range(len(samples) - 1, -1, -1):
+        ranks[place] = behind[samples[place].source]
+        behind[samples[place].source] += 1
+    chosen = sorted(range(len(samples)), key=lambda place: (ranks[place], -place))[:MAX_SAMPLES]
+    return tuple(samples[place] for place in sorted(chosen))
 
 
 def _answered(

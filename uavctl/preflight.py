@@ -68,5 +68,7 @@ def _receive(flight: Preflight, name: str, connection: Connection) -> None:
         answers = flight.receive(name, data, received_ns)
         if flight.heard_vehicle:  # cameras or a ground station may share the port
             connection.answer(index)
+        elif flight.heard_source:
+            connection.trust(index)
         for answer in answers:
             connection.send(answer.data)

@@ -52,15 +52,33 @@ class Sealed:
         """See `Connection`."""
         return self._inner.refused + self._gate.refused
 
+    @property
+    def unread(self) -> bool:
+        """See `Connection`."""
+        return self._inner.unread
+
+    @property
+    def known(self) -> bool:
+        """See `Connection`."""
+        return self._inner.known
+
     def fileno(self) -> int:
         """See `Connection`."""
         return self._inner.fileno()
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
+        """See `Connection`."""
+        return self._inner.filenos()
+
+    def lost(self) -> int:
+        """See `Connection`."""
+        return self._inner.lost()
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; what holds no verified frame is dropped."""
         arrived = []
         self._indices.clear()
-        for index, (data, at_ns) in enumerate(self._inner.receive()):
+        for index, (data, at_ns) in enumerate(self._inner.receive(everything=everything)):
             genuine = self._gate.admit(data, at_ns)
             if genuine:
                 self._indices.append(index)
@@ -70,6 +88,10 @@ class Sealed:
     def answer(self, index: int) -> None:
         """See `Connection`."""
         self._inner.answer(self._indices[index])
+
+    def trust(self, index: int) -> None:
+        """See `Connection`."""
+        self._inner.trust(self._indices[index])
 
     def send(self, data: bytes) -> None:
         """See `Connection`."""
@@ -82,7 +104,12 @@ class Sealed:
 
 def rules(security: SecurityConfig) -> Rules:
     """Whom the UDP connections listen to, and how much."""
-    return Rules(security.allow, float(security.max_datagrams_per_s))
+    return Rules(
+        security.allow,
+        float(security.max_datagrams_per_s),
+        float(security.max_frames_per_s),
+        float(security.max_bytes_per_s),
+    )
 
 
 @contextmanager

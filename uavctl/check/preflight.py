@@ -58,6 +58,7 @@ class Preflight:
 
     Attributes:
         heard_vehicle: whether the last datagram came from the vehicle.
+        heard_source: whether it held a position of a source that has spoken for a while.
         guide: the prompts, if they were asked for.
     """
 
@@ -77,14 +78,15 @@ class Preflight:
         self._asked_ns: int | None = None
         self._rounds = 0
         self._autopilot = ""
-        self.heard_vehicle = False
+        self.heard_vehicle = self.heard_source = False
         self.guide = Guide(PROMPT_NS) if move else None
 
     def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
         """Take one datagram that arrived at `at_ns`; gives what is to be sent at once."""
-        self.heard_vehicle = False
+        self.heard_vehicle = self.heard_source = False
         for one in self._links[link].receive(data, at_ns):
             if isinstance(one, PositionSample):
+                self.heard_source = self._links[link].settled
                 attitude = self._links[link].attitude
                 self._seen.add(one, attitude)
                 self._relay.take(one, attitude)

@@ -86,6 +86,9 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
             "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)",
         ),
     ] = "udpin://0.0.0.0:14560"
+    vehicle_system_id: Annotated[
+        int, Meta(ge=0, le=255, description="MAVLink system id of the vehicle; 0 takes the first one that is heard")
+    ] = 0
     system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
     component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
         25

@@ -17,7 +17,7 @@ MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
 
 
 class SecurityConfig(Section, frozen=True, kw_only=True):
-    """Signing of MAVLink 2, allow-list and rate cap of the UDP connections."""
+    """Signing of MAVLink 2, allow-list and budgets of the UDP connections."""
 
     key_file: Annotated[
         str,
@@ -56,9 +56,21 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=100,
             le=1_000_000,
-            description="datagrams a second that are taken of one sender (address and port); UDP only [1/s]",
+            description="datagrams a second that are taken of one sender (address and port), and of all strangers "
+            "together; of the vehicle four times as many. UDP only [1/s]",
         ),
     ] = 2000
+    max_frames_per_s: Annotated[
+        int,
+        Meta(
+            ge=100,
+            le=1_000_000,
+            description="the same for the frames in them, counted before any checksum or hash is taken [1/s]",
+        ),
+    ] = 800
+    max_bytes_per_s: Annotated[int, Meta(ge=10_000, le=1_000_000_000, description="the same for their bytes [1/s]")] = (
+        200_000
+    )
 
 
 def check(security: SecurityConfig) -> Iterator[Problem]:

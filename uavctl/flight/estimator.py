@@ -7,7 +7,7 @@ late one a recomputation from its place on: the result is the same to the last b
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 
@@ -19,6 +19,10 @@ from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, first_belie
 
 DUPLICATE = "sample-duplicate"
 TOO_OLD = "sample-too-old"
+
+# How far a stamp may lie after the arrival: clocks over a link are known to milliseconds, and a stamp that is
+# further off says nothing of the capture. A constant, as a tick may be of any length.
+LATEST_STAMP_NS = 20_000_000
 
 # Order of what happens at one instant; a sample sees the input before its change, which is the same state.
 _SAMPLE, _INPUT, _MARK = 0, 1, 2
@@ -114,7 +118,7 @@ def absorb(
         key = (captured_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
         if key[0] <= history.horizon_ns:
             refused.append(TOO_OLD)
-        elif any(entry.key[3] == key[3] and entry.key[2] == key[2] for entry in history.entries):
+        elif _known_already(history.entries, key):
             refused.append(DUPLICATE)
         else:
             taken.append(sample)
@@ -122,6 +126,17 @@ def absorb(
             history = _inserted(kalman, history, new, belief)
         belief = None  # the next one's is another
     return history, tuple(taken), tuple(refused)
+
+
+def _known_already(entries: Sequence[Entry], key: Key) -> bool:
+    """Whether a source has said something of this capture time, as stamped; near it, as stamps lie near arrivals."""
+    first = bisect_left(entries, key[3] - LATEST_STAMP_NS, key=lambda entry: entry.key[0])
+    for entry in entries[first:]:
+        if entry.key[0] > key[3]:
+            return False
+        if entry.key[2:] == key[2:]:
+            return True
+    return False
 
 
 def without(kalman: Kalman, history: History, poisoned: Callable[[PositionSample], bool]) -> History:

@@ -10,17 +10,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.data import PositionSample, StepInput, VehicleStatus
-from uavctl.flight.estimator import History, absorb, begin, belief_at, move_on, without
+from uavctl.flight.estimator import LATEST_STAMP_NS, History, absorb, begin, belief_at, move_on, without
 from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
 from uavctl.flight.stuck import FROZEN, REPEATED, Watches, doubtful, observe, stuck
 
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
-
-# How far a stamp may lie after the arrival: clocks over a link are known to milliseconds, and a stamp that is
-# further off says nothing of the capture. A constant, as a tick may be of any length.
-STAMP_TOLERANCE_NS = 20_000_000
 
 # A plan bridges H steps; a sample that used up no more than this part of them on its way leaves it most of them.
 _FRESH_PART = 3
@@ -241,7 +237,7 @@ def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters)
     # A standard deviation beyond the largest position says nothing, and its square may overflow.
     if not 0.0 < sample.std_m <= parameters.max_position_m:
         return INVALID
-    if sample.received_ns > at_ns or sample.captured_ns > sample.received_ns + STAMP_TOLERANCE_NS:
+    if sample.received_ns > at_ns or sample.captured_ns > sample.received_ns + LATEST_STAMP_NS:
         return FUTURE
     return None
 

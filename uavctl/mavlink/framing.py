@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
-MAX_FAILED = 64  # tries in one datagram; a hostile one must not cost the loop its tick
+MAX_FAILED = 64  # tries in one datagram or chunk; a hostile one must not cost the loop its tick
 # A byte of each message's definition, that is summed up after the frame's own.
 _CRC_EXTRA = {number: bytes((kind.crc_extra,)) for number, kind in mavlink.mavlink_map.items()}
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
@@ -120,8 +120,8 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
             has not are verified too, and then counted and dropped.
 
     Returns:
-        What was found. One broken frame, or one run of garbage, counts once. A datagram in which
-        nothing fits any more after `MAX_FAILED` tries is dropped from there on.
+        What was found. One broken frame, or one run of garbage, counts once. A datagram, or what has come of a stream,
+        in which nothing fits any more after `MAX_FAILED` tries is dropped from there on.
     """
     result = Scan(in_step=in_step)
     failed = 0
@@ -133,8 +133,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
             if result.in_step:
                 result.skip(reason)
             failed += 1
-            gives_up = final and failed > MAX_FAILED
-            end = len(data) if gives_up else _next_magic(data, result.consumed + 1)
+            end = len(data) if failed > MAX_FAILED else _next_magic(data, result.consumed + 1)
         result.in_step = reason is _TAKEN
         result.consumed = end
     return result

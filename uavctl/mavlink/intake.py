@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import get_args
+from typing import Generic, TypeVar, get_args
 
 from uavctl.config.peers import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
@@ -15,14 +15,77 @@ from uavctl.mavlink.clocksync import ClockSource, ClockSync, Refusal, RoundTrips
 from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 
-MAX_SOURCES = 16
+MAX_SOURCES = 32
+SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
+SETTLED = 20  # samples after which a source is no newcomer any more
+# Samples of all newcomers together, while no settled source speaks, and while one does: each costs the estimator its
+# time, and nobody knows yet whose it is.
+NEWCOMERS_PER_S, NEWCOMERS_BESIDE_PER_S = 100, 10
+NEWCOMERS_BURST = 50
+SPEAKS_NS = 1_000_000_000
 
 WRONG_SYSTEM = "system-id"
-TOO_MANY_SOURCES = "sources"
+NEW_SOURCE = "new-source"  # more samples of sources that nobody has heard before than are looked at
+MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
 ABSURD = "absurd"
 SLOW_ANSWER = "timesync"
 
 Address = tuple[int, int]
+
+
+Key = TypeVar("Key")
+Kept = TypeVar("Kept")
+
+
+class SourceTable(Generic[Key, Kept]):
+    """What is kept of each source. There is always room for another one: who has said least gives its place.
+
+    So nobody is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
+
+    Args:
+        most: sources.
+        bad: told when a source loses its place that is not silent.
+    """
+
+    def __init__(self, most: int, bad: Callable[[], None]) -> None:
+        self._most, self._bad = most, bad
+        self._entries: dict[Key, tuple[Kept, int, int]] = {}  # what is kept, times that it spoke, when last
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, key: Key) -> Kept | None:
+        """What is kept of a source; None of one that is not there."""
+        found = self._entries.get(key)
+        return None if found is None else found[0]
+
+    def times(self, key: Key) -> int:
+        """How often a source has spoken; 0 of one that is not there."""
+        found = self._entries.get(key)
+        return 0 if found is None else found[1]
+
+    def values(self) -> Iterator[Kept]:
+        """What is kept of all of them."""
+        return (kept for kept, _, _ in self._entries.values())
+
+    def hear(self, key: Key, at_ns: int, make: Callable[[], Kept]) -> Kept:
+        """What is kept of a source that speaks now; of a new one it is made."""
+        found = self._entries.get(key)
+        if found is None and len(self._entries) >= self._most:
+            self._make_room(at_ns)
+        kept, times = (make(), 0) if found is None else found[:2]
+        self._entries[key] = kept, times + 1, at_ns
+        return kept
+
+    def _make_room(self, at_ns: int) -> None:
+        def weight(key: Key) -> tuple[int, int]:
+            _, times, last_ns = self._entries[key]
+            return (times if at_ns - last_ns <= SILENCE_NS else 0), last_ns
+
+        least = min(self._entries, key=weight)
+        if weight(least)[0]:
+            self._bad()
+        del self._entries[least]
 
 
 class PositionIntake:
@@ -50,8 +113,11 @@ class PositionIntake:
         for axes in get_args(Convention):
             self._frames[axes] = replace(configured, convention=axes)
         self._clock, self._source, self._estimator, self._bad = clock, source, estimator, bad
-        self._clocks: dict[tuple[Address, bool], ClockSync] = {}
-        self._round_trips: dict[Address, RoundTrips] = {}
+        self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._round_trips: SourceTable[Address, RoundTrips] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._newcomers_left, self._newcomers_ns = float(NEWCOMERS_BURST), 0
+        self._settled_ns: int | None = None  # when a settled source was heard last
+        self.settled = False  # whether the newest sample is of one
         self._latest: ClockSync | None = None
         self._latest_address: Address | None = None
         self.samples = 0
@@ -79,12 +145,7 @@ class PositionIntake:
 
     def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to a TIMESYNC request."""
-        trips = self._round_trips.get(address)
-        if trips is None:
-            if len(self._round_trips) >= MAX_SOURCES:
-                self._bad(TOO_MANY_SOURCES)
-                return
-            trips = self._round_trips[address] = RoundTrips(_ns(self._clock.window_s))
+        trips = self._round_trips.hear(address, received_ns, lambda: RoundTrips(_ns(self._clock.window_s)))
         if not trips.answer(sent_ns, remote_ns, received_ns):
             self._bad(SLOW_ANSWER)
 
@@ -102,6 +163,9 @@ class PositionIntake:
             velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
         if self._absurd(position_m, velocity_mps):
             self._bad(ABSURD)
+            return None
+        if not self._has_room(message, received_ns):
+            self._bad(NEW_SOURCE)
             return None
         captured = self._captured(message, received_ns)
         if isinstance(captured, str):
@@ -123,16 +187,32 @@ class PositionIntake:
         far = max(map(abs, position_m)) > self._estimator.max_position_m
         return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
-    def _captured(self, message: Position, received_ns: int) -> int | Refusal | str:
+    def _has_room(self, message: Position, received_ns: int) -> bool:
+        """Whether one more sample is looked at; of sources that are settled each is."""
+        self.settled = self._clocks.times(_key(message)) >= SETTLED
+        if self.settled:
+            self._settled_ns = received_ns
+            return True
+        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SPEAKS_NS
+        per_s = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_PER_S
+        earned = (received_ns - self._newcomers_ns) * 1e-9 * per_s
+        burst = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_BURST
+        self._newcomers_left, self._newcomers_ns = min(burst, self._newcomers_left + earned), received_ns
+        if self._newcomers_left < 1.0:
+            return False
+        self._newcomers_left -= 1.0
+        return True
+
+    def _new_clock(self) -> ClockSync:
+        clock = self._clock
+        return ClockSync(_ns(clock.window_s), _ns(clock.latency_s), _ns(clock.future_tolerance_s))
+
+    def _lost_place(self) -> None:
+        self._bad(MANY_SOURCES)
+
+    def _captured(self, message: Position, received_ns: int) -> int | Refusal:
         address = (message.system, message.component)
-        clock = self._clocks.get((address, message.boot_ms))
-        if clock is None:
-            if len(self._clocks) >= MAX_SOURCES:
-                return TOO_MANY_SOURCES
-            clock = ClockSync(
-                _ns(self._clock.window_s), _ns(self._clock.latency_s), _ns(self._clock.future_tolerance_s)
-            )
-            self._clocks[address, message.boot_ms] = clock
+        clock = self._clocks.hear(_key(message), received_ns, self._new_clock)
         stamp_ns: int | None = None
         if message.boot_ms and message.stamp_us is not None:
             stamp_ns = clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
@@ -144,6 +224,11 @@ class PositionIntake:
         if not isinstance(captured, str):
             self._latest, self._latest_address = clock, address
         return captured
+
+
+def _key(message: Position) -> tuple[Address, bool]:
+    """Whose clock stamps it, and which of its clocks."""
+    return (message.system, message.component), message.boot_ms
 
 
 def _ns(seconds: float) -> int:

@@ -32,11 +32,13 @@ TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
 FIRST_REQUESTS = 10  # sent faster, until the first answer
 OPEN_REQUESTS = 8  # requests whose answers are still taken
-# Others' requests that are answered within a time: a flood of them makes none of answers, and takes no tick its time.
+# Requests that are answered within a time, of the vehicle's and of others' each: a flood of them makes none of answers,
+# and takes no tick its time.
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
 UNANSWERED = "timesync-flood"
+OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
 Item = PositionSample | VehicleStatus | VehicleMotion | Event | Ack | Text
@@ -75,7 +77,7 @@ class Link:
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
         self._encoder = Encoder(*self._own)
         self._intake = PositionIntake(frame, clock, source, estimator, self._count)
-        self._vehicle = VehicleWatch(self._count, self._own)
+        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id)
         self._streams, self._globe = Streams(), Globe()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
@@ -92,7 +94,8 @@ class Link:
         self._listen = listen
         self._askers: set[int] = set()  # systems that ask for our time
         self._answers: list[bytes] = []  # to requests of the last datagram
-        self._answers_left, self._answers_from_ns = MAX_ANSWERS, 0
+        self._answers_from_ns = 0
+        self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
 
     @property
     def vehicle(self) -> tuple[int, int] | None:
@@ -103,6 +106,11 @@ class Link:
     def attitude(self) -> Quaternion | None:
         """How the body of the newest sample was turned: body axes forward, right, down to NED (w, x, y, z)."""
         return self._intake.attitude
+
+    @property
+    def settled(self) -> bool:
+        """Whether the newest sample is of a source that has spoken for a while."""
+        return self._intake.settled
 
     def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
         """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
@@ -302,11 +310,13 @@ class Link:
         if message.tc1_ns == 0:
             self._askers.add(message.system)
             if at_ns - self._answers_from_ns >= ANSWERS_NS:
-                self._answers_left, self._answers_from_ns = MAX_ANSWERS, at_ns
-            if not self._answers_left:
+                self._answers_from_ns = at_ns
+                self._answered_to.clear()
+            of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
+            if self._answered_to[of_vehicle] >= MAX_ANSWERS:
                 self._count(UNANSWERED)
                 return
-            self._answers_left -= 1
+            self._answered_to[of_vehicle] += 1
             self._answers.append(self._encoder.timesync(at_ns, message.ts1_ns))
         elif message.ts1_ns in self._open:  # else it answers somebody else
             self._answered = True

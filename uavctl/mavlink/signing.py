@@ -21,7 +21,8 @@ EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
 UNIT_NS = 10_000  # of a stamp
 NEWEST_STAMP = 2**48 - 1
 FIRST_BEHIND = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
-MAX_STREAMS = 64  # of one key; a flight has a handful
+MAX_STREAMS = 64  # of one connection; a flight has a handful
+SKEW = 500_000  # units: no frame is taken that is five seconds behind what its stream has said on another connection
 SIGNATURE = int(mavlink.MAVLINK_SIGNATURE_BLOCK_LEN)
 _HASH = 6
 _FLAGS = 2  # index of the incompatibility flags
@@ -38,7 +39,6 @@ class Refusal(StrEnum):
     REPLAYED = "replayed"  # not newer than the newest of its stream, or than all before the start
     STALE = "stale"  # begins a stream more than a minute behind
     LINK_ID = "link-id"  # another link's, carried over to this one
-    STREAMS = "streams"  # one stream too many
 
 
 class SigningKey:
@@ -74,12 +74,19 @@ class Stamps:
     Attributes:
         floor: newest of all before the start; it has to be kept, so that nothing older is taken ever again.
         own: newest that was sent or verified since, on any connection.
-        streams: newest that was verified of each stream.
+        streams: newest that was verified of each stream, on any connection.
     """
 
     floor: int = 0
     own: int = 0
     streams: dict[Stream, int] = field(default_factory=dict)
+
+    def note(self, stream: Stream, stamp: int) -> None:
+        """Take a stamp that was verified."""
+        self.own = max(self.own, stamp)
+        if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
+            del self.streams[min(self.streams, key=lambda one: self.streams[one])]
+        self.streams[stream] = max(stamp, self.streams.get(stream, 0))
 
 
 class Signing:
@@ -88,7 +95,8 @@ class Signing:
     Args:
         key: the secret that is shared with the peers.
         link_id: ours, on this connection.
-        stamps: of this key; shared by all connections, so that a frame of one is none of another.
+        stamps: of this key, shared by all connections. What is new is decided by each for itself: a frame that somebody
+            brings to another connection first is not old on its own.
         wall_offset_ns: wall clock (UTC, since 1970) − the clock of `at_ns`. It is read once: a step of the wall clock
             during a flight has no effect.
         peer_link_ids: link ids that peers may use; none takes the first of each (system, component).
@@ -105,6 +113,8 @@ class Signing:
         self._key, self._link_id, self._stamps = key, link_id, stamps
         self._offset_ns = wall_offset_ns
         self._peer_link_ids = peer_link_ids
+        self._newest: dict[Stream, int] = {}  # stamp of each stream, here
+        self._floor = 0  # newest of the streams that are not kept any more
         self._links: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
@@ -128,12 +138,22 @@ class Signing:
         stamp = int.from_bytes(frame[-SIGNATURE + 1 : -_HASH], "little")
         if not self._expects(address, link_id):
             return Refusal.LINK_ID
-        refusal = self._too_old((*address, link_id), stamp, at_ns)
+        stream = (*address, link_id)
+        refusal = self._too_old(stream, stamp, at_ns)
         if refusal is None:
             self._links.setdefault(address, link_id)
-            self._stamps.streams[*address, link_id] = stamp
-            self._stamps.own = max(self._stamps.own, stamp)
+            self._keep(stream, stamp)
+            self._stamps.note(stream, stamp)
         return refusal
+
+    def _keep(self, stream: Stream, stamp: int) -> None:
+        """Keep a stream's stamp. The oldest one gives its place, and nothing that is older is taken for new again."""
+        if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
+            oldest = min(self._newest, key=lambda one: self._newest[one])
+            self._floor = max(self._floor, self._newest.pop(oldest))
+            if not any(one[:2] == oldest[:2] for one in self._newest):
+                self._links.pop(oldest[:2], None)
+        self._newest[stream] = stamp
 
     def _expects(self, address: tuple[int, int], link_id: int) -> bool:
         if self._peer_link_ids:
@@ -141,13 +161,13 @@ class Signing:
         return self._links.get(address) in (None, link_id)
 
     def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> Refusal | None:
-        newest = self._stamps.streams.get(stream)
+        if stamp + SKEW < self._stamps.streams.get(stream, 0):
+            return Refusal.REPLAYED
+        newest = self._newest.get(stream)
         if newest is not None:
             return Refusal.REPLAYED if stamp <= newest else None
-        if stamp <= self._stamps.floor:
+        if stamp <= max(self._floor, self._stamps.floor):
             return Refusal.REPLAYED
-        if len(self._stamps.streams) >= MAX_STREAMS:
-            return Refusal.STREAMS
         ours = max(self._now(at_ns), self._stamps.own)
         return Refusal.STALE if stamp + FIRST_BEHIND < ours else None
 

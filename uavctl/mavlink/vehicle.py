@@ -13,6 +13,7 @@ from uavctl.mavlink.modes import autopilot_name, describe_mode
 
 SECOND_VEHICLE = "second-vehicle"
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
+GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BACK_MS = 1000  # its clock goes back by more than this: it has started anew
 _WRAP_MS = 2**32
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
@@ -29,14 +30,18 @@ def is_vehicle(heartbeat: Heartbeat) -> bool:
 class VehicleWatch:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
+    One that has fallen silent on the ground, disarmed, gives its place to another.
+
     Args:
         bad: counter that heartbeats of other vehicles are added to.
         own: our system and component id; answers to others' commands are not ours.
+        system: the vehicle's system id; 0 takes any.
     """
 
-    def __init__(self, bad: Callable[[str], None], own: tuple[int, int]) -> None:
+    def __init__(self, bad: Callable[[str], None], own: tuple[int, int], system: int = 0) -> None:
         self._bad = bad
         self._own = own
+        self._system = system
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
@@ -119,12 +124,26 @@ class VehicleWatch:
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
         return (self._status,)
 
+    def _has_gone(self, at_ns: int) -> bool:
+        """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
+        status = self._status
+        return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
+
+    def _begin(self, address: tuple[int, int], at_ns: int) -> None:
+        """Follow a vehicle; of another than before nothing is known, and nothing is armed yet."""
+        if self.address is not None:
+            self._reboot()
+            self._battery_v = self._boot_ms = None
+            self._another_ns = at_ns
+        self.address, self._status = address, None
+
     def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
-        if self.address is None:
-            self.address = address
+        wanted = self._system in (0, message.system)
+        if wanted and (self.address is None or (address != self.address and self._has_gone(at_ns))):
+            self._begin(address, at_ns)
         if address != self.address:
-            if message.system != self.address[0]:
+            if self.address is None or message.system != self.address[0]:
                 self._bad(SECOND_VEHICLE)
                 self._another_ns = at_ns
             return ()

@@ -16,7 +16,7 @@ from uavctl.sources.natnet_url import SCHEME, NatNetUrl, parse
 from uavctl.sources.pipe import ANSWER_S, COUNTS, LARGEST, READY, REFUSED
 from uavctl.transport import Connection, Rules
 from uavctl.transport.base import Base
-from uavctl.transport.rules import TOO_MANY, AllowList, RateCap
+from uavctl.transport.rules import AllowList, Budgets
 
 _MAVLINK = (0xFD, 0xFE)
 _START_S = 60.0  # for the interpreter of the process, on a busy computer
@@ -38,8 +38,9 @@ class Piped(Base):
 
     def __init__(self, url: str, arguments: list[str], now: Callable[[], int], rules: Rules) -> None:
         super().__init__(url, now)
-        self._cap, self._sender = RateCap(rules.max_per_s), (url, 0)
-        self._too_many = 0
+        self._over: Counter[str] = Counter()
+        self._budgets, self._sender = Budgets(rules, self._over), (url, 0)
+        self._budgets.trust(self._sender, now())
         self._theirs: Counter[str] = Counter()  # what the process counted
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -84,12 +85,11 @@ class Piped(Base):
         """See `Connection`."""
         return self._socket.fileno()
 
-    def receive(self) -> list[tuple[bytes, int]]:
-        """See `Connection`; more than the cap allows is dropped, the oldest first."""
-        arrived = super().receive()
-        taken = self._cap.take([self._sender] * len(arrived), self._now())
-        self._too_many += taken.count(False)
-        self.refused = self._theirs + Counter({TOO_MANY: self._too_many})
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        arrived = super().receive(everything=everything)
+        taken = self._budgets.take([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
+        self.refused = self._theirs + self._over
         return [one for one, fits in zip(arrived, taken, strict=True) if fits]
 
     def send(self, data: bytes) -> None:

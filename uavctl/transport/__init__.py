@@ -10,7 +10,7 @@ Nothing here raises once a connection is open: errors are counted, a lost connec
 
 from __future__ import annotations
 
-import selectors
+import select
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -67,13 +67,13 @@ def wait(
     Returns:
         Names of the connections to read, none if the deadline came first.
     """
+    names: dict[int, str] = {}
+    for name, connection in connections.items():
+        if not connection.closed:
+            names.update(dict.fromkeys(connection.filenos(), name))
     # select() takes microseconds; epoll would round the deadline up to a millisecond.
-    with selectors.SelectSelector() as selector:
-        for name, connection in connections.items():
-            if not connection.closed:
-                selector.register(connection, selectors.EVENT_READ, name)
-        ready = selector.select(max(0.0, (deadline_ns - now()) * 1e-9))
-    return [str(key.data) for key, _ in ready]
+    ready, _, _ = select.select(list(names), [], [], max(0.0, (deadline_ns - now()) * 1e-9))
+    return list(dict.fromkeys(names[one] for one in ready))
 
 
 def _resolve(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 MAX_READS = 256  # datagrams of one call, so that a flood cannot hold the loop
+BACKLOG_READS = 16_384  # of a call that is to read everything: more than any buffer of the system's holds
 
 
 class Connection(Protocol):
@@ -38,16 +39,42 @@ class Connection(Protocol):
         """What came and was not handed on, by reason."""
         ...
 
-    def fileno(self) -> int:
-        """File descriptor to wait for."""
+    @property
+    def unread(self) -> bool:
+        """Whether the last `receive` has left something of the vehicle's behind that had come before it."""
         ...
 
-    def receive(self) -> list[tuple[bytes, int]]:
-        """All that has arrived: (data, monotonic time of reading [ns]); empty if nothing has."""
+    @property
+    def known(self) -> bool:
+        """Whether the last `receive` had something of a sender that the flight needs; True while none is known."""
+        ...
+
+    def fileno(self) -> int:
+        """File descriptor of the socket or port."""
+        ...
+
+    def filenos(self) -> tuple[int, ...]:
+        """File descriptors to wait for."""
+        ...
+
+    def lost(self) -> int:
+        """How much the system has dropped of what the vehicle sent, for want of room, before it could be read."""
+        ...
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        """What has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
+
+        Args:
+            everything: also a long backlog of the vehicle's.
+        """
         ...
 
     def answer(self, index: int) -> None:
         """Send to the sender of the `index`-th datagram of the last `receive`, where a connection has several peers."""
+        ...
+
+    def trust(self, index: int) -> None:
+        """Keep room for the sender of the `index`-th datagram of the last `receive`: the flight needs what it says."""
         ...
 
     def send(self, data: bytes) -> None:
@@ -63,26 +90,30 @@ class Base(ABC):
     """Counters and clock of every connection."""
 
     max_reads = MAX_READS
+    backlog_reads = BACKLOG_READS
     ends_on_error = False
 
     def __init__(self, url: str, now: Callable[[], int]) -> None:
         self.url = url
         self.closed = False
+        self.unread = False
+        self.known = True
         self.send_errors = 0
         self.receive_errors = 0
         self.refused: Counter[str] = Counter()
         self._now = now
 
-    def receive(self) -> list[tuple[bytes, int]]:
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`."""
         arrived: list[tuple[bytes, int]] = []
-        for _ in range(self.max_reads):
+        self.unread = False
+        for _ in range(self.backlog_reads if everything else self.max_reads):
             if self.closed:
-                break
+                return arrived
             try:
                 data = self._read()
             except BlockingIOError:
-                break
+                return arrived
             except OSError:
                 self.receive_errors += 1
                 if self.ends_on_error:
@@ -90,11 +121,28 @@ class Base(ABC):
                 continue
             if data is not None:
                 arrived.append((data, self._now()))
+        self.unread = True
         return arrived
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """See `Connection`."""
+
+    def filenos(self) -> tuple[int, ...]:
+        """See `Connection`."""
+        return (self.fileno(),)
+
+    def lost(self) -> int:
+        """See `Connection`."""
+        return 0
 
     def answer(self, index: int) -> None:
         """See `Connection`."""
         del index  # there is only one peer
+
+    def trust(self, index: int) -> None:
+        """See `Connection`."""
+        del index
 
     @abstractmethod
     def _read(self) -> bytes | None:

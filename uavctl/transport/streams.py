@@ -17,6 +17,8 @@ from uavctl.transport.udp import Socket
 CONNECT_TIMEOUT_S = 5.0
 CHUNK_BYTES = 4096
 MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; what waits is read in the next one
+BACKLOG_CHUNKS = 128  # of a call that is to read everything; the other side waits, and loses nothing
+PORT_BYTES = 4095  # that a port of Linux keeps; a serial line waits for nobody
 _PENDING_LIMIT = 4096  # bytes that wait for a stream that does not drain
 
 
@@ -40,6 +42,7 @@ class Tcp(Socket):
 
     ends_on_error = True
     max_reads = MAX_CHUNKS
+    backlog_reads = BACKLOG_CHUNKS
 
     def __init__(self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int]) -> None:
         super().__init__(url, family, socket.SOCK_STREAM, now)
@@ -67,10 +70,12 @@ class SerialConnection(Base):
 
     ends_on_error = True
     max_reads = MAX_CHUNKS
+    backlog_reads = BACKLOG_CHUNKS
 
     def __init__(self, url: str, device: str, baud: int, now: Callable[[], int]) -> None:
         super().__init__(url, now)
         self._pending = _Pending()
+        self._full = 0  # times that it was found full
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
@@ -91,7 +96,12 @@ class SerialConnection(Base):
         data = self._port.read(CHUNK_BYTES)
         if not data:
             raise BlockingIOError
+        self._full += len(data) >= PORT_BYTES
         return data
+
+    def lost(self) -> int:
+        """See `Connection`."""
+        return self._full
 
     def send(self, data: bytes) -> None:
         """See `Connection`."""

@@ -1,21 +1,26 @@
-"""UDP: an allow-list and a rate cap come before anything that looks into a datagram."""
+"""UDP: an allow-list and budgets come before anything that looks into a datagram."""
 
 from __future__ import annotations
 
 import socket
+import struct
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 from uavctl.errors import ConnectionSpecError
-from uavctl.transport.base import Base
-from uavctl.transport.rules import NOT_LISTED, SILENCE_NS, TOO_MANY, Address, AllowList, RateCap, Rules
+from uavctl.transport.base import BACKLOG_READS, MAX_READS, Base
+from uavctl.transport.rules import MAGIC, NOT_LISTED, SILENCE_NS, Address, AllowList, Budgets, Rules
 
 PEER_SILENCE_NS = SILENCE_NS
 SECOND_ADDRESS = "second-address"
 LARGEST = 8192  # bytes that are read of a datagram; none of MAVLink is as long
-BUFFER_BYTES = 2**20  # of the kernel; what floods must not push out what counts while the loop decides
-_MAVLINK = (0xFD, 0xFE)
+COMMON_BUFFER_BYTES = 2**20  # of the kernel's, for all who are not known yet
+OWN_BUFFER_BYTES = 2**22  # for one who is: some seconds of a vehicle's words, small ones too
+COMMON_READS = 64  # datagrams of strangers in one call
+MAX_OWN = 8  # senders with a socket of their own
+_SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55  # Linux
+_MEMINFO = struct.Struct("9I")
 
 
 class Socket(Base):
@@ -49,10 +54,9 @@ class _Udp(Socket):
         self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int], rules: Rules
     ) -> None:
         super().__init__(url, family, socket.SOCK_DGRAM, now)
-        self._allow, self._cap = AllowList(rules.allow), RateCap(rules.max_per_s)
+        self._family = family
+        self._allow, self._budgets = AllowList(rules.allow), Budgets(rules, self.refused)
         self._senders: list[Address] = []
-        with suppress(OSError):  # the system may grant less
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         self._join(address)
         self._socket.setblocking(False)
 
@@ -60,30 +64,29 @@ class _Udp(Socket):
     def _join(self, address: Address) -> None:
         """Bind or connect."""
 
-    @abstractmethod
-    def _read_from(self) -> tuple[bytes, Address]:
-        """Read once."""
-
     def _read(self) -> bytes | None:
-        data, sender = self._read_from()
+        data, sender = self._socket.recvfrom(LARGEST)
+        return self._let_in(data, sender)
+
+    def _let_in(self, data: bytes, sender: Address) -> bytes | None:
         if not self._allow.lets_in(sender[0]):
             self.refused[NOT_LISTED] += 1
             return None
-        if not data:
-            return None
-        self._senders.append(sender)
-        return data
+        if data:
+            self._senders.append(sender)
+        return data or None
 
-    def receive(self) -> list[tuple[bytes, int]]:
-        """See `Connection`; more than the cap allows is dropped, the oldest first."""
-        self._senders.clear()
-        arrived = super().receive()
-        taken = self._cap.take(self._senders, self._now())
+    def _within_budgets(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
+        """Drop more than the rules allow, the oldest first; `_senders` are those of what is left."""
+        taken = self._budgets.take(self._senders, [data for data, _ in arrived], self._now())
         if all(taken):
             return arrived
-        self.refused[TOO_MANY] += taken.count(False)
         self._senders = [sender for sender, fits in zip(self._senders, taken, strict=True) if fits]
         return [one for one, fits in zip(arrived, taken, strict=True) if fits]
+
+    def lost(self) -> int:
+        """See `Connection`."""
+        return _dropped(self._socket)
 
 
 class UdpIn(_Udp):
@@ -91,39 +94,118 @@ class UdpIn(_Udp):
 
     What others send is handed on too: cameras and vehicle may share a port. Only a peer that has fallen silent is
     followed by another one, so that nobody draws the setpoints to himself while it speaks.
+
+    Vehicle and cameras get sockets of their own once they are known, on the same port and connected to them: the system
+    keeps what they send apart from what others do, and a flood fills only the buffer of the others.
     """
 
     def _join(self, address: Address) -> None:
         self._peer: Address | None = None
         self._chosen = False
         self._heard_ns = 0
+        self._own: dict[Address, socket.socket] = {}
+        self._trusted_ns: dict[Address, int] = {}
+        self._earlier: list[tuple[bytes, Address, int]] = []  # read from the common socket when an own one was made
+        _enlarge(self._socket, COMMON_BUFFER_BYTES)
         self._attempt(
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
         )
 
-    def _read_from(self) -> tuple[bytes, Address]:
-        data, sender = self._socket.recvfrom(LARGEST)
-        if self._peer == sender and not self._chosen:
-            self._heard_ns = self._now()
-        return data, sender
-
-    def receive(self) -> list[tuple[bytes, int]]:
+    def filenos(self) -> tuple[int, ...]:
         """See `Connection`."""
-        arrived = super().receive()
+        return (self._socket.fileno(), *(one.fileno() for one in self._own.values()))
+
+    def lost(self) -> int:
+        """See `Connection`."""
+        own = None if self._peer is None else self._own.get(self._peer)
+        return _dropped(self._socket if own is None else own)
+
+    def close(self) -> None:
+        """See `Connection`."""
+        for one in self._own.values():
+            one.close()
+        super().close()
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        self._senders = []
+        arrived: list[tuple[bytes, int]] = []
+        earlier, self._earlier = self._earlier, []
+        for data, sender, at_ns in earlier:
+            if self._let_in(data, sender) is not None:
+                arrived.append((data, at_ns))
+        has_own = self._peer in self._own
+        # Strangers get a handful of looks; whoever shares their socket is found by reading all that it can hold.
+        most = BACKLOG_READS if everything and not has_own else COMMON_READS
+        self.unread = not self._pull(self._socket, most, arrived) and not has_own
+        common = len(arrived)
+        for sender, own in self._own.items():
+            emptied = self._pull(own, BACKLOG_READS if everything else MAX_READS, arrived)
+            self.unread = self.unread or (sender == self._peer and not emptied)
+        self.known = len(arrived) > common or not self._own
+        arrived = self._within_budgets(arrived)
         for (data, at_ns), sender in zip(arrived, self._senders, strict=True):
+            if sender == self._peer and not self._chosen:
+                self._heard_ns = at_ns
             silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._chosen
-            if data[0] in _MAVLINK and (self._peer is None or silent):
+            if data[0] in MAGIC and (self._peer is None or silent):
                 self._peer, self._heard_ns = sender, at_ns
         return arrived
+
+    def _pull(self, one: socket.socket, most: int, arrived: list[tuple[bytes, int]]) -> bool:
+        """Read a socket; whether it is empty now."""
+        for _ in range(most):
+            try:
+                data, sender = one.recvfrom(LARGEST)
+            except BlockingIOError:
+                return True
+            except OSError:
+                self.receive_errors += 1
+                continue
+            if self._let_in(data, sender) is not None:
+                arrived.append((data, self._now()))
+        return False
 
     def answer(self, index: int) -> None:
         """See `Connection`; another peer than the one that was told before only when that has fallen silent."""
         sender = self._senders[index]
-        if self._chosen and sender != self._peer and self._now() - self._heard_ns <= PEER_SILENCE_NS:
+        now_ns = self._now()
+        if self._chosen and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
             self.refused[SECOND_ADDRESS] += 1
             return
         # Only the vehicle's own words keep its place: noise, forgeries and replays from an address do not.
-        self._peer, self._chosen, self._heard_ns = sender, True, self._now()
+        self._peer, self._chosen, self._heard_ns = sender, True, now_ns
+        self._budgets.answer(sender, now_ns)
+        self._keep(sender, now_ns)
+
+    def trust(self, index: int) -> None:
+        """See `Connection`."""
+        sender, now_ns = self._senders[index], self._now()
+        self._budgets.trust(sender, now_ns)
+        self._keep(sender, now_ns)
+
+    def _keep(self, sender: Address, now_ns: int) -> None:
+        """Give a sender a socket of its own, if there is room; who has fallen silent makes room."""
+        self._trusted_ns[sender] = now_ns
+        if sender in self._own:
+            return
+        for one, at_ns in list(self._trusted_ns.items()):
+            if now_ns - at_ns > PEER_SILENCE_NS and one != self._peer:
+                del self._trusted_ns[one]
+                if one in self._own:
+                    self._own.pop(one).close()
+        if len(self._own) >= MAX_OWN and sender != self._peer:
+            return
+        own = _connected_beside((self._socket, *self._own.values()), self._family, sender)
+        if own is None:
+            return
+        self._own[sender] = own
+        # What had come before counts before what the new socket gets.
+        for _ in range(BACKLOG_READS):
+            try:
+                self._earlier.append((*self._socket.recvfrom(LARGEST), now_ns))
+            except OSError:
+                break
 
     def send(self, data: bytes) -> None:
         """See `Connection`; without a peer there is nobody to send to, which is no error."""
@@ -140,10 +222,17 @@ class UdpOut(_Udp):
 
     def _join(self, address: Address) -> None:
         self._to = address
+        _enlarge(self._socket, OWN_BUFFER_BYTES)
         self._attempt(self._socket.connect, address, "check host, port and network")
+        self._budgets.answer(address, self._now())
 
-    def _read_from(self) -> tuple[bytes, Address]:
-        return self._socket.recv(LARGEST), self._to
+    def _read(self) -> bytes | None:
+        return self._let_in(self._socket.recv(LARGEST), self._to)
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        self._senders = []
+        return self._within_budgets(super().receive(everything=everything))
 
     def send(self, data: bytes) -> None:
         """See `Connection`; a peer that is not there yet shows as an error."""
@@ -151,3 +240,47 @@ class UdpOut(_Udp):
             self._socket.send(data)
         except OSError:
             self.send_errors += 1
+
+
+def _enlarge(one: socket.socket, size: int) -> None:
+    """Ask for a buffer of the system's; it may grant less."""
+    with suppress(OSError):
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+    with suppress(OSError):  # whoever may, gets all of it
+        one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
+
+
+def _dropped(one: socket.socket) -> int:
+    """Datagrams that the system has dropped for want of room; 0 where it does not tell."""
+    try:
+        told = one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+    except OSError:
+        return 0
+    return int(_MEMINFO.unpack(told)[-1]) if len(told) == _MEMINFO.size else 0
+
+
+def _connected_beside(
+    bound: Sequence[socket.socket], family: socket.AddressFamily, sender: Address
+) -> socket.socket | None:
+    """Another socket on the port of those that are bound, which gets what one sender sends; None if none can be had."""
+    if not hasattr(socket, "SO_REUSEPORT"):
+        return None
+    own = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        _share_port((*bound, own), shared=True)
+        _enlarge(own, OWN_BUFFER_BYTES)
+        own.bind(bound[0].getsockname())
+        own.connect(sender)
+        own.setblocking(False)
+    except OSError:
+        own.close()
+        return None
+    finally:
+        _share_port(bound, shared=False)  # only for the moment: another program must not get hold of the port
+    _share_port((own,), shared=False)
+    return own
+
+
+def _share_port(sockets: Iterable[socket.socket], *, shared: bool) -> None:
+    for one in sockets:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, int(shared))
