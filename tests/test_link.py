@@ -8,9 +8,12 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import MS, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 
+from uavctl.build import build_estimator
+from uavctl.config import load_config
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.data import Setpoint, SetpointSource, Severity
+from uavctl.flight.samples import refusal
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.request import Ask
@@ -85,8 +88,11 @@ def test_positions_of_another_system_are_counted() -> None:
 )
 def test_useless_samples_are_counted(data: bytes, reason: str) -> None:
     link = make_link()
-    assert samples(link.receive(data, NOW)) == []
+    found = samples(link.receive(data, NOW))
     assert link.stats(NOW).bad == {reason: 1}
+    # What is absurd is refused by the controller, which has to know how long a source says nothing else.
+    limits = build_estimator(load_config("room"))
+    assert [refusal(one, NOW, limits) for one in found] == (["sample-invalid"] if reason == "absurd" else [])
 
 
 def test_limits_of_the_absurd_are_configured() -> None:

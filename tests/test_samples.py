@@ -6,8 +6,7 @@ import pytest
 from flight_rig import HORIZON, MS, START_NS, make_controller, sample
 
 from uavctl.data import PositionSample, StepInput
-from uavctl.flight.estimator import begin
-from uavctl.flight.estimator import LATEST_STAMP_NS
+from uavctl.flight.estimator import LATEST_STAMP_NS, begin
 from uavctl.flight.samples import Intake, Trust, take
 
 CONTROLLER = make_controller()
@@ -16,7 +15,9 @@ CONTROLLER = make_controller()
 def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> Intake:
     """Intake after several ticks, each (time in ms, samples)."""
     history = begin(CONTROLLER.kalman, START_NS, START_NS)
-    intake = Intake(history=history, trust=Trust(), moved=False, accepted=(), refused=(), clean_ns=None, fresh=0)
+    intake = Intake(
+        history=history, trust=Trust(), moved=False, absurd=False, accepted=(), refused=(), clean_ns=None, fresh=0
+    )
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
         intake = take(CONTROLLER.kalman, CONTROLLER.reach, intake.history, intake.trust, inp, horizon, intake.fresh)

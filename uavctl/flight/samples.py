@@ -27,11 +27,13 @@ class Trust(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         suspect: Samples that the vehicle cannot have come to and that agree; None without any.
+        absurd: Positions further out than any can be, since one was believed; None without any.
         doubt_mps: How wrong the velocity may be, each axis of the plant [m/s]; None before it was held against one.
         watches: What each source has said.
     """
 
     suspect: Suspect | None = None
+    absurd: Suspect | None = None
     doubt_mps: Array | None = None
     watches: Watches = msgspec.field(default_factory=dict)
 
@@ -43,6 +45,7 @@ class Intake(msgspec.Struct, frozen=True, eq=False):
         history: The estimator with them.
         trust: What is known of the sources.
         moved: A source has moved: positions are not to be believed any more.
+        absurd: It says what cannot be for so long that the same holds, for whoever flies.
         accepted: The samples taken.
         refused: Those that were not, each with the reason (an event's code).
         clean_ns: What was captured after this was believed and has been taken back; None if nothing was [ns].
@@ -52,6 +55,7 @@ class Intake(msgspec.Struct, frozen=True, eq=False):
     history: History
     trust: Trust
     moved: bool
+    absurd: bool
     accepted: tuple[PositionSample, ...]
     refused: tuple[tuple[PositionSample, str], ...]
     clean_ns: int | None
@@ -88,6 +92,7 @@ def take(
         history=history,
         trust=trust,
         moved=trust.suspect is not None and trust.suspect.moved(reach.parameters),
+        absurd=trust.absurd is not None and trust.absurd.moved(reach.parameters),
         accepted=believed.taken,
         refused=believed.refused,
         clean_ns=believed.clean_ns,
@@ -98,7 +103,7 @@ def take(
 def forget(kalman: Kalman, intake: Intake, at_ns: int) -> Intake:
     """Forget all positions: estimator and trust as they begin, at `at_ns`."""
     history = begin(kalman, intake.history.origin_ns, at_ns)
-    return replace(intake, history=history, trust=Trust(), moved=False, fresh=0)
+    return replace(intake, history=history, trust=Trust(), moved=False, absurd=False, fresh=0)
 
 
 def _fresh_in_row(
@@ -153,7 +158,12 @@ def _believe(kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: 
         history, one, why = absorb(kalman, history, inp.at_ns, (sample,), belief)
         taken.extend(one)
         refused.extend((sample, reason) for reason in why)
-    return _Believed(history, trust, tuple(taken), tuple(refused), clean_ns)
+    far = [captured_ns(sample) for sample, reason in refused if reason == INVALID and _far_out(sample, kalman)]
+    absurd = None if taken else trust.absurd
+    if far and not taken:
+        first_ns, count = (far[0], 0) if absurd is None else (absurd.first_ns, absurd.count)
+        absurd = Suspect(first_ns, max(far), count + len(far), np.zeros(len(kalman.axes)))
+    return _Believed(history, replace(trust, absurd=absurd), tuple(taken), tuple(refused), clean_ns)
 
 
 def _unstuck(
@@ -240,6 +250,13 @@ def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters)
     if sample.received_ns > at_ns or sample.captured_ns > sample.received_ns + LATEST_STAMP_NS:
         return FUTURE
     return None
+
+
+def _far_out(sample: PositionSample, kalman: Kalman) -> bool:
+    """Whether a position is a number, and further out than any can be, as in another unit."""
+    return all(map(math.isfinite, sample.position_m)) and not _plausible(
+        sample.position_m, kalman.parameters.max_position_m
+    )
 
 
 def _plausible(values: tuple[float, float, float], limit: float) -> bool:

@@ -102,13 +102,14 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     tick = place(state, inp, intake.history, controller)
     watching, breach = _watched(state, tick, intake, inp, controller)
     clean_ns = intake.clean_ns
-    if breach is not None or (intake.moved and not lost):
+    moved = intake.moved or (intake.absurd and before not in _NOT_FLOWN)
+    if breach is not None or (moved and not lost):
         clean_ns = min(clean_ns or inp.at_ns, watching.clean_ns or inp.at_ns)
         intake = _cleaned(intake, clean_ns, controller)
         tick = place(state, inp, intake.history, controller)
     stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
     ordered, answers = take_orders(state, inp, controller)
-    if intake.moved:
+    if moved:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)

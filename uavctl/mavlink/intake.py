@@ -162,8 +162,7 @@ class PositionIntake:
             position_m = frame.to_ned(position_m)
             velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
         if self._absurd(position_m, velocity_mps):
-            self._bad(ABSURD)
-            return None
+            self._bad(ABSURD)  # the controller refuses it too, and looks at how long a source says nothing else
         if not self._has_room(message, received_ns):
             self._bad(NEW_SOURCE)
             return None
