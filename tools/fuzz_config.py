@@ -30,7 +30,7 @@ from config_mutants import CONFIG, RECORDING, Case, Mutants, bases, toml_documen
 
 LIMIT_S = 5.0
 LIMIT_MB = 500
-KILL_S = 30.0
+KILL_S = 40.0
 _GOOD_CODES = (0, 1, 2, 3, 130)
 _ADDRESS_SPACE = 8 << 30
 # Commands whose good case takes long by itself.
@@ -58,8 +58,8 @@ class Outcome:
         """What is wrong with it, if anything."""
         if "Traceback (most recent call last)" in self.text:
             return "traceback: " + self.text.strip().splitlines()[-1][:150]
-        if self.signal and self.wall_s < KILL_S:
-            return f"signal {self.signal}"
+        if self.signal:
+            return f"no end in {KILL_S:g} s" if self.wall_s >= KILL_S else f"signal {self.signal}"
         if self.code not in _GOOD_CODES:
             return f"exit code {self.code}"
         if self.busy_s > allowed_s + LIMIT_S:
