@@ -173,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1 if found.wrong(allowed_s(case)) else 0
     bad: Counter[str] = Counter()
     codes: Counter[int] = Counter()
-    slowest, largest = (0.0, ""), (0.0, "")
+    slowest, largest = (-1e9, ""), (0.0, "")
     try:
         for kind, count in (("config", given.configs), ("line", given.lines)):
             for number in range(given.first, given.first + count):
