@@ -106,8 +106,8 @@ def test_more_fences_than_a_flight_has_are_refused_at_once() -> None:
 
 
 def test_a_tick_that_divides_no_step_is_refused_after_few_tries() -> None:
-    # 99.999999937 s is 99999999937 ns, whose only divisors are large: no tick of a millisecond or more divides it.
-    problems = told(PAPER, "plant.dt_s=99.999999937", "daemon.tick_s=0.001")
+    # 4.999999937 s is 4999999937 ns, whose only divisors are large: no tick of a millisecond or more divides it.
+    problems = told(PAPER, "plant.dt_s=4.999999937", "daemon.tick_s=0.001")
     assert any("daemon.tick_s: 0.001 s does not divide" in problem for problem in problems)
 
 
@@ -179,6 +179,27 @@ def test_a_long_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
     path.write_bytes(b"0" * (MOST_BYTES + 1))
     with pytest.raises(DataFileError, match=f"longer than {MOST_BYTES}"):
         read_text(path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        (["0,1,1,-1"] * (LONGEST_MOTION + 1), f"has {LONGEST_MOTION + 1} rows, more than {LONGEST_MOTION}"),
+        (["0,1,1,-1", "1,1e300,1,-1"], "motion.csv:2: 1e+300 is beyond 1e+07"),
+        (["0,1,1,-1", "1e6,1,1,-1"], "times_s: the last one is 1e+06 steps"),
+        (["0,1,1,-1", f"1,{'9' * 100_000},1,-1"], "is not a finite number"),
+    ],
+)
+def test_a_motion_from_a_file_is_bounded_as_one_in_the_table(rows: list[str], told: str, tmp_path: Path) -> None:
+    (tmp_path / "motion.csv").write_text("\n".join(rows), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load("paper", [f"mission.trajectory.file={tmp_path / 'motion.csv'}"])
+    assert any(told in problem and len(problem) < 400 for problem in caught.value.problems), caught.value.problems
+
+
+def test_a_horizon_whose_library_would_take_minutes_is_refused() -> None:
+    assert "smpc.horizon: 25 steps are more" in told(PAPER, "smpc.horizon=25")[0]
+    assert parse(PAPER, "my.toml", ["smpc.horizon=25", "solver.method=exact"]).config.smpc.horizon == 25
 
 
 # --- command lines ---------------------------------------------------------------------------------------------------

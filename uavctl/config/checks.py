@@ -16,6 +16,7 @@ from uavctl.config.peers import DaemonConfig
 from uavctl.config.problem import Problem as Problem
 from uavctl.config.section import LARGEST, Open
 from uavctl.config.types import (
+    LIBRARY_HORIZON,
     CostConfig,
     EstimatorConfig,
     LimitsConfig,
@@ -26,6 +27,7 @@ from uavctl.config.types import (
     Section,
     SetsConfig,
     SmpcConfig,
+    SolverConfig,
     TargetConfig,
 )
 
@@ -192,6 +194,15 @@ def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) ->
         yield from _length(f"schedule.search_states[{i}]", state, n_x, "n_x")
 
 
+def _library(smpc: SmpcConfig, solver: SolverConfig) -> Iterator[Problem]:
+    if solver.method == "library" and smpc.horizon > LIBRARY_HORIZON:
+        yield Problem(
+            "smpc.horizon",
+            f"{smpc.horizon} steps are more than a policy library is made for, {LIBRARY_HORIZON}",
+            'shorten it, or set solver.method = "exact"',
+        )
+
+
 def _target(plant: PlantConfig, sets: SetsConfig, target: TargetConfig) -> Iterator[Problem]:
     yield from mission_checks.outside(plant, sets, target.position_m, "target.position_m", "target")
 
@@ -276,6 +287,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("plant", "cost"), _cost),
     (("plant", "smpc"), _smpc),
     (("plant", "smpc", "schedule"), _schedule),
+    (("smpc", "solver"), _library),
     (("plant", "sets", "target"), _target),
     (("link",), _link),
     (("plant", "daemon"), _tick),

@@ -10,6 +10,7 @@ from uavctl.config.problem import Problem
 from uavctl.config.section import Floats, Position
 from uavctl.config.types import PlantConfig, SetsConfig, SolverConfig
 
+MOST_STEPS = 50_000  # of a motion, each of which is made before the flight
 _AXES = ("north", "east", "down")
 
 
@@ -65,6 +66,13 @@ def _trajectory(plant: PlantConfig, sets: SetsConfig, motion: TrajectoryConfig) 
     if count < 2:
         yield Problem(f"{key}.times_s", f"has {count} entries, a motion has at least 2", "add samples")
     yield from _increasing(f"{key}.times_s", motion.times_s)
+    steps = max(motion.times_s, default=0.0) / plant.dt_s
+    if steps > MOST_STEPS:
+        yield Problem(
+            f"{key}.times_s",
+            f"the last one is {steps:.3g} steps of plant.dt_s = {plant.dt_s:g} s ahead",
+            f"give a motion of at most {MOST_STEPS} steps",
+        )
     for name in ("positions_m", "velocities_mps"):
         entries = len(getattr(motion, name))
         if entries != count and (entries or name == "positions_m"):

@@ -11,10 +11,11 @@ import msgspec
 from uavctl.config.data_file import DataFileError, read_lines, refuse
 from uavctl.config.mission import MissionConfig
 from uavctl.config.problem import Problem
-from uavctl.config.section import Floats
+from uavctl.config.section import LARGEST, LONGEST_MOTION, Floats
 
 _WANTED = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
 _WITHOUT, _WITH = 4, 7  # columns
+_SHOWN = 40  # characters of a cell that is none
 _LISTS = ("times_s", "positions_m", "velocities_mps")
 
 
@@ -63,6 +64,8 @@ def _rows(path: Path) -> list[tuple[int, Floats]]:
         rows = rows[1:]  # a header
     if not rows:
         raise DataFileError((f"{path}: has no rows",))
+    if len(rows) > LONGEST_MOTION:
+        raise DataFileError((f"{path}: has {len(rows)} rows, more than {LONGEST_MOTION}",))
     width = len(rows[0][1])
     refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, width)])
     return [(number, tuple(float(cell) for cell in cells)) for number, cells in rows]
@@ -80,8 +83,11 @@ def _wrong(cells: list[str], width: int) -> Iterator[str]:
     elif len(cells) != width:
         yield f"has {len(cells)} columns, the first row has {width}"
     for cell in cells:
-        if _number(cell) is None:
-            yield f'"{cell.strip()}" is not a finite number'
+        value = _number(cell)
+        if value is None:
+            yield f'"{cell.strip()[:_SHOWN]}" is not a finite number'
+        elif abs(value) > LARGEST:
+            yield f"{value:g} is beyond {LARGEST:g}"
 
 
 def _number(cell: str) -> float | None:

@@ -66,7 +66,7 @@ def _wrong(cells: list[str], column: int, width: int) -> Iterator[str]:
     try:
         delay = _delay(cells[column])
     except ValueError:
-        yield f'"{cells[column].strip()}" is not a number'
+        yield f'"{cells[column].strip()[:40]}" is not a number'
         return
     if not delay >= 0.0:
         yield f"{delay:g} is not a delay in s"

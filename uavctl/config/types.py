@@ -25,6 +25,7 @@ from uavctl.config.section import Section as Section
 from uavctl.config.security import SecurityConfig as SecurityConfig
 from uavctl.config.sim import SimConfig
 
+LIBRARY_HORIZON = 24  # making the library takes minutes beyond
 Delay = Annotated[int, Meta(le=60)]
 
 
@@ -35,7 +36,7 @@ class PlantConfig(Section, frozen=True, kw_only=True):
         Literal["matrices", "drag-lag"],
         Meta(description="`matrices`: a, b, e, w as given; `drag-lag`: made from drag_1ps, lag_s, gain, wind_std_mps2"),
     ]
-    dt_s: Annotated[float, Meta(ge=0.001, le=100, description="time step Δt [s]")]
+    dt_s: Annotated[float, Meta(ge=0.001, le=5, description="time step Δt [s]")]
     axes: Annotated[
         tuple[Literal["north", "east", "down"], ...],
         Meta(
@@ -103,7 +104,14 @@ class CostConfig(Section, frozen=True, kw_only=True):
 class SmpcConfig(Section, frozen=True, kw_only=True):
     """The paper's scheme."""
 
-    horizon: Annotated[int, Meta(ge=2, le=60, description="prediction horizon H [steps]")]
+    horizon: Annotated[
+        int,
+        Meta(
+            ge=2,
+            le=40,
+            description=f"prediction horizon H; with solver.method `library` at most {LIBRARY_HORIZON} [steps]",
+        ),
+    ]
     tau: Annotated[int, Meta(ge=1, le=20, description="delay τ of the terminal control law [steps]")]
     delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")]
     delta_u: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_u of the input constraints")]
