@@ -34,6 +34,7 @@ def told(text: str, *overrides: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("brackets", ["[]", "{}"])
 @pytest.mark.parametrize("depth", [DEEPEST + 1, 500, 200_000])
+@pytest.mark.fault(33)
 def test_deep_nesting_is_refused_with_its_line(brackets: str, depth: int) -> None:
     opened = brackets[0] if brackets == "[]" else "{a="
     text = PAPER + f"\n[extra]\ndeep = {opened * depth}1{brackets[1] * depth}\n"
@@ -89,6 +90,7 @@ def test_long_texts_are_refused_before_they_are_read_as_toml() -> None:
         ("sim.camera.rate_hz=1e9", "sim.camera.rate_hz"),
     ],
 )
+@pytest.mark.fault(33)
 def test_what_no_key_takes_is_told_with_the_key(override: str, key: str) -> None:
     model = ("link.model=trace",) if "trace_s" in override else ()
     problems = told(PAPER, *model, override)
@@ -99,6 +101,7 @@ def test_numbers_of_thousands_of_digits_are_refused() -> None:
     assert told(PAPER + f"\n[x]\ny = {'9' * 5000}\n")[0].startswith("my.toml:")
 
 
+@pytest.mark.fault(33)
 def test_more_fences_than_a_flight_has_are_refused_at_once() -> None:
     most = PAPER.replace("fence = []\n", "") + FENCE * 50
     assert len(parse(most, "my.toml").config.fence) == 50

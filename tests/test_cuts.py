@@ -48,11 +48,13 @@ def all_wrong(cuts: Cuts, places: list[tuple[int, int]]) -> dict[tuple[int, int]
     return {place: text for place, text in found.items() if text}
 
 
+@pytest.mark.fault(52)
 def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
     assert len(cuts.files) > 1 and len(cuts.chunks) > 8
     assert all_wrong(cuts, cuts.places()) == {}
     assert cuts.straddled >= 10  # ticks of which the decision is beyond the cut
 
 
+@pytest.mark.fault(52)
 def test_cut_anywhere(cuts: Cuts) -> None:
     assert all_wrong(cuts, cuts.drawn(20, seed=1)) == {}

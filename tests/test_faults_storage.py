@@ -204,6 +204,7 @@ def test_31_killed_processes_lose_the_open_chunk_at_most() -> None:
 
 
 @pytest.mark.parametrize(("scenario", "runs"), [("cuts", 4), ("killed-flight", 2)])
+@pytest.mark.fault(52)
 def test_what_is_left_of_a_flight_replays_alike(scenario: str, runs: int) -> None:
     done = subprocess.run(
         [sys.executable, TOOL, "--scenario", scenario, "--runs", str(runs), "--json"],

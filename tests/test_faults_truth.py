@@ -64,7 +64,7 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
     assert 0.0 <= bounded(flight).hold_mps2 <= 0.05
 
 
-@pytest.mark.fault(15)
+@pytest.mark.fault(15, 45)
 @pytest.mark.parametrize("axes", IN_THE_AIR)
 def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
     prepared: Prepared, world: Config, axes: str
@@ -74,7 +74,7 @@ def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
-@pytest.mark.fault(15)
+@pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", AT_ONCE)
 def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
     prepared: Prepared, world: Config, axes: str
@@ -85,7 +85,7 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
-@pytest.mark.fault(15)
+@pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
 def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
     prepared: Prepared, world: Config, axes: str
@@ -113,6 +113,7 @@ def test_a_blackout_in_motion(prepared: Prepared, world: Config, at_s: float) ->
 
 
 @pytest.mark.parametrize("noise_m", [0.2, 0.7])
+@pytest.mark.fault(42)
 def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: float) -> None:
     flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=2.0, kind="noise", value=noise_m))))
     assert flight.alarms
@@ -120,6 +121,7 @@ def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: floa
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.fault(41)
 def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str) -> None:
     config = load_config("room", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])
     gale = FaultConfig(at_s=6.0, kind="wind", velocity_mps=(9.0, 0.0, 0.0))
@@ -129,5 +131,6 @@ def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str)
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.fault(44)
 def test_two_faults_at_a_time(prepared: Prepared, seed: int) -> None:
     bounded(fly_pair(prepared, seed))

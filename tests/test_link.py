@@ -124,6 +124,7 @@ def test_each_sources_new_clock_is_told_once() -> None:
     assert told == [54, 104, 154]
 
 
+@pytest.mark.fault(47)
 def test_forged_sources_keep_no_later_one_out() -> None:
     """Each of many speaks once; a genuine one that comes later is heard at once, and its clock is kept."""
     link = make_link()
@@ -139,6 +140,7 @@ def test_forged_sources_keep_no_later_one_out() -> None:
     assert sample.received_ns - sample.captured_ns == 190 * MS
 
 
+@pytest.mark.fault(47)
 def test_a_source_that_speaks_loses_nothing_to_those_that_come_and_go() -> None:
     link, strange = make_link(), 0
     for n in range(500):
@@ -170,6 +172,7 @@ def test_answers_of_many_peers_do_not_lose_the_vehicle_s_clock() -> None:
     assert trips.offset_ns(NOW + 100 * SECOND) == 5 * SECOND
 
 
+@pytest.mark.fault(48)
 def test_others_requests_for_the_time_leave_the_vehicle_its_answers() -> None:
     link, vehicle = make_link(), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from loopback_rig import Memory, make_loop
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -83,6 +84,7 @@ def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() ->
     assert SETPOINT not in rig.run(2, deaf=True)
 
 
+@pytest.mark.fault(49)
 def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes_behind_it() -> None:
     rig = Rig()
     rig.run(40)
@@ -92,6 +94,7 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
     assert any("released" in event.text for event in rig.memory.of(Event))
 
 
+@pytest.mark.fault(50)
 def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again() -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
@@ -110,6 +113,7 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     assert result.identical, result.first_difference
 
 
+@pytest.mark.fault(48)
 def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
     rig = Rig()
     rig.run(40)

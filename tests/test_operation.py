@@ -174,6 +174,7 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
     assert lines[0] in told  # the health line of a daemon without a terminal
 
 
+@pytest.mark.fault(55)
 def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
@@ -208,6 +209,7 @@ os.{call} = hanging
 
 
 @pytest.mark.parametrize("call", ["write", "fsync"])
+@pytest.mark.fault(54)
 def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
     flag = air.folder / "hangs"
     (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))

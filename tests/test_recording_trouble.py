@@ -79,6 +79,7 @@ def hung(path: Path, disk: Hanging, clock: Clock) -> Recorder:
     return recorder
 
 
+@pytest.mark.fault(54)
 def test_a_disk_that_hangs_is_told_by_the_age_of_the_last_completed_write(tmp_path: Path, disk: Hanging) -> None:
     clock = Clock()
     recorder = hung(tmp_path / "flight.mcap", disk, clock)
@@ -102,6 +103,7 @@ def test_a_disk_that_hangs_is_told_by_the_age_of_the_last_completed_write(tmp_pa
     assert recorder.close(60.0).ok
 
 
+@pytest.mark.fault(54)
 def test_an_end_that_does_not_reach_the_disk_is_told(tmp_path: Path, disk: Hanging) -> None:
     clock = Clock()
     recorder = hung(tmp_path / "flight.mcap", disk, clock)
@@ -133,6 +135,7 @@ def emptied(path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", [removed, folder_removed, folder_moved, replaced, emptied])
+@pytest.mark.fault(55)
 def test_a_file_that_is_taken_away_is_told_and_another_one_begun(tmp_path: Path, harm: Callable[[Path], None]) -> None:
     path = tmp_path / "flights" / "flight.mcap"
     clock = Clock()
@@ -157,6 +160,7 @@ def test_a_file_that_is_taken_away_is_told_and_another_one_begun(tmp_path: Path,
     assert recorder_health(final, path).dropped == final.gone
 
 
+@pytest.mark.fault(55)
 def test_a_closed_file_that_is_taken_away_is_told_too(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     clock = Clock()
@@ -173,6 +177,7 @@ def test_a_closed_file_that_is_taken_away_is_told_too(tmp_path: Path) -> None:
     assert recorder.close().gone == status.gone
 
 
+@pytest.mark.fault(55)
 def test_a_file_that_is_taken_away_just_before_the_end_is_told(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     recorder = SyncRecorder(path, clock=Clock())

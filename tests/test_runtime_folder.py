@@ -87,6 +87,7 @@ HARMS = [open_to_others, link, of_somebody_else, a_file]
 
 
 @pytest.mark.parametrize("harm", HARMS)
+@pytest.mark.fault(56)
 def test_what_is_not_one_s_own_is_not_used(machine: Path, harm: Callable[[Path], None]) -> None:
     given = machine / "given"
     harm(given)
@@ -110,6 +111,7 @@ def test_a_place_that_is_taken_is_told_in_a_line_and_does_not_matter_beside_a_se
         assert [path.parent for path in lock_paths(URL)] == [folder / "uavctl"]
 
 
+@pytest.mark.fault(57)
 def test_processes_of_one_user_meet_whatever_their_environment_says(
     machine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +131,7 @@ def test_processes_of_one_user_meet_whatever_their_environment_says(
     assert not any(path.exists() for path in lock_paths(URL))
 
 
+@pytest.mark.fault(56)
 def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None:
     def does() -> str:
         found = []
@@ -157,6 +160,7 @@ def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None
         assert not is_own(machine / "tmp")
 
 
+@pytest.mark.fault(56)
 def test_what_root_left_behind_is_told_in_a_line(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (path,) = lock_paths(URL)
     path.touch(mode=0o666)

@@ -169,6 +169,7 @@ class Mirror(AttackBench):
 
 
 @pytest.mark.fault(37)
+@pytest.mark.fault(51)
 def test_genuine_frames_that_are_delivered_first_at_the_other_port_change_nothing(plain_flight: list[Any]) -> None:
     bench = Mirror()
     assert flown(bench) == plain_flight

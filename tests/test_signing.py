@@ -156,6 +156,7 @@ def test_link_ids_of_peers_can_be_given() -> None:
 
 
 @pytest.mark.fault(37)
+@pytest.mark.fault(51)
 def test_genuine_frames_that_somebody_brings_elsewhere_first_are_not_old_here() -> None:
     stamps = Stamps()
     here, elsewhere = make_signing(stamps), make_signing(stamps)

@@ -170,6 +170,7 @@ def test_the_rig_s_clock_is_that_of_the_stamps() -> None:
     assert OFFSET_NS == 1_800_000_000 * 10**9
 
 
+@pytest.mark.fault(56)
 def test_no_other_user_can_open_the_files_and_what_one_left_half_written_is_not_in_the_way(tmp_path: Path) -> None:
     path = tmp_path / "keys" / "key.stamp"
     save(path, STAMP)

@@ -105,6 +105,7 @@ def test_a_sender_gets_its_rate_and_the_newest_of_each_batch() -> None:
 
 
 @pytest.mark.fault(39)
+@pytest.mark.fault(46)
 def test_frames_and_bytes_are_counted_and_not_datagrams_alone() -> None:
     """A sender within its datagrams: as many frames as it may send are looked at, and no more bytes are handed on."""
     for data in (Peer(99).heartbeat() * 5, Peer(99).odometry(1) * 5, HEARTBEATS, b"\xfe" * 4096):
@@ -119,6 +120,7 @@ def test_frames_and_bytes_are_counted_and_not_datagrams_alone() -> None:
 
 @pytest.mark.fault(39)
 @pytest.mark.parametrize("kind", WORDS)
+@pytest.mark.fault(46)
 def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,6 +147,7 @@ def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
 
 
 @pytest.mark.fault(39)
+@pytest.mark.fault(46)
 def test_a_flooder_takes_nothing_of_another_sender_s_share() -> None:
     cap, _ = budgets()
     flooder, other = ("192.0.2.1", 1), ("192.0.2.1", 2)
@@ -155,6 +158,7 @@ def test_a_flooder_takes_nothing_of_another_sender_s_share() -> None:
 
 
 @pytest.mark.fault(39)
+@pytest.mark.fault(46)
 def test_strangers_share_what_one_has_and_take_nothing_of_vehicle_and_cameras() -> None:
     cap, refused = budgets()
     cap.answer(VEHICLE, 0)
@@ -171,6 +175,7 @@ def test_strangers_share_what_one_has_and_take_nothing_of_vehicle_and_cameras() 
 
 
 @pytest.mark.fault(39)
+@pytest.mark.fault(47)
 def test_a_later_vehicle_is_heard_beside_sixteen_flooders() -> None:
     cap, _ = budgets()
     flooders: list[Address] = [("192.0.2.1", port) for port in range(16)]
@@ -338,6 +343,7 @@ def known(connection: Connection, who: socket.socket) -> None:
 
 
 @pytest.mark.fault(39)
+@pytest.mark.fault(46)
 def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
         known(connection, vehicle)
