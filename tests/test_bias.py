@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from envelope_rig import PARAMETERS
 from flight_rig import (
     DT_NS,
     HORIZON,
     MS,
     START_NS,
+    TICK_NS,
     TICKS,
     StubSolver,
     drag_lag_generator,
@@ -29,7 +31,7 @@ from scipy.linalg import expm
 
 from uavctl.build import build_controller, build_design, build_spec
 from uavctl.config import load_config
-from uavctl.data import ControlMode, PositionSample, StepInput
+from uavctl.data import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.errors import ConfigError
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
@@ -223,3 +225,30 @@ def test_without_it_nothing_is_estimated_shifted_or_left_free() -> None:
 def test_a_configuration_that_does_not_fit_is_refused(overrides: tuple[str, ...], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         load_config("room", list(overrides))
+
+
+def test_what_positions_that_are_taken_back_told_of_it_is_forgotten() -> None:
+    """After 4 s positions go their own way, against the vehicle's word: it is let go, level, without what they told."""
+    north = replace(PARAMETERS, axes=(True, False, False))
+    controller = replace(make_controller(Steady(small_plant()), bias_drift=0.3, bias_max=MOST), envelope=north)
+    state, lies = initial_state(), 20 * TICKS
+    for n in range(2 * lies):
+        at_ns = START_NS + n * TICK_NS
+        place = 0.33 * max(n - lies, 0) * TICK_NS * 1e-9
+        said = sample(at_ns, position_m=(place, 0.0, 0.0))
+        own = VehicleMotion(velocity_mps=(0.0, 0.0, 0.0), velocity_ns=at_ns)
+        before = state
+        state, output = step(
+            state, StepInput(tick=n, at_ns=at_ns, samples=(said,), vehicle=vehicle(), motion=own), controller
+        )
+        if state.breach is not None:
+            break
+    assert state.breach is not None and n > lies + TICKS
+    clean_ns = state.watching.clean_ns
+    assert clean_ns is not None and lies * TICK_NS <= clean_ns - START_NS < n * TICK_NS
+    assert any(at_ns > clean_ns for at_ns, _ in before.biases)
+    assert state.biases == tuple(one for one in before.biases if one[0] <= clean_ns) != ()
+    assert state.history is not None and state.history.captured_ns == clean_ns
+    assert output.estimate is not None and output.estimate.captured_ns == clean_ns
+    assert output.decision.mode is ControlMode.HOLD and output.setpoint is not None
+    assert output.setpoint.accel_mps2 == (0.0, 0.0, 0.0)

@@ -23,7 +23,17 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from uavctl.data import Estimate, PositionSample
-from uavctl.flight.estimator import DUPLICATE, TOO_OLD, History, absorb, begin, belief_at, estimate, set_input
+from uavctl.flight.estimator import (
+    DUPLICATE,
+    TOO_OLD,
+    History,
+    absorb,
+    begin,
+    belief_at,
+    estimate,
+    set_input,
+    without,
+)
 from uavctl.flight.kalman import Kalman, make_kalman
 from uavctl.flight.propagation import make_propagation
 from uavctl.smpc.plant import Plant
@@ -344,3 +354,53 @@ def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
     at_ns = START_NS + TICKS * TICK_NS
     history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns + 5 * MS, at_ns - 3 * MS)])
     assert history.captured_ns == at_ns - 3 * MS
+
+
+def told(history: History) -> list[str]:
+    """All that is known, to the last bit."""
+    return [repr((history.origin_ns, history.horizon_ns, history.anchor))] + [repr(one) for one in history.entries]
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("bias_drift", [0.0, 0.03])
+def test_what_is_taken_back_is_as_if_it_had_never_come(seed: int, bias_drift: float) -> None:
+    """Samples late, in bursts, from two sources; some of what came after the window's begin was poisoned."""
+    rng = np.random.default_rng(seed)
+    kalman, history = make(bias_drift=bias_drift, bias_max=0.4)
+    never, ticks = history, 70
+    window_ns = 2 * S
+    poisoned_from_ns = START_NS + (ticks - 1) * TICK_NS - window_ns + int(rng.integers(1, S))
+
+    def poisoned(one: PositionSample) -> bool:
+        return one.source == "bad" and one.captured_ns > poisoned_from_ns
+
+    taken_back = 0
+    for tick in range(ticks):
+        at_ns = START_NS + tick * TICK_NS
+        due = [
+            sample(
+                at_ns - int(rng.integers(0, 4 * TICK_NS)),
+                at_ns,
+                position_m=(float(rng.normal()), 0.0, 0.0),
+                source="bad" if rng.random() < 0.5 else "good",
+            )
+            for _ in range(rng.integers(0, 3))
+        ]
+        taken_back += sum(map(poisoned, due))
+        history, _, _ = absorb(kalman, history, at_ns, due)
+        never, _, _ = absorb(kalman, never, at_ns, [one for one in due if not poisoned(one)])
+        u = None if tick % 17 == 0 else rng.normal(size=1)
+        if rng.random() < 0.6:
+            history, never = (set_input(kalman, known, at_ns, u) for known in (history, never))
+    assert taken_back > 3 and told(history) != told(never)
+    assert told(without(kalman, history, poisoned)) == told(never)
+    assert told(without(kalman, never, poisoned)) == told(never)
+
+
+def test_what_the_anchor_holds_is_not_taken_back() -> None:
+    kalman, history = make()
+    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS)])
+    history, _, _ = absorb(kalman, history, START_NS + 3 * S, [sample(START_NS + 3 * S)])
+    history = without(kalman, history, lambda one: True)
+    assert history.captured_ns == START_NS
+    assert all(one.sample is None for one in history.entries)

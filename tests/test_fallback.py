@@ -105,8 +105,9 @@ def test_begins_with_braking() -> None:
 
 def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
     velocity = (1.0, -2.0, 0.0)
-    assert acceleration(enter(0), 2 * S - 1, velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
-    assert acceleration(enter(0), 2 * S, velocity, PARAMETERS) == (0.0, 0.0, 0.0)  # on the way to holding
+    assert acceleration(enter(5 * S), 7 * S - 1, velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
+    for over_ns in (7 * S, 7 * S + 1):
+        assert acceleration(enter(5 * S), over_ns, velocity, PARAMETERS) == (0.0, 0.0, 0.0)  # on the way to holding
     for mode in (HOLD, LAND, STOPPED):
         assert acceleration(Fallback(mode=mode, since_ns=0), 0, velocity, PARAMETERS) == (0.0, 0.0, 0.0)
 
@@ -120,6 +121,7 @@ def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
         (Fallback(HOLD, 4), BARRED, Fallback(BRAKE, 9, BARRED)),
         (Fallback(HOLD, 4, STOP), STOP, Fallback(HOLD, 4, STOP)),
         (Fallback(HOLD, 4, BARRED), STOP, Fallback(BRAKE, 9, STOP)),
+        (Fallback(HOLD, 4, STOP), TO_LAND, Fallback(BRAKE, 9, TO_LAND)),
         (Fallback(BRAKE, 4, TO_LAND), STOP, Fallback(BRAKE, 4, TO_LAND)),  # nobody takes a landing back
         (Fallback(BRAKE, 4, STOP), BARRED, Fallback(BRAKE, 4, STOP)),
         (Fallback(BRAKE, 4, BARRED), TO_LAND, Fallback(BRAKE, 4, TO_LAND)),
@@ -160,6 +162,7 @@ def test_a_tick_cannot_change_what_the_tick_before_left() -> None:
         ((0.0, 0.0, 0.3), (0.0, 0.0, -0.3), 0, STILL, BRAKE),
         ((0.3, 0.0, 0.0), ZERO, 3 * S - 1, FAST, BRAKE),
         ((0.3, 0.0, 0.0), ZERO, 3 * S, FAST, HOLD),  # it is not waited for for ever
+        ((0.3, 0.0, 0.0), ZERO, 4 * S, FAST, HOLD),
     ],
 )
 def test_holding_begins_once_the_setpoint_is_what_is_held(
@@ -176,6 +179,7 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
     [
         (RECOVER, True, 0.151, BRAKE),
         (RECOVER, True, 0.15, HOLD),
+        (RECOVER, True, 0.149, HOLD),
         (RECOVER, False, 9.0, HOLD),  # a prediction does not drift
         (STOP, True, 9.0, HOLD),
     ],
@@ -208,8 +212,17 @@ def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> Non
         biases = remember(biases, n * S, bias)
         assert (learnt(biases) == (0.0, 0.0, 0.0)) == (n < 2)
     assert learnt(biases) == (0.2, 0.0, -0.1)
-    assert learnt(((0, (0.5,)), (2 * S - 1, (0.5,)))) == (0.0,)
-    assert learnt(((0, (0.5,)), (2 * S, (0.5,)))) == (0.5,)
-    later = remember(biases, 3 * S, (0.4, 0.1, 0.1))
-    assert later[0][0] == 0
-    assert remember(later, 3 * S + 1, (0.4, 0.1, 0.1))[0][0] == S
+    for after_ns, known in ((2 * S - 1, 0.0), (2 * S, 0.5), (2 * S + 1, 0.5)):
+        assert learnt(((5 * S, (0.5,)), (5 * S + after_ns, (0.5,)))) == (known,)
+    for after_ns, first_ns in ((3 * S - 1, 5 * S), (3 * S, 5 * S), (3 * S + 1, 6 * S)):
+        later = remember(((5 * S, (0.1,)), (6 * S, (0.2,))), 5 * S + after_ns, (0.3,))
+        assert (later[0][0], later[-1]) == (first_ns, (5 * S + after_ns, (0.3,)))
+
+
+def test_what_does_not_fit_together_is_an_error_and_not_compared_in_part() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        advance(enter(0), 0, STILL, ZERO, PARAMETERS, (0.0, 0.0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="zip"):
+        learnt(((0, (0.1,)), (1, (0.1, 0.2))))
+    with pytest.raises(TypeError):  # whose word it is has to be said
+        advance(enter(0), 0, STILL, ZERO, PARAMETERS, ZERO, True)  # type: ignore[call-arg]

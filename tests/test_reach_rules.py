@@ -132,6 +132,23 @@ def test_a_source_has_moved_after_three_that_agree_and_the_configured_time(
     assert Suspect(7, 7 + last_ns, count, off(1.0)).moved(PARAMETERS) is moved
 
 
+@pytest.mark.parametrize(
+    ("count", "last_ns", "likely"),
+    [
+        (2, 100 * MS, True),
+        (2, 100 * MS - 1, False),
+        (1, 900 * MS, False),
+        (3, 100 * MS - 1, False),
+        (3, 101 * MS, True),
+        (2, 900 * MS, True),
+    ],
+)
+def test_a_source_may_well_have_moved_after_two_that_agree_and_a_tenth_of_a_second(
+    count: int, last_ns: int, likely: bool
+) -> None:
+    assert Suspect(7 * MS, 7 * MS + last_ns, count, off(1.0)).likely is likely
+
+
 def test_who_is_suspected_and_how_far_inputs_carry_are_objects_that_nobody_changes(reach: Reach) -> None:
     suspect = Suspect(5, 7, 2, np.array([1.0, 2.0]))
     with pytest.raises(FrozenInstanceError):

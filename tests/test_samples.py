@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
-from flight_rig import HORIZON, MS, START_NS, make_controller, sample
+from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, vehicle
+from msgspec import structs
 
 from uavctl.data import PositionSample, StepInput
-from uavctl.flight.estimator import LATEST_STAMP_NS, begin
+from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
+from uavctl.flight.reach import GateParameters
 from uavctl.flight.samples import Intake, Trust, take
+from uavctl.flight.stuck import FROZEN
 
 CONTROLLER = make_controller()
 
@@ -79,3 +85,63 @@ def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_t
     arrival_ns = START_NS + 440 * MS
     intake = taken([(450, [sample(arrival_ns + LATEST_STAMP_NS + 1, arrival_ns)])])
     assert (len(intake.accepted), [why for _, why in intake.refused]) == (0, ["sample-future"])
+
+
+def pushed(says: dict[str, int], ticks: int, *, believes: bool = True) -> list[Intake]:
+    """Cameras, some millimetres off, of a vehicle pushed north from tick 12 on; each says the same from a tick on.
+
+    A tick of -1 is never. Where they are not to be believed, what is said again does not come.
+    """
+    controller = replace(make_controller(), trust=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
+    history = begin(controller.kalman, START_NS, START_NS)
+    a, b, _ = controller.plant.transition(TICK_NS * 1e-9)
+    x, intakes, last = np.zeros(3), [], dict.fromkeys(says, 0.0)
+    intake = Intake(
+        history=history, trust=Trust(), moved=False, absurd=False, accepted=(), refused=(), clean_ns=None, fresh=0
+    )
+    for tick in range(ticks):
+        at_ns, samples = START_NS + tick * TICK_NS, []
+        for n, (source, freezes) in enumerate(says.items()):
+            again = 0 <= freezes < tick
+            last[source] = last[source] if again else float(x[0]) + 0.001 * (tick % 2)
+            if believes or not again:
+                samples.append(sample(at_ns - n * MS, at_ns, (last[source], 0.0, 0.0), source=source))
+        inp = StepInput(tick=tick, at_ns=at_ns, samples=tuple(samples), vehicle=vehicle())
+        intake = take(controller.kalman, controller.reach, intake.history, intake.trust, inp, HORIZON, intake.fresh)
+        u = np.full(1, float(tick >= 12))
+        intake = structs.replace(intake, history=set_input(controller.kalman, intake.history, at_ns, u))
+        intakes.append(intake)
+        x = a @ x + b @ u
+    return intakes
+
+
+def refused_as(intake: Intake) -> set[str]:
+    return {why for _, why in intake.refused}
+
+
+def test_what_a_stuck_source_said_again_is_taken_back() -> None:
+    # From rest it says the same although it is pushed: at first nobody can tell it from one that rounds.
+    found = pushed({"stuck": 12}, 40)
+    back = [tick for tick, one in enumerate(found) if one.clean_ns is not None]
+    assert len(back) == 1
+    (tick,) = back
+    assert refused_as(found[tick]) == {FROZEN}
+    believed = [n for n in range(13, tick) if found[n].accepted]
+    assert believed  # or there was nothing to take back
+    assert found[tick].clean_ns == START_NS + 12 * TICK_NS
+    assert found[tick].fresh == 0
+    assert found[tick - 1].history.captured_ns == START_NS + believed[-1] * TICK_NS
+    never = pushed({"stuck": 12}, 40, believes=False)
+    assert repr(found[tick].history) == repr(never[tick].history)
+    for one in found[tick + 1 :]:
+        assert (refused_as(one), one.clean_ns, one.accepted) == ({FROZEN}, None, ())
+    assert repr(found[-1].history) == repr(never[-1].history)
+
+
+def test_what_others_said_meanwhile_is_kept() -> None:
+    found = pushed({"good": -1, "stuck": 12}, 40)
+    never = pushed({"good": -1, "stuck": 12}, 40, believes=False)
+    back = [tick for tick, one in enumerate(found) if one.clean_ns is not None]
+    assert back and found[back[0]].clean_ns == START_NS + 12 * TICK_NS - MS
+    assert repr(found[-1].history) == repr(never[-1].history)
+    assert found[-1].history.captured_ns == START_NS + 39 * TICK_NS

@@ -13,7 +13,7 @@ from uavctl.data import PositionSample
 from uavctl.flight.estimator import absorb, begin, set_input
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.reach import GateParameters
-from uavctl.flight.stuck import Watch, Watches, observe, stuck
+from uavctl.flight.stuck import Watch, Watches, doubtful, observe, stuck
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 PLANT = small_plant()
@@ -132,6 +132,44 @@ def test_what_counts_as_stuck(
     assert stuck(watch, KALMAN, one, PARAMETERS) is found
     assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
     assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS) is True
+
+
+@pytest.mark.parametrize(
+    ("news_m", "resolution_m", "far_m", "doubted"),
+    [
+        (0.004, 0.001, 0.0, True),  # noise of four resolutions
+        (0.003999, 0.001, 0.0, False),
+        (2e-5, 1e-6, 0.0, True),
+        (1.99e-5, 1e-6, 0.0, False),  # a message's numbers
+        (9.0, 0.0, 0.0, False),  # it has said but one thing
+        (0.0, 0.0, 0.01499, False),  # half of 6 times 5 mm
+        (0.0, 0.0, 0.01501, True),
+        (0.0, 0.0, -0.01501, True),
+        (0.0, 0.0, -0.01499, False),
+        (0.0, 0.002, 0.01699, False),
+        (0.0, 0.002, 0.01701, True),
+    ],
+)
+def test_when_a_value_that_came_again_is_not_believed(
+    news_m: float, resolution_m: float, far_m: float, doubted: bool
+) -> None:
+    """However uncertain the prediction is, in the axis of the plant alone."""
+    one = sample(START_NS, position_m=(2.0, 7.0, -7.0))
+    for std_m in (0.0, 5.0):
+        mean, cov = np.array([2.0 + far_m, 9.0, 9.0, 9.0]), np.eye(4) * std_m**2
+        belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=mean, cov=cov)
+        watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats=1, coasting=belief)
+        assert doubtful(watch, KALMAN, one, PARAMETERS) is doubted
+        assert doubtful(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
+
+
+def test_what_is_near_enough_is_so_at_the_edge_as_well() -> None:
+    parameters = GateParameters(sigma=0.0, margin_m=9.0, jump_ns=0)
+    one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
+    for north_m, doubted in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
+        belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
+        watch = Watch(START_NS, one.position_m, resolution_m=0.125, repeats=1, coasting=belief)
+        assert doubtful(watch, KALMAN, one, parameters) is doubted
 
 
 def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:

@@ -18,9 +18,10 @@ The answer is a `Breach` that names the cause. What follows needs no position: l
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from operator import itemgetter
 
 import msgspec
 import numpy as np
@@ -49,13 +50,16 @@ PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no
 KNOWN = 1.5  # it is more than this many of its standard deviations
 PLAIN = 1.5  # this many times its bound
 HINT = 0.4  # of the bound of the unexplained acceleration
+QUIET = 0.5  # of the bound: below, positions are clean
 OUTSIDE_NS = 100_000_000
+RETURNS_MPS = 0.3  # outside, towards the limit: it is on its way back
 POSITION_STD_M = 0.02  # at least, of a position: what gate and rounding may leave
 VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the flight begins
 BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
 REACTION_S = 0.3  # from a setpoint to what it does: recorded autopilots need 0.18 to 0.32 s
 GUSTS = 0.3  # of the unexplained acceleration: what gusts make of it for as long as nobody looks
+SHORTEST = 0.3  # of the window: over less, two velocities are not compared
 GRAVITY_MPS2 = 9.81
 LEAST_LAG_S = 1e-3  # for a plant without one
 
@@ -181,6 +185,7 @@ def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tup
         seen: The tick.
         parameters: What is possible.
     """
+    seen = _shown(seen, parameters)
     watching = _told(watching, seen)
     breach: Breach | None = None
     for sample in sorted(seen.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
@@ -200,7 +205,7 @@ def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: Envel
         age_s: How old that prediction's newest position is [s]: gusts may have changed it since.
         parameters: What is possible.
     """
-    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
+    velocity = _own(seen.motion, seen.at_ns)
     if velocity is None or watching.contradicted:
         return None
     drift_mps = parameters.disagreement_mps + GUSTS * parameters.unexplained_mps2 * age_s
@@ -208,9 +213,33 @@ def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: Envel
     return velocity if max(apart, default=0.0) <= drift_mps else None
 
 
-def _own(motion: VehicleMotion, at_ns: int) -> Vec3 | None:
-    fresh = motion.velocity_ns is not None and at_ns - motion.velocity_ns <= MOTION_NS
-    return motion.velocity_mps if fresh else None
+def _shown(seen: Seen, parameters: EnvelopeParameters) -> Seen:
+    """The tick in the axes of the plant; in the others positions, velocities and setpoints are zero."""
+
+    def shown(values: Vec3) -> Vec3:
+        north, east, down = (value if has else 0.0 for value, has in zip(values, parameters.axes, strict=True))
+        return north, east, down
+
+    samples = tuple(
+        replace(
+            sample,
+            position_m=shown(sample.position_m),
+            velocity_mps=None if sample.velocity_mps is None else shown(sample.velocity_mps),
+        )
+        for sample in seen.samples
+    )
+    motion = seen.motion
+    if motion is not None and motion.velocity_mps is not None:
+        motion = replace(motion, velocity_mps=shown(motion.velocity_mps))
+    return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion)
+
+
+def _own(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
+    """The vehicle's own velocity; None where it is silent, or says what is no number."""
+    if motion is None or motion.velocity_mps is None or motion.velocity_ns is None:
+        return None
+    fresh = at_ns - motion.velocity_ns <= MOTION_NS
+    return motion.velocity_mps if fresh and all(map(math.isfinite, motion.velocity_mps)) else None
 
 
 def _told(watching: Watching, seen: Seen) -> Watching:
@@ -220,16 +249,16 @@ def _told(watching: Watching, seen: Seen) -> Watching:
     if not sent or sent[-1][1] != seen.sent_mps2:
         sent = (*sent, (watching.tick_ns or seen.at_ns, seen.sent_mps2))
     first = max((i for i, (at_ns, _) in enumerate(sent) if at_ns <= horizon_ns), default=0)
-    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
+    watching = replace(watching, tick_ns=seen.at_ns, sent=sent[first:])
+    velocity, way = _own(seen.motion, seen.at_ns), watching.way
     if velocity is None:
-        return replace(watching, tick_ns=seen.at_ns, sent=sent[first:], way=(), offsets=())
-    way = watching.way
-    distance = np.zeros(3)
-    if way:
-        since_s = (seen.at_ns - way[-1][0]) * 1e-9
-        distance = way[-1][1] + since_s * np.array(velocity)
-    kept = tuple(one for one in way if one[0] > horizon_ns)
-    return replace(watching, tick_ns=seen.at_ns, sent=sent[first:], way=(*kept, (seen.at_ns, distance)))
+        return replace(watching, way=(), offsets=())
+    if not way or seen.at_ns - way[-1][0] > MOTION_NS:  # missed ticks: nobody knows how far it flew in them
+        return replace(watching, way=((seen.at_ns, np.zeros(3)),), offsets=())
+    last_ns, distance = way[-1]
+    distance = distance + (seen.at_ns - last_ns) * 1e-9 * np.array(velocity)
+    kept = (one for one in way if one[0] > horizon_ns)
+    return replace(watching, way=(*kept, (seen.at_ns, distance)))
 
 
 def _position(
@@ -238,7 +267,7 @@ def _position(
     """Take one believed position, if it is newer than those before by enough to tell something."""
     at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
     before = watching.observer
-    if before is None or at_ns - before.at_ns >= TOLD_NS:
+    if before is None or seen.at_ns - before.at_ns >= TOLD_NS:
         begun = _begun(at_ns, sample, watching, parameters)
         watching = replace(watching, observer=begun, clipped=(), over_ns=None, clean_ns=at_ns)
         return _compared(watching, at_ns, position, False, parameters)
@@ -246,13 +275,13 @@ def _position(
         return watching, None
     observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
-    unexplained = _unexplained(observer) * parameters.axes
+    unexplained = _unexplained(observer)
     unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2]))
     size = unexplained_mps2 / parameters.unexplained_mps2
     known = unexplained_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
     watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
-    quiet = size <= 0.5 and not clipped and watching.apart_ns is None
+    quiet = size <= QUIET and not clipped and watching.apart_ns is None
     watching = replace(
         watching,
         observer=observer,
@@ -352,7 +381,7 @@ def _response_text(observer: Observer, unexplained: Array, seen: Seen) -> str:
     if lean is None:
         return text
     off = math.hypot(lean[0] - float(observer.accel_mps2[0]), lean[1] - float(observer.accel_mps2[1]))
-    as_told = off <= 0.5 * math.hypot(float(unexplained[0]), float(unexplained[1]))
+    as_told = off <= 0.5 * math.hypot(*unexplained)
     return f"{text}; the vehicle leans {'as it was told' if as_told else 'otherwise than it was told'}"
 
 
@@ -381,21 +410,15 @@ def _compared(
     Where the observer too has a hint of something amiss, that has not to persist.
     """
     flown = _flown(watching.way, at_ns)
-    if flown is None:
-        return replace(watching, offsets=(), apart_mps=None, apart_ns=None), None
     kept = (one for one in watching.offsets if one[0] > at_ns - parameters.window_ns)
-    offsets = (*kept, (at_ns, position - flown))
-    watching = replace(watching, offsets=offsets)
-    times_s = np.array([(one - at_ns) * 1e-9 for one, _ in offsets])
-    if len(offsets) < 3 or -times_s[0] < 0.3e-9 * parameters.window_ns:
-        return watching, None
-    centred = times_s - times_s.mean()
-    apart: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
-    apart = apart * parameters.axes
-    speed_mps = float(np.linalg.norm(apart))
+    offsets = () if flown is None else (*kept, (at_ns, position - flown))
+    apart = _slope(offsets, parameters)
+    if apart is None:
+        return replace(watching, offsets=offsets, apart_mps=None, apart_ns=None), None
+    speed_mps = math.hypot(*apart)
     contradicted = speed_mps > parameters.disagreement_mps
     apart_ns = (watching.apart_ns or at_ns) if contradicted else None
-    watching = replace(watching, apart_mps=speed_mps, apart_ns=apart_ns, contradicted=contradicted)
+    watching = replace(watching, offsets=offsets, apart_mps=speed_mps, apart_ns=apart_ns, contradicted=contradicted)
     plain = hinted or speed_mps >= PLAIN * parameters.disagreement_mps
     if apart_ns is None or (not plain and at_ns - apart_ns < PERSISTS_NS):
         return watching, None
@@ -403,14 +426,24 @@ def _compared(
     return watching, Breach(VELOCITY, text)
 
 
+def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters) -> Array | None:
+    """Velocity (3,) [m/s] of the line through the offsets; None where they are too few, or too close in time."""
+    if len(offsets) < 3 or offsets[-1][0] - offsets[0][0] < SHORTEST * parameters.window_ns:
+        return None
+    times_s = np.array([(at_ns - offsets[0][0]) * 1e-9 for at_ns, _ in offsets])
+    centred = times_s - times_s.mean()
+    slope: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
+    return slope
+
+
 def _flown(way: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
     """Distance flown by the vehicle's own velocity at `at_ns`; None where that is not known."""
-    for (begin_ns, begin), (end_ns, end) in pairwise(way):
-        if begin_ns <= at_ns <= end_ns:
-            share = (at_ns - begin_ns) / (end_ns - begin_ns)
-            between: Array = begin + share * (end - begin)
-            return between
-    return None
+    place = bisect_left(way, at_ns, key=itemgetter(0))
+    if not 0 < place < len(way):
+        return None
+    (begin_ns, begin), (end_ns, end) = way[place - 1 : place + 1]
+    between: Array = begin + (at_ns - begin_ns) / (end_ns - begin_ns) * (end - begin)
+    return between
 
 
 # Limits and braking
@@ -431,6 +464,7 @@ def _outside(seen: Seen, parameters: EnvelopeParameters) -> str | None:
         return None
     rows = zip(
         AXES,
+        parameters.axes,
         seen.position_m,
         seen.velocity_mps,
         parameters.lower_m,
@@ -439,20 +473,24 @@ def _outside(seen: Seen, parameters: EnvelopeParameters) -> str | None:
         parameters.brake_mps2,
         strict=True,
     )
-    for axis, position, velocity, lower, upper, margin, brake in rows:
+    for axis, has, position, velocity, lower, upper, margin, brake in rows:
+        if has and not math.isfinite(position + velocity):
+            return f"the estimate of {axis} is no number"
         for beyond, outward in ((lower - position, -velocity), (position - upper, velocity)):
-            if beyond > margin and outward > -BRAKED_MPS:
+            if beyond > margin and outward > -RETURNS_MPS:
                 return f"the estimate is {beyond:.1f} m beyond the limit of {axis}"
-            if outward > 0.0 and beyond + outward * REACTION_S + outward**2 / (2.0 * brake) > margin:
+            if outward > 0.0 and beyond + outward * REACTION_S + outward * outward / (2.0 * brake) > margin:
                 return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
     return None
 
 
 def _braking(watching: Watching, seen: Seen) -> tuple[Watching, Breach | None]:
     """Whether braking brakes, by the vehicle's own velocity."""
-    velocity = None if seen.motion is None else _own(seen.motion, seen.at_ns)
-    if not seen.braking or velocity is None:
+    velocity = _own(seen.motion, seen.at_ns)
+    if not seen.braking:
         return replace(watching, braking=None), None
+    if velocity is None:
+        return watching, None
     speed_mps = math.hypot(*velocity)
     if watching.braking is None:
         return replace(watching, braking=(seen.at_ns, speed_mps)), None

@@ -1,0 +1,104 @@
+"""What the envelope is shown in its tests: ticks, and what it knew before one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from flight_rig import MS, START_NS, sample
+from msgspec import structs
+from numpy.typing import NDArray
+
+from uavctl.data import PositionSample, Vec3, VehicleMotion
+from uavctl.flight.envelope import Breach, EnvelopeParameters, Observer, Seen, Watching, watch
+from uavctl.flight.limits import ZERO
+
+Array = NDArray[np.float64]
+
+S = 1_000_000_000
+TICK_NS = 50 * MS
+NAN3: Vec3 = (math.nan, math.nan, math.nan)
+PARAMETERS = EnvelopeParameters(
+    axes=(True, True, True),
+    lower_m=(-3.0, -2.0, -4.0),
+    upper_m=(3.0, 2.0, -1.0),
+    outside_m=(0.5, 0.625, 0.75),
+    brake_mps2=(2.0, 2.5, 1.5),
+    lag_s=(0.2, 0.3, 0.4),
+    unexplained_mps2=2.0,
+    disagreement_mps=0.25,
+    window_ns=1200 * MS,
+    begins_mps=0.3,
+)
+
+
+def vec3(values: Sequence[float] | Array) -> Vec3:
+    north, east, down = map(float, values)
+    return north, east, down
+
+
+def motion(velocity_mps: Vec3, at_ns: int) -> VehicleMotion:
+    return VehicleMotion(velocity_mps=velocity_mps, velocity_ns=at_ns)
+
+
+def seen(at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, own: VehicleMotion | None = None) -> Seen:
+    return Seen(
+        at_ns=at_ns,
+        samples=samples,
+        sent_mps2=sent,
+        position_m=None,
+        velocity_mps=NAN3,
+        motion=own,
+        braking=False,
+    )
+
+
+LOOK_NS = 62_500_000
+AT_NS = START_NS + LOOK_NS
+
+
+def look(
+    unexplained: Vec3,
+    velocity: Vec3 = ZERO,
+    *,
+    off_m: float = 0.0,
+    own: VehicleMotion | None = None,
+    accel: Vec3 = ZERO,
+    parameters: EnvelopeParameters = PARAMETERS,
+    **known: Any,
+) -> tuple[Watching, Breach | None]:
+    """What comes of a position, by which the observer has, exactly, that velocity and unexplained acceleration."""
+    s, d = LOOK_NS * 1e-9, np.array(unexplained)
+    begun = np.array(velocity) - s * d
+    observer = Observer(
+        at_ns=START_NS, mean=np.array([np.zeros(3), begun, d]), cov=np.zeros((3, 3)), accel_mps2=np.array(accel)
+    )
+    watching = structs.replace(Watching(observer=observer, tick_ns=START_NS, sent=((START_NS, accel),)), **known)
+    position = s * begun + 0.5 * s * s * (np.array(accel) + d) + np.array([off_m, 0.0, 0.0])
+    return watch(watching, seen(AT_NS, sample(AT_NS, AT_NS, vec3(position)), sent=accel, own=own), parameters)
+
+
+def just_more(value: float) -> float:
+    return math.nextafter(value, math.inf)
+
+
+def just_less(value: float) -> float:
+    return math.nextafter(value, -math.inf)
+
+
+AT_REST = motion(ZERO, AT_NS)
+
+
+def offsets(
+    speed_mps: float, *, spans_ns: Sequence[int] = (250 * MS, 500 * MS), place_m: float = 0.0, **known: object
+) -> dict[str, Any]:
+    """Offsets so long before AT_NS that grow by so much in a second; the vehicle says that it is at rest."""
+    return {
+        "way": ((START_NS, np.zeros(3)), (AT_NS - MS, np.zeros(3))),
+        "offsets": tuple(
+            (AT_NS - ns, np.array([place_m - speed_mps * ns * 1e-9, 0.0, 0.0])) for ns in sorted(spans_ns)[::-1]
+        ),
+        **known,
+    }

@@ -1,0 +1,344 @@
+"""The envelope alone: its questions against closed forms, and vehicles that fly by `expm` under cameras that lie."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from envelope_rig import (
+    AT_NS,
+    PARAMETERS,
+    TICK_NS,
+    Array,
+    just_less,
+    look,
+    motion,
+    seen,
+    vec3,
+)
+from flight_rig import MS, START_NS, drag_lag_generator, sample
+from msgspec import structs
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from uavctl.data import Vec3, VehicleMotion
+from uavctl.flight.envelope import (
+    BRAKING,
+    NOT_WATCHING,
+    OUTSIDE,
+    RESPONSE,
+    SCATTER,
+    VELOCITY,
+    Breach,
+    Seen,
+    Watching,
+    lean_mps2,
+    watch,
+)
+from uavctl.flight.limits import ZERO
+
+# The limits
+
+
+def at(position: Vec3 | None, velocity: Vec3 = ZERO, *, since_ns: int | None = AT_NS - 100 * MS) -> Breach | None:
+    """The answer to an estimate that has been outside since then."""
+    ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=velocity)
+    watching, breach = watch(Watching(outside_ns=since_ns), ours, PARAMETERS)
+    assert breach is None or (breach.code == OUTSIDE and watching.outside_ns == since_ns)
+    return breach
+
+
+def on_axis(axis: int, value: float, others: Vec3 = (0.0, 0.0, -2.0)) -> Vec3:
+    values = list(others)
+    values[axis] = value
+    return vec3(values)
+
+
+@pytest.mark.parametrize(("axis", "word"), [(0, "north"), (1, "east"), (2, "down")])
+@pytest.mark.fault(41)
+def test_an_estimate_beyond_a_limit_and_its_margin_is_outside_unless_it_comes_back(axis: int, word: str) -> None:
+    assert at(None) is None
+    limits = ((PARAMETERS.lower_m[axis], -1.0), (PARAMETERS.upper_m[axis], 1.0))
+    for limit, outward in limits:
+        edge = limit + outward * PARAMETERS.outside_m[axis]
+        assert at(on_axis(axis, edge)) is None
+        breach = at(on_axis(axis, edge + outward * 1e-9))
+        assert breach is not None and f"limit of {word}" in breach.text and "beyond" in breach.text
+        for speed, comes_back in ((0.3, True), (just_less(0.3), False)):
+            speeds = on_axis(axis, -outward * speed, ZERO)
+            assert (at(on_axis(axis, edge + outward), speeds) is None) == comes_back
+
+
+@pytest.mark.parametrize(("axis", "word"), [(0, "north"), (1, "east"), (2, "down")])
+@pytest.mark.fault(41)
+def test_an_estimate_that_leaves_faster_than_it_can_brake_is_outside_before_it_is(axis: int, word: str) -> None:
+    """It flies on for 0.3 s, then brakes at the limit: v 0.3 + v² / 2b."""
+    brake, margin = PARAMETERS.brake_mps2[axis], PARAMETERS.outside_m[axis]
+    for limit, outward in ((PARAMETERS.lower_m[axis], -1.0), (PARAMETERS.upper_m[axis], 1.0)):
+        for room_m in (-0.4, 0.0, 0.7):  # to the limit; then the speed at which it comes to rest at the margin
+            left = room_m + margin
+            speed = -0.3 * brake + math.sqrt((0.3 * brake) ** 2 + 2.0 * brake * left)
+            position = on_axis(axis, limit - outward * room_m)
+            assert at(position, on_axis(axis, outward * (speed - 1e-9), ZERO)) is None
+            breach = at(position, on_axis(axis, outward * (speed + 1e-9), ZERO))
+            assert breach is not None and f"limit of {word}" in breach.text and "brake" in breach.text
+        rests = on_axis(axis, limit + outward * margin)
+        assert at(rests, ZERO) is None
+        assert at(rests, on_axis(axis, outward * 1e-6, ZERO)) is not None
+        assert at(rests, on_axis(axis, -outward * 2.0, ZERO)) is None
+
+
+def test_being_outside_has_to_persist() -> None:
+    out: Vec3 = (4.0, 0.0, -2.0)
+    assert at(out, since_ns=None) is None
+    assert at(out, since_ns=AT_NS - 100 * MS + 1) is None
+    watching = NOT_WATCHING
+    since = []
+    for n, position in enumerate([out, out, (0.0, 0.0, -2.0), out, out, out, out]):
+        ours = structs.replace(seen(START_NS + n * TICK_NS), position_m=position, velocity_mps=ZERO)
+        watching, breach = watch(watching, ours, PARAMETERS)
+        since.append(None if watching.outside_ns is None else (watching.outside_ns - START_NS) // TICK_NS)
+        assert (breach is not None) == (n >= 5)
+    assert since == [0, 0, None, 3, 3, 3, 3]
+
+
+def test_an_estimate_that_is_no_number_is_outside() -> None:
+    for axis in range(3):
+        assert at(on_axis(axis, math.nan)) is not None
+        assert at((0.0, 0.0, -2.0), on_axis(axis, math.inf, ZERO)) is not None
+    assert at((0.0, 0.0, -2.0), (1e200, 0.0, 0.0)) is not None
+
+
+# Braking
+
+
+def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = ()) -> list[tuple[int, Breach]]:
+    """What comes of own velocities (north), each at a time [ms]; the fallback does not brake at those of `ends`."""
+    watching, found = NOT_WATCHING, []
+    for at_ms, speed in speeds:
+        at_ns = START_NS + at_ms * MS
+        own = None if speed is None else motion((0.6 * speed, 0.0, -0.8 * speed), at_ns)
+        ours = structs.replace(seen(at_ns, own=own), braking=at_ms not in ends)
+        watching, breach = watch(watching, ours, PARAMETERS)
+        if breach is not None:
+            found.append((at_ms, breach))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("speeds", "ends", "found"),
+    [
+        ([(0, 2.0), (500, 2.0), (999, 2.0), (1000, 2.0)], (), [1000]),
+        ([(0, 2.0), (1000, 1.89)], (), []),  # 0.8 of it and 0.3
+        ([(0, 2.0), (1000, 1.91)], (), [1000]),
+        ([(0, 0.0), (1000, 0.29)], (), []),
+        ([(0, 0.0), (1000, 0.31)], (), [1000]),
+        ([(0, 2.0), (1000, 0.5), (1500, 1.92)], (), [1500]),
+        ([(0, 2.0), (500, 2.0), (1000, 2.0), (1499, 2.0), (1500, 2.0)], (500,), []),
+        ([(0, 2.0), (500, 2.0), (550, 2.0), (1549, 2.0), (1550, 2.0)], (500,), [1550]),
+        ([(0, None), (400, 2.0), (1000, 2.0), (1400, 2.0)], (), [1400]),  # since it is known
+        ([(0, 2.0), (500, None), (1000, 2.0)], (), [1000]),  # a gap does not begin it anew
+        ([(0, 2.0), (1000, None)], (), []),
+    ],
+)
+@pytest.mark.fault(43)
+def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple[int, ...], found: list[int]) -> None:
+    breaches = braked(iter(speeds), ends=ends)
+    assert [at_ms for at_ms, _ in breaches] == found
+    assert {breach.code for _, breach in breaches} <= {BRAKING}
+
+
+# Attitude
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_lean_is_what_a_thrust_that_carries_the_vehicle_does_along_the_floor(seed: int) -> None:
+    roll, pitch, yaw = np.random.default_rng(seed).uniform((-1.0, -1.0, -3.1), (1.0, 1.0, 3.1))
+    thrust = Rotation.from_euler("ZYX", (yaw, pitch, roll)).apply([0.0, 0.0, -1.0])
+    words = VehicleMotion(attitude_rad=(roll, pitch, yaw), attitude_ns=AT_NS)
+    lean = lean_mps2(words, AT_NS)
+    assert lean == pytest.approx(tuple(9.81 * thrust[:2] / -thrust[2]))
+
+
+@pytest.mark.parametrize(
+    ("words", "known"),
+    [
+        (VehicleMotion(), False),
+        (VehicleMotion(attitude_rad=ZERO), False),
+        (VehicleMotion(attitude_ns=AT_NS), False),
+        (VehicleMotion(attitude_rad=ZERO, attitude_ns=AT_NS - 300 * MS), True),
+        (VehicleMotion(attitude_rad=ZERO, attitude_ns=AT_NS - 300 * MS - 1), False),
+        (VehicleMotion(attitude_rad=(math.acos(0.1) - 1e-6, 0.0, 0.0), attitude_ns=AT_NS), True),
+        (VehicleMotion(attitude_rad=(math.acos(0.1) + 1e-6, 0.0, 0.0), attitude_ns=AT_NS), False),
+        (VehicleMotion(attitude_rad=(0.0, 2.0, 0.0), attitude_ns=AT_NS), False),
+        (VehicleMotion(attitude_rad=(2.0, 2.0, 0.0), attitude_ns=AT_NS), True),  # the same as none of them, turned
+    ],
+)
+def test_an_attitude_that_is_old_or_on_its_side_says_nothing(words: VehicleMotion, known: bool) -> None:
+    assert (lean_mps2(words, AT_NS) is not None) == known
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "lean", "words"),
+    [
+        ((3.0, 4.0, 0.0), (1.0, 0.0), "as it was told"),
+        ((3.0, 4.0, 0.0), (1.0, 2.49), "as it was told"),
+        ((3.0, 4.0, 0.0), (1.0, -2.51), "otherwise than it was told"),
+        ((3.0, 4.0, 0.0), (3.49, 0.0), "as it was told"),
+        ((3.0, 4.0, 0.0), (-1.51, 0.0), "otherwise than it was told"),
+        ((0.0, 0.0, 4.0), (1.0, 1.99), "as it was told"),  # a climb that nobody asked for is no lean
+        ((0.0, 0.0, 4.0), (1.0, 2.01), "otherwise than it was told"),
+        ((3.0, 4.0, 0.0), None, ""),
+    ],
+)
+def test_a_breach_tells_whether_the_vehicle_leans_as_it_was_told(
+    unexplained: Vec3, lean: tuple[float, float] | None, words: str
+) -> None:
+    """It was told 1 m/s² north, and the observer knows."""
+    own = None
+    if lean is not None:  # a lean forwards is a negative pitch
+        pitch = -math.atan(lean[0] / 9.81)
+        own = VehicleMotion(attitude_rad=(math.atan(lean[1] / 9.81 * math.cos(pitch)), pitch, 0.0), attitude_ns=AT_NS)
+    _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), own=own)
+    assert breach is not None and breach.code == RESPONSE
+    north, east, down = unexplained
+    assert f"({north:.1f}, {east:.1f}, {down:.1f}) m/s²" in breach.text and "(1.0, 0.0, 0.0) m/s²" in breach.text
+    assert breach.text.endswith(words) and ("leans" in breach.text) == bool(words)
+
+
+# What there is not
+
+
+def test_axes_that_the_plant_has_not_are_not_looked_at() -> None:
+    rng = np.random.default_rng(5)
+    for axis in range(3):
+        parameters = replace(PARAMETERS, axes=tuple(other == axis for other in range(3)))
+        only = np.eye(3)[axis]
+        one = two = NOT_WATCHING
+        for n in range(30):
+            at_ns = START_NS + n * TICK_NS
+            position, own, sent = (rng.normal(scale=0.01, size=3) for _ in range(3))
+            wild = np.where(only > 0, 0.0, rng.normal(scale=50.0, size=3))
+            velocity = None if n else own
+            estimated = np.where(only > 0, position, math.nan)
+
+            def tick(other: Array, at_ns: int = at_ns) -> Seen:
+                return Seen(
+                    at_ns=at_ns,
+                    samples=(
+                        sample(
+                            at_ns,
+                            position_m=vec3(position * only + other),  # noqa: B023
+                            velocity_mps=None if velocity is None else vec3(velocity * only + other),  # noqa: B023
+                        ),
+                    ),
+                    sent_mps2=vec3(sent * only + other),  # noqa: B023
+                    position_m=vec3(estimated) if axis < 2 else None,  # noqa: B023
+                    velocity_mps=vec3(estimated),  # noqa: B023
+                    motion=motion(vec3(own * only + other), at_ns),  # noqa: B023
+                    braking=True,
+                )
+
+            one, breach = watch(one, tick(wild), parameters)
+            assert breach is None
+            two, _ = watch(two, tick(np.zeros(3)), parameters)
+            assert repr(one) == repr(two)
+        assert one.apart_mps is not None
+
+
+def test_a_tick_cannot_change_what_the_tick_before_left_nor_anybody_what_is_possible() -> None:
+    watching, _ = look(ZERO)
+    assert watching.observer is not None
+    for thing in (watching, watching.observer, seen(AT_NS), Breach("", "")):
+        with pytest.raises(AttributeError):
+            setattr(thing, thing.__struct_fields__[0], None)
+    with pytest.raises(FrozenInstanceError):
+        replace(PARAMETERS).begins_mps = 1.0  # type: ignore[misc]
+    # Nor are they compared by their arrays, which have no one truth.
+    assert watching != structs.replace(watching)
+    assert watching.observer != structs.replace(watching.observer)
+
+
+# Vehicles that fly as they are told, and frames that do not fit
+
+
+Camera = Callable[[float, Array], Array]  # time, true position -> what it says
+
+
+def fly(
+    camera: Camera, *, drag_1ps: float = 0.3, own: bool = False, accel_mps2: float = 2.0, stall: range = range(0)
+) -> tuple[float, float, str] | None:
+    """A vehicle is sent to and fro, by `expm`, for 10 s: (time, largest true distance so far, code) of a breach."""
+    rng = np.random.default_rng(2)
+    parameters = replace(PARAMETERS, unexplained_mps2=1.5, lag_s=(0.25, 0.25, 0.25), lower_m=(-99.0,) * 3)
+    step = expm(drag_lag_generator(drag_1ps, 0.25) * TICK_NS * 1e-9)
+    x, watching, sent, far_m = np.zeros((5, 3)), NOT_WATCHING, ZERO, 0.0
+    for n in range(200):
+        t, at_ns = n * 0.05, START_NS + n * TICK_NS
+        far_m = max(far_m, float(np.linalg.norm(x[0])))
+        if n not in stall:
+            said = camera(t, x[0]) + rng.normal(scale=0.003, size=3)
+            words = motion(vec3(x[1] + rng.normal(scale=0.02, size=3)), at_ns) if own else None
+            watching, breach = watch(
+                watching, seen(at_ns, sample(at_ns, None, vec3(said)), sent=sent, own=words), parameters
+            )
+            if breach is not None:
+                return t, far_m, breach.code
+            north = accel_mps2 if int(t / 0.8 + 0.5) % 2 else -accel_mps2
+            sent = (north, -0.5 * north, -0.3 * north)
+        x[4] = sent
+        x = step @ x
+    assert far_m > 0.2
+    return None
+
+
+def turned(degrees: float) -> Camera:
+    matrix = Rotation.from_euler("Z", degrees, degrees=True).as_matrix()
+    return lambda t, truth: matrix @ truth
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("drag_1ps", [0.0, 0.3, 1.0])
+def test_a_vehicle_that_flies_as_it_is_told_is_quiet(drag_1ps: float, own: bool) -> None:
+    assert fly(lambda t, truth: truth, drag_1ps=drag_1ps, own=own) is None
+    assert fly(turned(4.0), drag_1ps=drag_1ps, own=own) is None  # nobody hangs up cameras better
+
+
+def test_a_vehicle_that_flew_on_while_we_missed_ticks_is_no_contradiction() -> None:
+    for begins in range(40, 80, 5):
+        assert fly(lambda t, truth: truth, own=True, stall=range(begins, begins + 13)) is None
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        turned(90.0),
+        turned(-90.0),
+        turned(180.0),
+        lambda t, truth: truth * [-1.0, 1.0, 1.0],
+        lambda t, truth: truth[[1, 0, 2]] * [1.0, 1.0, -1.0],  # east, north, up
+        lambda t, truth: truth * 3.281,
+        lambda t, truth: truth * 1000.0,
+        lambda t, truth: truth * 0.0,  # the marker is on the floor
+        lambda t, truth: truth * [1.0, 1.0, 1.0] if t < 2.0 else np.array([0.0, 0.0, 9.81 / 2 * (t - 2.0) ** 2]),
+    ],
+)
+@pytest.mark.fault(42)
+def test_frames_that_do_not_fit_and_loose_markers_are_found_before_the_vehicle_is_far(
+    camera: Camera, own: bool
+) -> None:
+    found = fly(camera, own=own)
+    assert found is not None
+    assert found[1] < 1.0
+    assert found[2] in {RESPONSE, VELOCITY, SCATTER}
+
+
+@pytest.mark.fault(42)
+def test_positions_that_leap_about_are_found() -> None:
+    rng = np.random.default_rng(9)
+    found = fly(lambda t, truth: truth + rng.normal(scale=0.7, size=3) * (t > 1.0))
+    assert found is not None and found[0] < 1.5

@@ -1,0 +1,489 @@
+"""The envelope's observer against a textbook filter, and what it and the vehicle's own velocity make of positions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from envelope_rig import (
+    AT_NS,
+    AT_REST,
+    LOOK_NS,
+    NAN3,
+    PARAMETERS,
+    TICK_NS,
+    Array,
+    S,
+    just_less,
+    just_more,
+    look,
+    motion,
+    offsets,
+    seen,
+    vec3,
+)
+from flight_rig import MS, START_NS, sample
+from msgspec import structs
+from scipy.linalg import expm
+
+from uavctl.data import Vec3, VehicleMotion
+from uavctl.flight.envelope import (
+    NOT_WATCHING,
+    RESPONSE,
+    SCATTER,
+    VELOCITY,
+    Observer,
+    Watching,
+    own_velocity,
+    watch,
+)
+from uavctl.flight.limits import ZERO
+
+# The observer
+
+
+class Textbook:
+    """A Kalman filter of (position, velocity, unexplained acceleration) of an axis; the lag is exact."""
+
+    def __init__(self, at_ns: int, position_m: float, velocity_mps: float, velocity_std_mps: float, lag_s: float):
+        self.at_ns = at_ns
+        self.mean = np.array([position_m, velocity_mps, 0.0])
+        self.cov = np.diag([0.02**2, velocity_std_mps**2, (2.0 / 3.0) ** 2])
+        self.accel = 0.0
+        self.lag_s = lag_s
+
+    def predict(self, at_ns: int, inputs: Sequence[tuple[int, float]]) -> None:
+        g = np.zeros((5, 5))  # of (position, velocity, unexplained, acceleration, setpoint)
+        g[0, 1] = g[1, 2] = g[1, 3] = 1.0
+        g[3, 3:5] = [-1.0 / self.lag_s, 1.0 / self.lag_s]
+        x = np.array([*self.mean, self.accel, 0.0])
+        cuts = sorted({self.at_ns, at_ns, *(one for one, _ in inputs if self.at_ns < one < at_ns)})
+        for begin_ns, end_ns in pairwise(cuts):
+            x[4] = next((u for since_ns, u in reversed(inputs) if since_ns <= begin_ns), 0.0)
+            x = expm(g * (end_ns - begin_ns) * 1e-9) @ x
+        self.mean, self.accel = x[:3], float(x[3])
+        # Van Loan: the noise of a random walk of the unexplained acceleration.
+        step = np.zeros((6, 6))
+        step[:3, :3], step[3:, 3:] = -g[:3, :3], g[:3, :3].T
+        step[2, 5] = 2.0**2
+        moved = expm(step * (at_ns - self.at_ns) * 1e-9)
+        f = moved[3:, 3:].T
+        self.cov = f @ self.cov @ f.T + f @ moved[:3, 3:]
+        self.at_ns = at_ns
+
+    def correct(self, position_m: float) -> bool:
+        h = np.array([[1.0, 0.0, 0.0]])
+        s = float((h @ self.cov @ h.T)[0, 0]) + 0.02**2
+        gain = self.cov @ h.T / s
+        innovation = position_m - self.mean[0]
+        bound = 6.0 * math.sqrt(s)
+        self.mean = self.mean + gain[:, 0] * min(max(innovation, -bound), bound)
+        self.cov = (np.eye(3) - gain @ h) @ self.cov
+        return bool(abs(innovation) > bound)
+
+
+def same(watching: Watching, want: Sequence[Textbook]) -> None:
+    observer = watching.observer
+    assert observer is not None
+    assert {one.at_ns for one in want} == {observer.at_ns}
+    for axis, one in enumerate(want):
+        np.testing.assert_allclose(observer.mean[:, axis], one.mean, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(observer.cov, one.cov, rtol=1e-7, atol=1e-12)
+        assert observer.accel_mps2[axis] == pytest.approx(one.accel, rel=1e-9, abs=1e-11)
+
+
+@pytest.mark.parametrize(("seed", "lag_s"), [(0, (0.2, 0.3, 0.4)), (1, (0.2, 0.2, 0.2)), (2, (0.0, 0.001, 0.0005))])
+def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Vec3) -> None:
+    """Setpoints at odd ticks, positions late and in bursts, some of them metres off."""
+    rng = np.random.default_rng(seed)
+    parameters = replace(PARAMETERS, lag_s=lag_s)
+    at_ns, captured_ns = START_NS, START_NS - 7 * MS
+    inputs: list[list[tuple[int, float]]] = [[], [], []]
+    watching, sent, clipped = NOT_WATCHING, ZERO, 0
+    books: list[Textbook] = []
+    for _ in range(30):
+        before_ns, at_ns = at_ns, at_ns + int(rng.integers(20, 120)) * MS
+        if rng.random() < 0.4:
+            sent = vec3(rng.normal(size=3))
+        for axis in range(3):
+            inputs[axis].append((before_ns if books else at_ns, sent[axis]))
+        samples = []
+        for _ in range(rng.integers(0, 4)):
+            captured_ns += int(rng.integers(41, 60)) * MS
+            if captured_ns > at_ns:
+                captured_ns = at_ns
+                break
+            far = 5.0 if rng.random() < 0.1 else 0.1
+            velocity = None if rng.random() < 0.5 else vec3(rng.normal(size=3))
+            samples.append(sample(captured_ns, at_ns, vec3(rng.normal(scale=far, size=3)), velocity))
+        for one in samples:
+            if not books:
+                speeds, std = (ZERO, 0.3) if one.velocity_mps is None else (one.velocity_mps, 0.1)
+                books = [
+                    Textbook(one.captured_ns, p, v, std, max(lag, 0.001))
+                    for p, v, lag in zip(one.position_m, speeds, lag_s, strict=True)
+                ]
+            elif one.captured_ns - books[0].at_ns >= 40 * MS:
+                for axis, book in enumerate(books):
+                    book.predict(one.captured_ns, inputs[axis])
+                    clipped += book.correct(one.position_m[axis])
+        watching, _ = watch(watching, seen(at_ns, *samples[::-1], sent=sent), parameters)
+        if books:
+            same(watching, books)
+    assert clipped
+
+
+# What is unexplained
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_drag_that_explains_most_is_taken_away_up_to_a_bound(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    d, v = rng.normal(size=3), rng.normal(size=3)
+    rests = d + np.linspace(0.0, 1.2, 12_001)[:, None] * v
+    least = rests[np.argmin(np.sum(rests**2, axis=1))]
+    watching, _ = look(vec3(d), vec3(v))
+    want = max(math.hypot(least[0], least[1]), abs(least[2]))
+    assert watching.unexplained_mps2 == pytest.approx(want, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "velocity", "rest_mps2"),
+    [
+        ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), 0.0),
+        ((-2.4, 0.0, 0.0), (2.0, 0.0, 0.0), 0.0),  # drag of 1.2/s
+        ((-4.0, 0.0, 0.0), (2.0, 0.0, 0.0), 1.6),  # more than any
+        ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), 1.0),  # drag does not push
+        ((0.0, 1.0, 0.0), (2.0, 0.0, 0.0), 1.0),
+        ((0.0, 1.0, 0.0), ZERO, 1.0),
+        ((0.3, 0.4, 0.0), ZERO, 0.5),
+        ((0.3, 0.4, -0.6), ZERO, 0.6),  # of the two, not of both
+    ],
+)
+def test_what_is_left_as_unexplained(unexplained: Vec3, velocity: Vec3, rest_mps2: float) -> None:
+    watching, breach = look(unexplained, velocity)
+    assert watching.unexplained_mps2 == pytest.approx(rest_mps2, abs=1e-12)
+    assert breach is None
+
+
+@pytest.mark.parametrize(
+    ("unexplained_mps2", "over_ns", "since_ns", "breached"),
+    [
+        (2.0, None, None, False),
+        (2.0, AT_NS - 200 * MS, None, False),
+        (just_more(2.0), None, AT_NS, False),
+        (just_more(2.0), AT_NS - 100 * MS + 1, AT_NS - 100 * MS + 1, False),
+        (just_more(2.0), AT_NS - 100 * MS, AT_NS - 100 * MS, True),
+        (just_less(3.0), None, AT_NS, False),
+        (3.0, None, AT_NS, True),
+        (-3.0, None, AT_NS, True),
+    ],
+)
+def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not(
+    unexplained_mps2: float, over_ns: int | None, since_ns: int | None, breached: bool
+) -> None:
+    for axis in range(3):
+        d = [0.0, 0.0, 0.0]
+        d[axis] = unexplained_mps2
+        watching, breach = look(vec3(d), over_ns=over_ns)
+        assert watching.unexplained_mps2 == abs(unexplained_mps2)
+        assert watching.over_ns == since_ns
+        assert (breach is not None) == breached
+        assert breach is None or breach.code == RESPONSE
+
+
+@pytest.mark.parametrize(
+    ("unexplained_mps2", "off_m", "apart", "clean"),
+    [
+        (1.0, 0.0, False, True),
+        (just_more(1.0), 0.0, False, False),
+        (0.0, 0.1, False, True),
+        (0.0, 0.2, False, False),
+        (0.0, -0.2, False, False),
+        (0.0, 0.0, True, False),
+    ],
+)
+def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: float, apart: bool, clean: bool) -> None:
+    known = offsets(0.3) if apart else {}
+    watching, _ = look((unexplained_mps2, 0.0, 0.0), off_m=off_m, own=AT_REST, clean_ns=START_NS - 5, **known)
+    assert (watching.apart_ns is not None) == apart
+    assert watching.clean_ns == (AT_NS if clean else START_NS - 5)
+
+
+@pytest.mark.parametrize(
+    ("before", "off_m", "breached"),
+    [
+        ((True, True), 0.2, True),
+        ((True, False, False, True), 0.2, True),
+        ((True, True, False, False, False), 0.2, False),
+        ((True, False), 0.2, False),
+        ((True, True), 0.1, False),
+        ((True, True, True, True, False), 0.0, True),  # it persists
+    ],
+)
+def test_three_of_five_positions_that_are_far_off_are_no_chance(
+    before: tuple[bool, ...], off_m: float, breached: bool
+) -> None:
+    watching, breach = look(ZERO, off_m=off_m, clipped=before)
+    assert watching.clipped == (*before, off_m > 0.15)[-5:]
+    assert (None if breach is None else breach.code) == (SCATTER if breached else None)
+
+
+def test_an_innovation_counts_up_to_six_standard_deviations() -> None:
+    at_rest = Observer(at_ns=START_NS, mean=np.zeros((3, 3)), cov=np.diag([0.0021, 0, 0]), accel_mps2=np.zeros(3))
+    at_ns = START_NS + 40 * MS
+    book = Textbook(START_NS, 0.0, 0.0, 0.0, 0.2)
+    book.cov = at_rest.cov
+    book.predict(at_ns, [])
+    bound_m = 6.0 * math.sqrt(float(book.cov[0, 0]) + 0.0004)
+    assert bound_m == pytest.approx(0.3, abs=1e-5)
+    for off_m, clipped in ((0.299, False), (0.301, True), (-0.299, False), (-0.301, True)):
+        for axis in range(3):
+            place = [0.0, 0.0, 0.0]
+            place[axis] = off_m
+            watching, _ = watch(
+                Watching(observer=at_rest), seen(at_ns, sample(at_ns, position_m=vec3(place))), PARAMETERS
+            )
+            assert watching.clipped == (clipped,)
+
+
+@pytest.mark.parametrize(("since_ns", "counts"), [(40 * MS, True), (40 * MS - 1, False), (0, False), (-S, False)])
+def test_positions_that_are_late_or_close_to_one_another_say_nothing_new(since_ns: int, counts: bool) -> None:
+    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
+    at_ns = START_NS + 80 * MS
+    after, _ = watch(watching, seen(at_ns, sample(START_NS + since_ns, at_ns)), PARAMETERS)
+    assert after.observer is not None
+    assert (after.observer is not watching.observer) == counts
+    assert after.clean_ns == after.observer.at_ns == START_NS + (since_ns if counts else 0)
+
+
+def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
+    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS + 9 * MS, START_NS - MS)), PARAMETERS)
+    assert watching.observer is not None and watching.observer.at_ns == START_NS - MS
+
+
+@pytest.mark.parametrize(("silent_ns", "anew"), [(3 * S, True), (3 * S - 1, False)])
+def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: bool) -> None:
+    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
+    watching = structs.replace(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
+    captured_ns, at_ns = START_NS + silent_ns - 30 * MS, START_NS + silent_ns
+    far = sample(captured_ns, at_ns, (0.5, 0.0, 0.0))
+    after, breach = watch(watching, seen(at_ns, far), PARAMETERS)
+    assert after.observer is not None and breach is None
+    if anew:
+        np.testing.assert_array_equal(after.observer.mean, [[0.5, 0.0, 0.0], ZERO, ZERO])
+        np.testing.assert_allclose(np.diagonal(after.observer.cov), [0.0004, 4.0, 4.0 / 9.0])
+        assert (after.clipped, after.over_ns, after.clean_ns) == ((), None, captured_ns)
+    else:
+        assert after.clipped == (True, True, False)
+
+
+def test_what_was_sent_is_remembered_for_three_seconds_and_no_longer() -> None:
+    rng = np.random.default_rng(1)
+    watching = NOT_WATCHING
+    all_sent: list[tuple[int, Vec3]] = []
+    for n in range(200):
+        at_ns = START_NS + n * TICK_NS
+        sent = (float(rng.integers(0, 3)), 0.0, 0.0) if n > 90 else (float(n % 7 == 0), 0.0, 0.0)
+        watching, _ = watch(watching, seen(at_ns, sent=sent), PARAMETERS)
+        if not all_sent or all_sent[-1][1] != sent:
+            all_sent.append((at_ns - TICK_NS if n else at_ns, sent))
+        old = [one for one in all_sent if one[0] <= at_ns - 3 * S]
+        assert watching.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * S))
+        assert watching.tick_ns == at_ns
+
+
+# Positions against the vehicle's own velocity
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    parameters = replace(PARAMETERS, disagreement_mps=100.0)
+    watching, at_ns = NOT_WATCHING, START_NS
+    ticks_ns: list[int] = []
+    flown: list[Array] = []
+    taken: list[tuple[int, Array]] = []
+    for _ in range(80):
+        at_ns += int(rng.integers(30, 90)) * MS
+        velocity = rng.normal(size=3)
+        flown.append(flown[-1] + velocity * (at_ns - ticks_ns[-1]) * 1e-9 if flown else np.zeros(3))
+        ticks_ns.append(at_ns)
+        captured_ns = at_ns - int(rng.integers(0, 30)) * MS
+        one = sample(captured_ns, at_ns, vec3(rng.normal(size=3)))
+        if captured_ns > ticks_ns[0] and (not taken or captured_ns - taken[-1][0] >= 40 * MS):
+            distance = [np.interp(captured_ns, ticks_ns, axis) for axis in np.array(flown).T]
+            taken.append((captured_ns, np.array(one.position_m) - distance))
+        watching, _ = watch(watching, seen(at_ns, one, own=motion(vec3(velocity), at_ns)), parameters)
+        if not taken or taken[-1][0] != captured_ns:
+            continue
+        window = [one for one in taken if one[0] > captured_ns - 1200 * MS]
+        assert [at for at, _ in watching.offsets] == [at for at, _ in window]
+        if len(window) < 3 or captured_ns - window[0][0] < 360 * MS:
+            assert watching.apart_mps is None
+            continue
+        slope, _ = np.polyfit([(at - captured_ns) * 1e-9 for at, _ in window], [off for _, off in window], 1)
+        assert watching.apart_mps == pytest.approx(float(np.linalg.norm(slope)), rel=1e-6)
+    kept = [at for at in ticks_ns if at > at_ns - 3 * S]
+    assert [at for at, _ in watching.way] == kept
+
+
+@pytest.mark.parametrize(
+    ("spans_ns", "compared"),
+    [
+        ((360 * MS,), False),
+        ((100 * MS, 360 * MS), True),
+        ((100 * MS, 360 * MS - 1), False),
+        ((100 * MS, 1200 * MS - 1), True),
+        ((100 * MS, 1200 * MS), False),  # one is too old
+    ],
+)
+def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
+    spans_ns: tuple[int, ...], compared: bool
+) -> None:
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
+    assert watching.apart_mps == (pytest.approx(0.125) if compared else None)
+    assert watching.apart_ns is None
+    assert not watching.contradicted
+
+
+# 0.4375 m/s are exactly what is shown of 0.4375 m/s, and 1.5 times 0.4375 / 1.5.
+EXACT_MPS = 0.4375
+
+
+@pytest.mark.parametrize(
+    ("bound_mps", "unexplained_mps2", "apart_ns", "since_ns", "breached"),
+    [
+        (EXACT_MPS, 0.0, None, None, False),
+        (EXACT_MPS, 0.0, 1, None, False),
+        (just_less(EXACT_MPS), 0.0, None, AT_NS, False),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS + 1, AT_NS - 100 * MS + 1, False),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS, AT_NS - 100 * MS, True),
+        (just_less(EXACT_MPS), 0.8, None, AT_NS, False),
+        (just_less(EXACT_MPS), just_more(0.8), None, AT_NS, True),  # the observer too has a hint
+        (EXACT_MPS, 1.0, None, None, False),
+        (EXACT_MPS / 1.5, 0.0, None, AT_NS, True),
+        (just_more(EXACT_MPS / 1.5), 0.0, None, AT_NS, False),
+    ],
+)
+def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plain(
+    bound_mps: float, unexplained_mps2: float, apart_ns: int | None, since_ns: int | None, breached: bool
+) -> None:
+    parameters = replace(PARAMETERS, disagreement_mps=bound_mps)
+    # The position is a little off where something is unexplained: so are the offsets.
+    s = LOOK_NS * 1e-9
+    place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
+    known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
+    watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
+    assert watching.apart_mps == EXACT_MPS
+    assert watching.apart_ns == since_ns
+    assert watching.contradicted == (since_ns is not None)
+    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+
+
+def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
+    for captured_ns, known in ((START_NS, False), (START_NS + 1, True), (AT_NS, True)):
+        state = Watching(way=((START_NS, np.zeros(3)),))
+        watching, _ = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+        assert [at for at, _ in watching.offsets] == [captured_ns] * known
+
+
+@pytest.mark.parametrize(
+    ("words", "known"),
+    [
+        (None, False),
+        (VehicleMotion(), False),
+        (VehicleMotion(velocity_mps=ZERO), False),
+        (VehicleMotion(velocity_ns=AT_NS), False),
+        (motion(ZERO, AT_NS - 300 * MS), True),
+        (motion(ZERO, AT_NS - 300 * MS - 1), False),
+        (motion((0.0, math.nan, 0.0), AT_NS), False),
+        (motion((0.0, 0.0, math.inf), AT_NS), False),
+    ],
+)
+def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
+    watching, _ = look(ZERO, own=words, **offsets(0.125))
+    assert (watching.apart_mps is not None) == (len(watching.offsets) == 3) == known
+    assert len(watching.way) == (3 if known else 0)
+    ours = structs.replace(seen(AT_NS, own=words), velocity_mps=ZERO)
+    assert (own_velocity(watching, ours, 0.0, PARAMETERS) is not None) == known
+
+
+@pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
+def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
+    before = offsets(0.0, way=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
+    watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
+    assert watching.way[-1][0] == AT_NS
+    assert watching.way[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
+    assert [at for at, _ in watching.way[:-1]] == [AT_NS - gap_ns] * known
+    assert len(watching.offsets) == (3 if known else 0)
+
+
+@pytest.mark.parametrize(
+    ("own", "known", "age_s", "contradicted", "believed"),
+    [
+        ((0.25, 0.0, 0.0), ZERO, 0.0, False, True),
+        ((just_more(0.25), 0.0, 0.0), ZERO, 0.0, False, False),
+        ((0.0, -0.26, 0.0), ZERO, 0.0, False, False),
+        ((0.0, 0.0, 1.5), (0.0, 0.0, 1.3), 0.0, False, True),
+        ((0.84, 0.0, 0.0), ZERO, 1.0, False, True),  # 0.25 and 0.3 of 2 m/s² for a second
+        ((0.86, 0.0, 0.0), ZERO, 1.0, False, False),
+        ((0.0, 0.0, 0.0), ZERO, 0.0, True, False),
+        ((9.0, 9.0, 0.1), (math.nan, math.nan, 0.0), 0.0, False, True),
+        ((9.0, 9.0, 0.3), (math.nan, math.nan, 0.0), 0.0, False, False),
+        ((9.0, 9.0, 9.0), NAN3, 0.0, False, True),
+    ],
+)
+def test_which_own_velocity_may_be_braked_on(
+    own: Vec3, known: Vec3, age_s: float, contradicted: bool, believed: bool
+) -> None:
+    ours = structs.replace(seen(AT_NS, own=motion(own, AT_NS)), velocity_mps=known)
+    watching = Watching(contradicted=contradicted)
+    assert own_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
+
+
+# What is not known counts less
+
+
+def test_a_flight_that_began_before_its_first_position_has_the_velocity_that_was_sent() -> None:
+    watching, sent = NOT_WATCHING, (1.0, -0.5, 0.0)
+    for n in range(21):
+        watching, _ = watch(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
+    at_ns = START_NS + S
+    watching, breach = watch(watching, seen(at_ns, sample(at_ns, at_ns, (7.0, 8.0, -9.0)), sent=sent), PARAMETERS)
+    assert breach is None and watching.observer is not None
+    left = [math.exp(-1.0 / lag_s) for lag_s in PARAMETERS.lag_s]
+    velocity = [u * (1.0 - lag_s * (1.0 - e)) for u, lag_s, e in zip(sent, PARAMETERS.lag_s, left, strict=True)]
+    np.testing.assert_allclose(watching.observer.mean, [(7.0, 8.0, -9.0), velocity, ZERO], atol=1e-12)
+    np.testing.assert_allclose(watching.observer.accel_mps2, [u * (1.0 - e) for u, e in zip(sent, left, strict=True)])
+    # Gusts have had a second for it.
+    assert watching.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.0) ** 2)
+
+
+@pytest.mark.parametrize(("std_m", "noise_m"), [(0.005, 0.02), (0.02, 0.02), (0.1, 0.1)])
+def test_a_position_counts_by_its_own_standard_deviation(std_m: float, noise_m: float) -> None:
+    begun, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS, std_m=std_m)), PARAMETERS)
+    assert begun.observer is not None
+    assert begun.observer.cov[0, 0] == pytest.approx(noise_m**2)
+    observer = Observer(START_NS, np.zeros((3, 3)), np.diag([0.01, 0.0, 0.0]), np.zeros(3))
+    later = sample(AT_NS, AT_NS, (0.1, 0.0, 0.0), std_m=std_m)
+    watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, later), PARAMETERS)
+    assert watching.observer is not None
+    wanders = (PARAMETERS.unexplained_mps2 * math.sqrt((LOOK_NS * 1e-9) ** 5 / 20)) ** 2
+    gain = (0.01 + wanders) / (0.01 + wanders + noise_m**2)
+    assert watching.observer.mean[0, 0] == pytest.approx(0.1 * gain)
+
+
+@pytest.mark.parametrize(("std_mps2", "over"), [(0.0, True), (1.55, True), (1.6, False)])
+def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over: bool) -> None:
+    mean = np.array([ZERO, ZERO, (2.5, 0.0, 0.0)])
+    observer = Observer(START_NS, mean, np.diag([0.0, 0.0, std_mps2**2]), np.zeros(3))
+    s = LOOK_NS * 1e-9
+    there = sample(AT_NS, AT_NS, (0.5 * 2.5 * s * s, 0.0, 0.0), std_m=50.0)  # which tells next to nothing
+    watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, there), PARAMETERS)
+    assert watching.unexplained_mps2 == pytest.approx(2.5, rel=1e-6)
+    assert (watching.over_ns is not None) == over
