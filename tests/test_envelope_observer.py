@@ -37,7 +37,9 @@ from uavctl.flight.envelope import (
     SCATTER,
     VELOCITY,
     Observer,
+    Seen,
     Watching,
+    misled,
     own_velocity,
     watch,
 )
@@ -487,3 +489,62 @@ def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over:
     watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, there), PARAMETERS)
     assert watching.unexplained_mps2 == pytest.approx(2.5, rel=1e-6)
     assert (watching.over_ns is not None) == over
+
+
+# The vehicle's own velocity as a witness
+
+
+def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[Watching, Seen]:
+    """Half a second into a flight by what was sent, the vehicle's word, and a prediction."""
+    watching = structs.replace(Watching(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
+    return watching, structs.replace(seen(AT_NS, own=motion(velocity, AT_NS)), velocity_mps=predicted)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "predicted", "flown", "apart_mps", "braked_on"),
+    [
+        ((1.0, 0.0, 0.0), (1.25, 0.0, 0.0), (9.0, 0.0, 0.0), None, True),  # near the prediction
+        ((1.0, 0.0, 0.0), (1.26, 0.0, 0.0), (9.0, 0.0, 0.0), None, False),
+        ((1.0, 0.0, 0.0), (9.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1, True),  # positions agreed with it
+        ((1.0, 0.0, 0.0), (9.0, 0.0, 0.0), (1.849, 0.0, 0.0), None, True),  # near what was sent, and gusts of 0.5 s
+        ((1.0, 0.0, 0.0), (9.0, 0.0, 0.0), (1.851, 0.0, 0.0), None, False),
+        ((0.0, 0.0, 1.0), (NAN3[0], NAN3[1], NAN3[2]), (9.0, 0.0, 0.0), None, True),  # the plant has no such axes
+    ],
+)
+def test_who_speaks_for_the_vehicle_s_own_velocity(
+    velocity: Vec3, predicted: Vec3, flown: Vec3, apart_mps: float | None, braked_on: bool
+) -> None:
+    watching, tick = told(velocity, predicted, flown_mps=flown, apart_mps=apart_mps)
+    assert own_velocity(watching, tick, 0.0, PARAMETERS) == (velocity if braked_on else None)
+    assert own_velocity(structs.replace(watching, contradicted=True), tick, 0.0, PARAMETERS) is None
+
+
+def test_what_was_sent_is_a_witness_for_ten_seconds() -> None:
+    watching, tick = told(ZERO, (9.0, 0.0, 0.0))
+    assert own_velocity(structs.replace(watching, began_ns=AT_NS - 10 * S), tick, 0.0, PARAMETERS) == ZERO
+    assert own_velocity(structs.replace(watching, began_ns=AT_NS - 10 * S - 1), tick, 0.0, PARAMETERS) is None
+    assert own_velocity(structs.replace(watching, began_ns=None), tick, 0.0, PARAMETERS) is None
+
+
+@pytest.mark.parametrize(("apart_mps", "age_s", "is_misled"), [(1.0, 0.0, False), (1.01, 0.0, True), (1.6, 1.0, False)])
+def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
+    apart_mps: float, age_s: float, is_misled: bool
+) -> None:
+    watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1)
+    assert misled(watching, tick, age_s, PARAMETERS) == is_misled
+    assert not misled(structs.replace(watching, contradicted=True), tick, age_s, PARAMETERS)
+
+
+def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
+    rng, watching = np.random.default_rng(4), NOT_WATCHING
+    velocity, accel, sent = np.zeros(3), np.zeros(3), ZERO
+    for n in range(30):
+        watching, _ = watch(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
+        if n:
+            for axis, lag_s in enumerate(PARAMETERS.lag_s):
+                step = expm(np.array([[0, 1, 0], [0, -1 / lag_s, 1 / lag_s], [0, 0, 0]]) * TICK_NS * 1e-9)
+                velocity[axis], accel[axis], _ = step @ (velocity[axis], accel[axis], sent[axis])
+        np.testing.assert_allclose(watching.flown_mps, velocity, atol=1e-12)
+        np.testing.assert_allclose(watching.flown_mps2, accel, atol=1e-12)
+        sent = vec3(rng.uniform(-2.0, 2.0, 3))
+    assert watching.began_ns == START_NS

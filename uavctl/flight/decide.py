@@ -48,6 +48,7 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
     mute: bool = False  # nothing may be sent in this tick
 
 
+PLAYED_OUT_STEPS = 2  # without a position: from there on a plan is held against the vehicle's own velocity
 MISSION_OVER = "the mission is over: landing"
 _FINAL = {
     End.BARRED: "positions jumped and are not believed any more",
@@ -99,6 +100,9 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
         return _fall(state, state.fallback, tick, inp, controller, why)
     if state.plan is not None and state.trust.suspect is not None and state.trust.suspect.likely:
         why = "positions jumped: braking until they are believed again, or not any more"
+        return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
+    if state.plan is not None and _misled(state, tick, inp, controller):
+        why = "the vehicle moves otherwise than was predicted, and no position says why"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
     if tick.boundary:
         return _decide(state, tick, inp, controller)
@@ -214,6 +218,14 @@ def moving_mps(state: ControlState, tick: Tick, inp: StepInput, controller: Cont
         return predicted, False
     north, east, down = (v if axis in controller.plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
     return (north, east, down), True
+
+
+def _misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
+    """Whether a plan that plays out is made of what was not so."""
+    if controller.envelope is None or tick.estimate is None or (tick.age_steps or 0) < PLAYED_OUT_STEPS:
+        return False
+    seen = seen_of(tick, inp, state.accel_mps2, controller.plant)
+    return envelope.misled(state.watching, seen, tick.estimate.age_s, controller.envelope)
 
 
 def seen_of(

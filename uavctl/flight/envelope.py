@@ -28,7 +28,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.data import PositionSample, Vec3, VehicleMotion
+from uavctl.data import PositionSample, Vec3, Vector, VehicleMotion
 from uavctl.flight.limits import AXES, ZERO
 
 Array = NDArray[np.float64]
@@ -60,6 +60,8 @@ BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part o
 REACTION_S = 0.3  # from a setpoint to what it does: recorded autopilots need 0.18 to 0.32 s
 GUSTS = 0.3  # of the unexplained acceleration: what gusts make of it for as long as nobody looks
 SHORTEST = 0.3  # of the window: over less, two velocities are not compared
+MISLEADS = 4.0  # disagreements of a prediction that gusts alone do not make
+WITNESS_S = 10.0  # of a flight: as long as what was sent says something of the velocity
 GRAVITY_MPS2 = 9.81
 LEAST_LAG_S = 1e-3  # for a plant without one
 
@@ -144,6 +146,9 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         observer: None before the first position.
         tick_ns: The last tick.
+        began_ns: The first one.
+        flown_mps: Velocity (3,) that was sent since then, behind the vehicle's lag.
+        flown_mps2: The acceleration (3,) that belongs to it.
         sent: Setpoints, each with the tick from which it acted [ns], oldest first.
         clipped: Whether each of the last innovations was clipped, newest last.
         unexplained_mps2: Size of the unexplained acceleration, when it was last looked at; None before.
@@ -160,6 +165,9 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
 
     observer: Observer | None = None
     tick_ns: int | None = None
+    began_ns: int | None = None
+    flown_mps: Vector = ZERO
+    flown_mps2: Vector = ZERO
     sent: tuple[tuple[int, Vec3], ...] = ()
     clipped: tuple[bool, ...] = ()
     unexplained_mps2: float | None = None
@@ -186,7 +194,7 @@ def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tup
         parameters: What is possible.
     """
     seen = _shown(seen, parameters)
-    watching = _told(watching, seen)
+    watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
     breach: Breach | None = None
     for sample in sorted(seen.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
         watching, found = _position(watching, sample, seen, parameters)
@@ -197,7 +205,9 @@ def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tup
 
 
 def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
-    """The vehicle's own velocity where it may be braked on; None where it does not come, or contradicts what is known.
+    """The vehicle's own velocity where it may be braked on; None where it does not come, or nothing speaks for it.
+
+    For it speak positions that agreed with it, the velocity that is predicted, and what was sent since a flight began.
 
     Args:
         watching: After the tick.
@@ -208,9 +218,31 @@ def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: Envel
     velocity = _own(seen.motion, seen.at_ns)
     if velocity is None or watching.contradicted:
         return None
-    drift_mps = parameters.disagreement_mps + GUSTS * parameters.unexplained_mps2 * age_s
-    apart = [abs(own - known) for own, known in zip(velocity, seen.velocity_mps, strict=True) if not math.isnan(known)]
-    return velocity if max(apart, default=0.0) <= drift_mps else None
+    within_mps = parameters.disagreement_mps + _gusts_mps(age_s, parameters)
+    if watching.apart_mps is not None or _near(velocity, seen.velocity_mps, within_mps):
+        return velocity
+    if watching.began_ns is None:
+        return None
+    since_s = (seen.at_ns - watching.began_ns) * 1e-9
+    within_mps = parameters.begins_mps + parameters.disagreement_mps + _gusts_mps(since_s, parameters)
+    return velocity if since_s <= WITNESS_S and _near(velocity, watching.flown_mps, within_mps) else None
+
+
+def misled(watching: Watching, seen: Seen, age_s: float, parameters: EnvelopeParameters) -> bool:
+    """Whether a prediction without fresh positions is wrong, by the vehicle's own velocity: a plan of it is, too."""
+    velocity = own_velocity(watching, seen, age_s, parameters)
+    within_mps = MISLEADS * parameters.disagreement_mps + _gusts_mps(age_s, parameters)
+    return velocity is not None and not _near(velocity, seen.velocity_mps, within_mps)
+
+
+def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
+    """Whether no axis is further apart, of those that are known."""
+    return all(abs(own - value) <= within_mps for own, value in zip(velocity, known, strict=True) if value == value)
+
+
+def _gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
+    """What gusts can have made of a velocity meanwhile."""
+    return GUSTS * parameters.unexplained_mps2 * for_s
 
 
 def _shown(seen: Seen, parameters: EnvelopeParameters) -> Seen:
@@ -259,6 +291,20 @@ def _told(watching: Watching, seen: Seen) -> Watching:
     distance = distance + (seen.at_ns - last_ns) * 1e-9 * np.array(velocity)
     kept = (one for one in way if one[0] > horizon_ns)
     return replace(watching, way=(*kept, (seen.at_ns, distance)))
+
+
+def _flown_on(watching: Watching, tick_ns: int | None, seen: Seen, parameters: EnvelopeParameters) -> Watching:
+    """Let what was sent since the last tick act: velocity and acceleration since the flight began, behind the lag."""
+    if tick_ns is None:
+        return replace(watching, began_ns=seen.at_ns, flown_mps=ZERO, flown_mps2=ZERO)
+    s, flown, accels = (seen.at_ns - tick_ns) * 1e-9, [], []
+    rows = zip(watching.flown_mps, watching.flown_mps2, seen.sent_mps2, parameters.lag_s, strict=True)
+    for velocity, accel, setpoint, lag_s in rows:
+        lag_s = max(lag_s, LEAST_LAG_S)
+        gone = math.exp(-s / lag_s)
+        flown.append(velocity + s * setpoint + (accel - setpoint) * lag_s * (1.0 - gone))
+        accels.append(setpoint + (accel - setpoint) * gone)
+    return replace(watching, flown_mps=tuple(flown), flown_mps2=tuple(accels))
 
 
 def _position(
