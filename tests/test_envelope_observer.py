@@ -548,3 +548,8 @@ def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
         np.testing.assert_allclose(watching.flown_mps2, accel, atol=1e-12)
         sent = vec3(rng.uniform(-2.0, 2.0, 3))
     assert watching.began_ns == START_NS
+
+
+def test_what_is_recorded_of_it_is_plain_numbers() -> None:
+    watching, _ = look((0.1, 0.2, -0.9), own=AT_REST, **offsets(0.1))
+    assert [type(watching.unexplained_mps2), type(watching.apart_mps)] == [float, float]

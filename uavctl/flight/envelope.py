@@ -322,7 +322,7 @@ def _position(
     observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
     unexplained = _unexplained(observer)
-    unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(unexplained[2]))
+    unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(float(unexplained[2])))
     size = unexplained_mps2 / parameters.unexplained_mps2
     known = unexplained_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
