@@ -12,7 +12,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from uavctl.data import PositionSample, Vec3, VehicleMotion
-from uavctl.flight.envelope import Breach, EnvelopeParameters, Observer, Seen, Watching, watch
+from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Observer, Watching, watch
 from uavctl.flight.limits import ZERO
 
 Array = NDArray[np.float64]
@@ -43,8 +43,8 @@ def motion(velocity_mps: Vec3, at_ns: int) -> VehicleMotion:
     return VehicleMotion(velocity_mps=velocity_mps, velocity_ns=at_ns)
 
 
-def seen(at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, own: VehicleMotion | None = None) -> Seen:
-    return Seen(
+def seen(at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, own: VehicleMotion | None = None) -> Observation:
+    return Observation(
         at_ns=at_ns,
         samples=samples,
         sent_mps2=sent,

@@ -33,7 +33,7 @@ from uavctl.flight.envelope import (
     SCATTER,
     VELOCITY,
     Breach,
-    Seen,
+    Observation,
     Watching,
     lean_mps2,
     watch,
@@ -225,8 +225,8 @@ def test_axes_that_the_plant_has_not_are_not_looked_at() -> None:
             velocity = None if n else own
             estimated = np.where(only > 0, position, math.nan)
 
-            def tick(other: Array, at_ns: int = at_ns) -> Seen:
-                return Seen(
+            def tick(other: Array, at_ns: int = at_ns) -> Observation:
+                return Observation(
                     at_ns=at_ns,
                     samples=(
                         sample(

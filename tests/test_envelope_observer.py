@@ -36,8 +36,8 @@ from uavctl.flight.envelope import (
     RESPONSE,
     SCATTER,
     VELOCITY,
+    Observation,
     Observer,
-    Seen,
     Watching,
     misled,
     own_velocity,
@@ -494,7 +494,7 @@ def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over:
 # The vehicle's own velocity as a witness
 
 
-def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[Watching, Seen]:
+def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[Watching, Observation]:
     """Half a second into a flight by what was sent, the vehicle's word, and a prediction."""
     watching = structs.replace(Watching(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
     return watching, structs.replace(seen(AT_NS, own=motion(velocity, AT_NS)), velocity_mps=predicted)

@@ -128,7 +128,7 @@ def test_what_counts_as_stuck(
         mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
-    watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats=repeats, coasting=belief)
+    watch = Watch(START_NS, one.position_m, resolution_m, news_m, changes=10, repeats=repeats, coasting=belief)
     assert stuck(watch, KALMAN, one, PARAMETERS) is found
     assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
     assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS) is True
@@ -158,7 +158,7 @@ def test_when_a_value_that_came_again_is_not_believed(
     for std_m in (0.0, 5.0):
         mean, cov = np.array([2.0 + far_m, 9.0, 9.0, 9.0]), np.eye(4) * std_m**2
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=mean, cov=cov)
-        watch = Watch(START_NS, one.position_m, resolution_m, news_m, repeats=1, coasting=belief)
+        watch = Watch(START_NS, one.position_m, resolution_m, news_m, changes=10, repeats=1, coasting=belief)
         assert doubtful(watch, KALMAN, one, PARAMETERS) is doubted
         assert doubtful(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
 
@@ -168,7 +168,7 @@ def test_what_is_near_enough_is_so_at_the_edge_as_well() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, doubted in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = Watch(START_NS, one.position_m, resolution_m=0.125, repeats=1, coasting=belief)
+        watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
         assert doubtful(watch, KALMAN, one, parameters) is doubted
 
 
@@ -177,5 +177,5 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = Watch(START_NS, one.position_m, resolution_m=0.125, repeats=1, coasting=belief)
+        watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
         assert stuck(watch, KALMAN, one, parameters) is found

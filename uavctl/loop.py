@@ -180,8 +180,10 @@ class ControlLoop:
         self.link = out.link or self.link
         self._record(out, at_ns)
         autopilot = "" if self.vehicle is None else self.vehicle.autopilot
-        for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
-            yield self._send(VEHICLE, data, at_ns)
+        # A vehicle that lands must not do so by positions that have just been found to be wrong.
+        if not self._state.disbelieves:
+            for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
+                yield self._send(VEHICLE, data, at_ns)
         yield from self._command(inp, out)
         self._record_stats(at_ns)
 

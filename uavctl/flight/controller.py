@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import msgspec
 
 from uavctl.data import Command, ControlMode, Plan, Vec3
-from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Watching
+from uavctl.flight.envelope import NOT_WATCHING, OF_POSITIONS, Breach, EnvelopeParameters, Watching
 from uavctl.flight.estimator import History
-from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
+from uavctl.flight.fallback import Biases, End, Fallback, FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
@@ -116,6 +116,12 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     watching: Watching = NOT_WATCHING
     breach: Breach | None = None
     biases: Biases = ()
+
+    @property
+    def disbelieves(self) -> bool:
+        """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
+        jumped = self.fallback is not None and self.fallback.end is End.BARRED
+        return jumped or (self.breach is not None and self.breach.code in OF_POSITIONS)
 
     @property
     def mode(self) -> ControlMode:

@@ -236,13 +236,13 @@ def seen_of(
     accepted: Sequence[PositionSample] = (),
     *,
     braking: bool = False,
-) -> envelope.Seen:
+) -> envelope.Observation:
     """What the envelope may know of a tick."""
     position, speed = None, (math.nan, math.nan, math.nan)
     if tick.estimate is not None:
         mean = tick.estimate.mean
         position, speed = (_vec3(plant, mean, each, math.nan) for each in (plant.position_index, plant.velocity_index))
-    return envelope.Seen(
+    return envelope.Observation(
         at_ns=inp.at_ns,
         samples=accepted,
         sent_mps2=sent_mps2,

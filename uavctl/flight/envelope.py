@@ -38,7 +38,8 @@ RESPONSE = "envelope-response"
 VELOCITY = "envelope-velocity"
 SCATTER = "envelope-scatter"
 BRAKING = "envelope-braking"
-BREACHES = frozenset({OUTSIDE, RESPONSE, VELOCITY, SCATTER, BRAKING})
+OF_POSITIONS = frozenset({RESPONSE, VELOCITY, SCATTER})  # after these no position is believed
+BREACHES = OF_POSITIONS | {OUTSIDE, BRAKING}
 
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
 SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge
@@ -102,7 +103,7 @@ class Breach(msgspec.Struct, frozen=True):
     text: str
 
 
-class Seen(msgspec.Struct, frozen=True):
+class Observation(msgspec.Struct, frozen=True):
     """What the envelope may know of a tick.
 
     Attributes:
@@ -185,7 +186,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
 NOT_WATCHING = Watching()
 
 
-def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
+def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
     """Take a tick in which we fly.
 
     Args:
@@ -204,7 +205,7 @@ def watch(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tup
     return watching, breach or outside or brakes
 
 
-def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
+def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
     """The vehicle's own velocity where it may be braked on; None where it does not come, or nothing speaks for it.
 
     For it speak positions that agreed with it, the velocity that is predicted, and what was sent since a flight began.
@@ -228,7 +229,7 @@ def own_velocity(watching: Watching, seen: Seen, age_s: float, parameters: Envel
     return velocity if since_s <= WITNESS_S and _near(velocity, watching.flown_mps, within_mps) else None
 
 
-def misled(watching: Watching, seen: Seen, age_s: float, parameters: EnvelopeParameters) -> bool:
+def misled(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> bool:
     """Whether a prediction without fresh positions is wrong, by the vehicle's own velocity: a plan of it is, too."""
     velocity = own_velocity(watching, seen, age_s, parameters)
     within_mps = MISLEADS * parameters.disagreement_mps + _gusts_mps(age_s, parameters)
@@ -245,7 +246,7 @@ def _gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
     return GUSTS * parameters.unexplained_mps2 * for_s
 
 
-def _shown(seen: Seen, parameters: EnvelopeParameters) -> Seen:
+def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
     """The tick in the axes of the plant; in the others positions, velocities and setpoints are zero."""
 
     def shown(values: Vec3) -> Vec3:
@@ -274,7 +275,7 @@ def _own(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
     return motion.velocity_mps if fresh and all(map(math.isfinite, motion.velocity_mps)) else None
 
 
-def _told(watching: Watching, seen: Seen) -> Watching:
+def _told(watching: Watching, seen: Observation) -> Watching:
     """Remember what was sent, and how far the vehicle says that it has flown."""
     horizon_ns = seen.at_ns - TOLD_NS
     sent = watching.sent
@@ -293,7 +294,7 @@ def _told(watching: Watching, seen: Seen) -> Watching:
     return replace(watching, way=(*kept, (seen.at_ns, distance)))
 
 
-def _flown_on(watching: Watching, tick_ns: int | None, seen: Seen, parameters: EnvelopeParameters) -> Watching:
+def _flown_on(watching: Watching, tick_ns: int | None, seen: Observation, parameters: EnvelopeParameters) -> Watching:
     """Let what was sent since the last tick act: velocity and acceleration since the flight began, behind the lag."""
     if tick_ns is None:
         return replace(watching, began_ns=seen.at_ns, flown_mps=ZERO, flown_mps2=ZERO)
@@ -308,7 +309,7 @@ def _flown_on(watching: Watching, tick_ns: int | None, seen: Seen, parameters: E
 
 
 def _position(
-    watching: Watching, sample: PositionSample, seen: Seen, parameters: EnvelopeParameters
+    watching: Watching, sample: PositionSample, seen: Observation, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
     """Take one believed position, if it is newer than those before by enough to tell something."""
     at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
@@ -418,7 +419,7 @@ def _unexplained(observer: Observer) -> Array:
     return rest
 
 
-def _response_text(observer: Observer, unexplained: Array, seen: Seen) -> str:
+def _response_text(observer: Observer, unexplained: Array, seen: Observation) -> str:
     text = (
         f"positions show an acceleration of {_vector(unexplained)} m/s² that no setpoint asked for "
         f"({_vector(observer.accel_mps2)} m/s² was)"
@@ -495,7 +496,7 @@ def _flown(way: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
 # Limits and braking
 
 
-def _place(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
+def _place(watching: Watching, seen: Observation, parameters: EnvelopeParameters) -> tuple[Watching, Breach | None]:
     """Whether the estimate is outside by more than the margin, or cannot stop before it is."""
     found = _outside(seen, parameters)
     if found is None:
@@ -505,7 +506,7 @@ def _place(watching: Watching, seen: Seen, parameters: EnvelopeParameters) -> tu
     return watching, Breach(OUTSIDE, found) if seen.at_ns - since_ns >= OUTSIDE_NS else None
 
 
-def _outside(seen: Seen, parameters: EnvelopeParameters) -> str | None:
+def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
     if seen.position_m is None:
         return None
     rows = zip(
@@ -530,7 +531,7 @@ def _outside(seen: Seen, parameters: EnvelopeParameters) -> str | None:
     return None
 
 
-def _braking(watching: Watching, seen: Seen) -> tuple[Watching, Breach | None]:
+def _braking(watching: Watching, seen: Observation) -> tuple[Watching, Breach | None]:
     """Whether braking brakes, by the vehicle's own velocity."""
     velocity = _own(seen.motion, seen.at_ns)
     if not seen.braking:

@@ -214,7 +214,7 @@ def _distrust(
     if newest and _flies(inp.vehicle):
         if stuck(watch, kalman, sample, reach.parameters):
             found = {**watches, sample.source: replace(watch, found=True)}
-            return _Distrust(replace(trust, watches=found), FROZEN, watch.first_ns)
+            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns or watch.first_ns)
         if doubtful(watch, kalman, sample, reach.parameters):
             return _Distrust(trust, REPEATED)
     doubted = np.zeros(n_axes) if trust.doubt_mps is None else trust.doubt_mps

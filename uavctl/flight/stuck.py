@@ -37,6 +37,9 @@ _NEWS = 0.5  # of a resolution: rounding alone makes no more
 _PLAIN = 4.0  # resolutions: noise of that size does not say the same twice
 _LEAST_NEWS_M = 2e-5  # nor do the numbers of a message, however large the room is; any camera's noise is more
 _SMOOTH = 0.1  # least weight of a sample in the mean of what was news
+_ENOUGH = round(1.0 / _SMOOTH)  # changes that tell the resolution
+_GRAIN_M = 2e-3  # what a few changes may be taken for
+_STILL = 5  # repeats of one axis in a row
 _NEAR = 0.5  # of the gate: how far a value that comes again may be off what inputs alone foretell
 _SOURCES = 8  # that are watched at once
 
@@ -53,6 +56,9 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         first_ns: Capture time at which the value first came [ns].
         repeats: How often the value came again.
         coasting: The belief that the value first gave, moved on by inputs alone; None without repeats.
+        moves: How often each axis has said something else, up to a number that is enough.
+        still: How often each axis came again in a row, whatever the others did.
+        still_ns: Capture time at which the value of each axis first came [ns].
         found: Whether it was found to be stuck, which holds until it says something else.
     """
 
@@ -64,7 +70,23 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
     first_ns: int = 0
     repeats: int = 0
     coasting: Belief | None = None
+    moves: tuple[int, ...] = (0, 0, 0)
+    still: tuple[int, ...] = (0, 0, 0)
+    still_ns: tuple[int, ...] = (0, 0, 0)
     found: bool = False
+
+    @property
+    def grain_m(self) -> float:
+        """The resolution; of a few changes only as far as no motion is taken for it [m]."""
+        return self.resolution_m if self.changes >= _ENOUGH else min(self.resolution_m, _GRAIN_M)
+
+    @property
+    def still_since_ns(self) -> int | None:
+        """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has."""
+        if not _noisy(self, _MANY):
+            return None
+        axes = zip(self.moves, self.still, self.still_ns, strict=True)
+        return min((since for moves, still, since in axes if moves >= _ENOUGH and still >= _STILL), default=None)
 
 
 Watches = Mapping[str, Watch]
@@ -83,18 +105,22 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
     at_ns, watch = captured_ns(sample), watches.get(sample.source)
     if watch is None:
         fewer = watches if len(watches) < _SOURCES else {}
-        return {**fewer, sample.source: Watch(at_ns=at_ns, position_m=sample.position_m, first_ns=at_ns)}
+        return {
+            **fewer,
+            sample.source: Watch(at_ns=at_ns, position_m=sample.position_m, first_ns=at_ns, still_ns=(at_ns,) * 3),
+        }
     if at_ns <= watch.at_ns:
         return watches
     moved_m = [abs(new - old) for new, old in zip(sample.position_m, watch.position_m, strict=True)]
     if not any(moved_m):
         begun = watch.coasting or belief_at(kalman, history, watch.at_ns)
         coasting = None if begun is None else coasted(kalman, history, begun, at_ns)
-        watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting)
+        still = tuple(count + 1 for count in watch.still)
+        watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting, still=still)
     else:
         smallest = min(one for one in moved_m if one)
         news_m = float(np.abs(off_m).max())
-        changes = min(watch.changes + 1, round(1.0 / _SMOOTH))
+        changes = min(watch.changes + 1, _ENOUGH)
         watch = Watch(
             at_ns=at_ns,
             position_m=sample.position_m,
@@ -102,12 +128,17 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
             news_m=watch.news_m + (news_m - watch.news_m) / changes,
             changes=changes,
             first_ns=at_ns,
+            moves=tuple(min(n + bool(moved), _ENOUGH) for moved, n in zip(moved_m, watch.moves, strict=True)),
+            still=tuple(0 if moved else count + 1 for moved, count in zip(moved_m, watch.still, strict=True)),
+            still_ns=tuple(at_ns if moved else since for moved, since in zip(moved_m, watch.still_ns, strict=True)),
         )
     return {**watches, sample.source: watch}
 
 
 def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
     """Whether a source is stuck, as `observe` left it with its newest sample."""
+    if watch.still_since_ns is not None:
+        return True
     belief = watch.coasting
     if belief is None or watch.found:
         return watch.found
@@ -116,7 +147,7 @@ def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: Gate
     values, variances = shown_by(kalman, sample)
     variance = np.diagonal(belief.cov)[index]
     far_m = np.abs(belief.mean[index] - values[:n_axes])
-    doubt_m = parameters.sigma * np.sqrt(variance + variances[:n_axes]) + parameters.margin_m + watch.resolution_m
+    doubt_m = parameters.sigma * np.sqrt(variance + variances[:n_axes]) + parameters.margin_m + watch.grain_m
     if (far_m > doubt_m).any():
         return True
     spread_m = float(np.sqrt(variance.max()))
@@ -131,7 +162,7 @@ def doubtful(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: G
     n_axes = len(kalman.axes)
     values, variances = shown_by(kalman, sample)
     far_m = np.abs(belief.mean[kalman.shown[:n_axes]] - values[:n_axes])
-    near_m = _NEAR * parameters.sigma * np.sqrt(variances[:n_axes]) + watch.resolution_m
+    near_m = _NEAR * parameters.sigma * np.sqrt(variances[:n_axes]) + watch.grain_m
     return _noisy(watch, _PLAIN) or bool((far_m > near_m).any())
 
 
