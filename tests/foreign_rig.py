@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from loopback_rig import make_loop
 from mcap.writer import Writer
 
 from logs.replay_tlog import ForeignReplay, replay_tlog
 from logs.tlog import TlogPacket, read_tlog
+from uavctl.build import build_controller
 from uavctl.config import load_config
-from uavctl.loop import VEHICLE
+from uavctl.loop import VEHICLE, ControlLoop
 
 DATA = Path(__file__).parent / "data"
 TLOGS = ("arducopter-vicon.tlog", "px4-offboard.tlog", "hand-over-arducopter-gps.tlog")
@@ -56,7 +57,10 @@ def rows_of(tlog: str, topic: str = "/mavlink", encoding: str = "mavlink") -> li
 def flown(packets: tuple[TlogPacket, ...]) -> ForeignReplay:
     config = load_config("room", ["daemon.vehicle=tlog", "daemon.mocap=tlog", "solver.method=exact"])
     incoming = [(packet.at_ns, packet.data) for packet in packets if not packet.outgoing]
-    return replay_tlog(incoming, lambda sink: make_loop(config, sink), link=VEHICLE, tick_ns=50_000_000)
+    controller = replace(build_controller(config), envelope=None)  # as `uavctl log replay` does: others flew it
+    return replay_tlog(
+        incoming, lambda sink: ControlLoop(config, controller, sink, lambda: 0), link=VEHICLE, tick_ns=50_000_000
+    )
 
 
 @cache

@@ -19,14 +19,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 ARMED_CUSTOM = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 PX4_OFFBOARD = 6 << 16
 FLIGHT, PAUSE, AFTER, LONGEST = 80, 80, 80, 1200  # setpoints: seen, unseen, seen again at least, and all at most
-TICK_S, WAIT_S = 0.05, 0.02
+WAIT_S = 0.02
 NEAR_M, SLOW_MPS = 0.1, 0.1
 
 
 class Vehicle:
-    """A point mass without friction, moved by what it is told, and what it has got."""
+    """A point mass without friction, moved in real time by what it was told last, and what it has got."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: float) -> None:
+        self.now, self.accel_mps2 = now, [0.0, 0.0, 0.0]
         self.position_m, self.velocity_mps = [0.5, 0.5, -1.0], [0.0, 0.0, 0.0]
         self.setpoints, self.poses, self.largest_mps2 = 0, 0, 0.0
         self.masks: set[int] = set()
@@ -35,12 +36,17 @@ class Vehicle:
     def unseen(self) -> bool:
         return FLIGHT <= self.setpoints < FLIGHT + PAUSE
 
+    def move(self, now: float) -> None:
+        """Fly on to a time by the last setpoint."""
+        for axis, accel in enumerate(self.accel_mps2):
+            s, self.velocity_mps[axis] = now - self.now, self.velocity_mps[axis] + accel * (now - self.now)
+            self.position_m[axis] += s * self.velocity_mps[axis] - 0.5 * s * s * accel
+        self.now = now
+
     def fly(self, message: mavlink.MAVLink_message) -> None:
-        """One tick on a setpoint."""
-        accel = (message.afx, message.afy, message.afz)
-        for axis in range(3):
-            self.velocity_mps[axis] += accel[axis] * TICK_S
-            self.position_m[axis] += self.velocity_mps[axis] * TICK_S
+        """Take a setpoint."""
+        accel = [message.afx, message.afy, message.afz]
+        self.accel_mps2 = accel
         self.setpoints += 1
         self.largest_mps2 = max(self.largest_mps2, *map(abs, accel))
         self.masks.add(message.type_mask)
@@ -57,10 +63,11 @@ def main(port: int, target_m: list[float]) -> None:
     out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
-    vehicle, told = Vehicle(), False
     next_pose = next_heartbeat = time.monotonic()
+    vehicle, told = Vehicle(next_pose), False
     while True:
         now = time.monotonic()
+        vehicle.move(now)
         if now >= next_heartbeat:
             next_heartbeat = now + 0.5
             beat = out.heartbeat_encode(

@@ -96,6 +96,7 @@ HEIGHT_M = validators.Number(gt=0, lte=1000)
 SEED = validators.Number(gte=0, lte=LARGEST_SEED)
 WORKERS = validators.Number(gte=1, lte=1024)
 PORT = validators.Number(gte=1, lte=65535)
+FREE_PORT = validators.Number(gte=0, lte=65535)
 
 
 def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:

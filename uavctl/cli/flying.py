@@ -27,7 +27,7 @@ from logs.report import write_report
 from logs.summary import FlightSummary, summarise
 from logs.topics import HEADER, LIBRARY
 from logs.views import Views
-from uavctl.cli.common import PORT, messages
+from uavctl.cli.common import FREE_PORT, messages
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.provenance import cpu, versions
 from uavctl.config import Config
@@ -41,7 +41,9 @@ LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
 LIVE_PORT = 8765  # where Foxglove looks first
 Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer on this machine; needs uavctl[live]")]
-LivePort = Annotated[int | None, Parameter(help=f"TCP port of the live view; else {LIVE_PORT}", validator=PORT)]
+LivePort = Annotated[
+    int | None, Parameter(help=f"TCP port of the live view, 0 is any free one; else {LIVE_PORT}", validator=FREE_PORT)
+]
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
 

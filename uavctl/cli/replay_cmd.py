@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -78,7 +79,9 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
     loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
     config = loaded.config
     with located(loaded):
-        make_loop = _loop_maker(config, prepare(config, build_design(config)).controller)
+        controller = prepare(config, build_design(config)).controller
+        # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
+        make_loop = _loop_maker(config, replace(controller, envelope=None))
     packets = ((packet.at_ns, packet.data) for packet in recorded if not packet.outgoing)
     tick_ns = round(config.daemon.tick_s * 1e9)
     result = replay_tlog(packets, make_loop, link=VEHICLE, tick_ns=tick_ns)

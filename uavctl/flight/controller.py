@@ -99,6 +99,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         link_alarms: What was told of the link and still holds, by event code.
         watching: What the envelope knows of this flight.
         breach: What it found that cannot be; None for nothing.
+        recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
         biases: Estimated biases of late.
     """
 
@@ -115,6 +116,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     link_alarms: tuple[str, ...] = ()
     watching: Watching = NOT_WATCHING
     breach: Breach | None = None
+    recalled: bool = False
     biases: Biases = ()
 
     @property

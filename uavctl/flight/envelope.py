@@ -506,6 +506,11 @@ def _place(watching: Watching, seen: Observation, parameters: EnvelopeParameters
     return watching, Breach(OUTSIDE, found) if seen.at_ns - since_ns >= OUTSIDE_NS else None
 
 
+def is_outside(seen: Observation, parameters: EnvelopeParameters) -> bool:
+    """Whether the estimate is outside by more than the margin, or about to be."""
+    return _outside(seen, parameters) is not None
+
+
 def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
     if seen.position_m is None:
         return None

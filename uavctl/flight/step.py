@@ -17,6 +17,7 @@ from uavctl.data import (
     Estimate,
     Event,
     LinkEstimate,
+    Order,
     Plan,
     PositionSample,
     Setpoint,
@@ -27,7 +28,7 @@ from uavctl.data import (
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
-from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, watch
+from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, is_outside, watch
 from uavctl.flight.estimator import begin, set_input, without
 from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array, captured_ns
@@ -100,7 +101,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
     tick = place(state, inp, intake.history, controller)
-    watching, breach = _watched(state, tick, intake, inp, controller)
+    recalled = _recalled(state, tick, inp, controller)
+    watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
     clean_ns = intake.clean_ns
     moved = intake.moved or (intake.absurd and before not in _NOT_FLOWN)
     if breach is not None or (moved and not lost):
@@ -120,6 +122,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         decided_step=tick.number,
         fresh=0 if stale else intake.fresh,
         watching=watching,
+        recalled=recalled,
         plan=_outdated(ordered.plan, clean_ns),
         biases=_biases(state, tick, clean_ns),
     )
@@ -178,8 +181,17 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     )
 
 
+def _recalled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
+    """Whether a vehicle is on its way back from outside because the operator has asked for it."""
+    asked = state.recalled or any(command.order is Order.ENGAGE for command in inp.commands)
+    if not asked or controller.envelope is None:
+        return False
+    flown = inp.vehicle is not None and not unready(inp.vehicle)
+    return not flown or is_outside(seen_of(tick, inp, state.accel_mps2, controller.plant), controller.envelope)
+
+
 def _watched(
-    state: ControlState, tick: Tick, intake: Intake, inp: StepInput, controller: Controller
+    state: ControlState, tick: Tick, intake: Intake, inp: StepInput, controller: Controller, *, recalled: bool
 ) -> tuple[Watching, Breach | None]:
     """Hold the tick against the envelope, as long as it is we who fly."""
     if state.breach is not None:
@@ -196,7 +208,7 @@ def _watched(
         intake.accepted,
         braking=state.mode is ControlMode.BRAKE,
     )
-    if tick.age_steps is None or tick.age_steps >= controller.horizon:
+    if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
         seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
     return watch(state.watching, seen, controller.envelope)
 
