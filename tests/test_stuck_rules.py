@@ -98,6 +98,53 @@ def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> No
     assert set(watched([0.0], "new", crowd)) == {"new"}
 
 
+def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
+    """The north moves and the down but twice; the east never does."""
+    watches: Watches = {}
+    history = begin(KALMAN, START_NS, START_NS)
+    values = [(0.0, 1.0, 5.0), (0.1, 1.0, 5.0), (0.3, 1.0, 6.0), (0.3, 1.0, 6.0), (0.4, 1.0, 7.0), (0.6, 1.0, 7.0)]
+    for n, value in enumerate(values):
+        one = sample(START_NS + (n + 1) * TICK_NS, position_m=value)
+        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
+        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+    watch = watches["camera"]
+    assert (watch.moves, watch.still) == ((4, 0, 2), (0, 5, 1))
+    assert watch.still_ns == (START_NS + 6 * TICK_NS, START_NS + TICK_NS, START_NS + 5 * TICK_NS)
+    for n in range(20):
+        one = sample(START_NS + (n + 9) * TICK_NS, position_m=(0.1 * (n % 2), 1.0, 7.0))
+        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+    assert (watches["camera"].moves, watches["camera"].still) == ((10, 0, 2), (0, 25, 21))
+
+
+@pytest.mark.parametrize(
+    ("moves", "still", "news_m", "since"),
+    [
+        ((10, 10, 10), (0, 0, 5), 0.02, 3),
+        ((10, 10, 10), (0, 0, 4), 0.02, None),
+        ((10, 10, 10), (0, 0, 6), 0.02, 3),
+        ((10, 10, 9), (0, 0, 5), 0.02, None),  # it has not moved all the time
+        ((10, 10, 10), (5, 0, 5), 0.02, 1),
+        ((10, 10, 10), (0, 5, 5), 0.02, 2),
+        ((10, 10, 10), (0, 0, 5), 0.01999, None),  # of 20 resolutions
+        ((10, 10, 10), (0, 0, 0), 0.02, None),
+    ],
+)
+def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
+    moves: tuple[int, ...], still: tuple[int, ...], news_m: float, since: int | None
+) -> None:
+    watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, news_m, moves=moves, still=still, still_ns=(1, 2, 3))
+    assert watch.still_since_ns == since
+    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS) is (since is not None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "resolution_m", "grain_m"),
+    [(10, 0.01, 0.01), (9, 0.01, 0.002), (9, 0.001, 0.001), (11, 0.01, 0.01), (0, 0.0, 0.0)],
+)
+def test_a_few_changes_do_not_tell_the_resolution(changes: int, resolution_m: float, grain_m: float) -> None:
+    assert Watch(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).grain_m == grain_m
+
+
 @pytest.mark.parametrize(
     ("repeats", "news_m", "resolution_m", "std_m", "far_m", "found"),
     [

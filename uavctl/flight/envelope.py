@@ -238,7 +238,8 @@ def misled(watching: Watching, seen: Observation, age_s: float, parameters: Enve
 
 def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
     """Whether no axis is further apart, of those that are known."""
-    return all(abs(own - value) <= within_mps for own, value in zip(velocity, known, strict=True) if value == value)
+    pairs = zip(velocity, known, strict=True)
+    return all(abs(own - value) <= within_mps for own, value in pairs if not math.isnan(value))
 
 
 def _gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
@@ -357,13 +358,11 @@ def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: E
     mean, accel = np.zeros((3, 3)), np.zeros(3)
     speed_mps = parameters.unexplained_mps2
     if watching.observer is None:
-        speed_mps = parameters.begins_mps
-        if watching.sent:
-            began_ns = min(watching.sent[0][0], at_ns)
-            rest = Observer(at_ns=began_ns, mean=mean, cov=np.zeros((3, 3)), accel_mps2=accel)
-            flown = _predicted(rest, watching.sent, at_ns, parameters)
-            mean[1], accel = flown.mean[1], flown.accel_mps2
-            speed_mps += GUSTS * parameters.unexplained_mps2 * (at_ns - began_ns) * 1e-9
+        began_ns = min(watching.sent[0][0], at_ns)
+        rest = Observer(at_ns=began_ns, mean=mean, cov=np.zeros((3, 3)), accel_mps2=accel)
+        flown = _predicted(rest, watching.sent, at_ns, parameters)
+        mean[1], accel = flown.mean[1], flown.accel_mps2
+        speed_mps = parameters.begins_mps + _gusts_mps((at_ns - began_ns) * 1e-9, parameters)
     mean[0] = sample.position_m
     if sample.velocity_mps is not None:
         mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
