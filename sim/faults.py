@@ -22,7 +22,7 @@ from uavctl.errors import ConfigError
 
 OF_LINK = ("blackout", "held", "uplink_blackout")
 OF_CAMERA = ("occluded", "swapped", "frozen")
-LASTING = ("wind", "battery", "frame", "noise", "parameter")
+LASTING = ("wind", "battery", "frame", "noise", "drift", "parameter")
 MOST_NOISE_M = 100.0
 MODE_S = 1.0  # how long a change of mode is told; afterwards the mode itself tells
 
@@ -129,6 +129,8 @@ class Faults:
             self._cameras.mistake(fault.name)
         elif fault.kind == "noise":
             self._cameras.shake(fault.value)
+        elif fault.kind == "drift":
+            self._cameras.creep(fault.velocity_mps)
         elif fault.kind == "mode":
             self._autopilot.pilot.change(self._kind.mode(fault.name), at_ns)
         elif isinstance(vehicle, Quadrotor):

@@ -86,6 +86,7 @@ class Cameras:
         self._hidden = False
         self._seen: _Pose | None = None
         self._axes, self._noise_std_m = AXES["right"], camera.noise_std_m
+        self._creeps, self._crept_ns, self._crept_m = STILL, start_ns, STILL
         self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
         self._taken = 0
 
@@ -106,6 +107,11 @@ class Cameras:
     def shake(self, noise_std_m: float) -> None:
         """Have another noise of the positions from now on [m]."""
         self._noise_std_m = noise_std_m
+
+    def creep(self, velocity_mps: Vec3) -> None:
+        """Let the origin of what they say move from the next sample on [m/s], as of cameras that have been knocked."""
+        self._crept_m = self._creep_m(self.next_ns)
+        self._creeps, self._crept_ns = velocity_mps, self.next_ns
 
     def capture(self, position_m: Vec3, velocity_mps: Vec3, attitude: Quaternion) -> tuple[int, bytes] | None:
         """Take the sample that is due at `next_ns`.
@@ -130,12 +136,20 @@ class Cameras:
         if self._seen is None or not within(camera.frozen, since_ns):
             north, east, down = (float(p + n) for p, n in zip(body.position_m, noise, strict=True))
             place, speed = _in_axes(self._axes, (north, east, down)), _in_axes(self._axes, body.velocity_mps)
+            if self._creeps is not STILL:
+                north, east, down = (p + off for p, off in zip(place, self._creep_m(at_ns), strict=True))
+                place = (north, east, down)
             self._seen = body._replace(position_m=place, velocity_mps=speed)
         drift_us = round(since_ns * camera.clock_drift_ppm * 1e-9)
         msg = self._message(self._clock_us + since_ns // 1000 + drift_us, self._seen)
         data = bytes(msg.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
         return at_ns + round(latency_s * 1e9), data
+
+    def _creep_m(self, at_ns: int) -> Vec3:
+        s = (at_ns - self._crept_ns) * 1e-9
+        north, east, down = (off + s * v for off, v in zip(self._crept_m, self._creeps, strict=True))
+        return north, east, down
 
     def _hides(self, since_ns: int) -> bool:
         self._hidden = bool(self._occlusion.random() < (self._keep if self._hidden else self._hide))

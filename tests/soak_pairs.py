@@ -21,7 +21,7 @@ FLIGHT_S = 30.0
 OUTSIDE_M = 1.0  # beyond the position limits of `[sets]`, ceiling included
 SPEED_MPS = 3.0  # twice what `[sets]` allows
 WORLDS = [(plant, autopilot) for plant in ("linear", "quadrotor") for autopilot in ("px4", "ardupilot")]
-KINDS = ("blackout", "held", "occluded", "swapped", "frozen", "frame", "noise", "wind")
+KINDS = ("blackout", "held", "occluded", "swapped", "frozen", "frame", "noise", "drift", "wind")
 WRONG_AXES = tuple(name for name in AXES if name != "right")
 
 
@@ -104,7 +104,7 @@ def _told(fault: FaultConfig) -> str:
     what = " ".join(filter(None, (fault.kind, fault.name)))
     if fault.kind == "noise":
         what += f" {fault.value:.2f} m"
-    if fault.kind == "wind":
+    if fault.kind in ("wind", "drift"):
         what += " (" + ", ".join(f"{v:.1f}" for v in fault.velocity_mps) + ") m/s"
     return f"{what} at {fault.at_s:.2f} s" + (f" for {fault.for_s:.1f} s" if fault.for_s else "")
 
@@ -133,13 +133,15 @@ def _drawn_fault(rng: np.random.Generator, plant: str) -> FaultConfig:
     span_s, noise_m = float(rng.uniform(0.2, 20.0)), float(rng.uniform(0.0, 1.0))
     name = str(rng.choice(WRONG_AXES)) if kind == "frame" else ""
     north, east = rng.uniform(-1.5, 1.5, 2).tolist()
+    if kind == "drift":
+        north, east = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.6), float(rng.uniform(-0.3, 0.3))
     return FaultConfig(
         at_s=at_s,
         kind=kind,  # type: ignore[arg-type]  # one of them
         for_s=span_s if kind in ("blackout", "held", "occluded", "swapped", "frozen") else 0.0,
         name=name,
         value=noise_m if kind == "noise" else 0.0,
-        velocity_mps=(north, east, 0.0) if kind == "wind" else (0.0, 0.0, 0.0),
+        velocity_mps=(north, east, 0.0) if kind in ("wind", "drift") else (0.0, 0.0, 0.0),
     )
 
 

@@ -29,6 +29,7 @@ from envelope_rig import (
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
 
 from uavctl.data import Vec3, VehicleMotion
 from uavctl.flight.envelope import (
@@ -36,6 +37,7 @@ from uavctl.flight.envelope import (
     RESPONSE,
     SCATTER,
     VELOCITY,
+    Breach,
     Observation,
     Observer,
     Watching,
@@ -329,7 +331,18 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
             assert watching.apart_mps is None
             continue
         slope, _ = np.polyfit([(at - captured_ns) * 1e-9 for at, _ in window], [off for _, off in window], 1)
-        assert watching.apart_mps == pytest.approx(float(np.linalg.norm(slope)), rel=1e-6)
+        # As much of it as stamps that are up to 0.15 s late or early make is no difference.
+        middle_ns = (window[0][0] + captured_ns) // 2
+        places = [[np.interp(at, ticks_ns, axis) for axis in np.array(flown).T] for at in (window[0][0], middle_ns)]
+        half_s = (captured_ns - window[0][0]) * 0.5e-9
+        accel = (np.array(places[0]) - 2.0 * np.array(places[1]) + distance) / half_s**2
+        left = minimize_scalar(
+            lambda late_s, by=slope, a=accel: float(np.linalg.norm(by + late_s * a)),
+            bounds=(-0.15, 0.15),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        assert watching.apart_mps == pytest.approx(left.fun, rel=1e-6)
     kept = [at for at in ticks_ns if at > at_ns - 3 * S]
     assert [at for at, _ in watching.way] == kept
 
@@ -355,6 +368,120 @@ def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
 
 # 0.4375 m/s are exactly what is shown of 0.4375 m/s, and 1.5 times 0.4375 / 1.5.
 EXACT_MPS = 0.4375
+
+
+def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
+    """What is left of offsets with that slope while the vehicle accelerates, and whether it contradicts."""
+    times_ns = [AT_NS - ns * MS for ns in (512, 256)]
+    nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
+    way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
+    lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
+    watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
+    return watching.apart_mps, watching.contradicted
+
+
+@pytest.mark.parametrize(
+    ("accel", "slope", "left_mps"),
+    [
+        (ZERO, (0.3, 0.0, 0.0), 0.3),
+        ((2.0, 0.0, 0.0), (-0.2, 0.0, 0.0), 0.0),  # positions are 0.1 s late
+        ((2.0, 0.0, 0.0), (0.2, 0.0, 0.0), 0.0),  # or early
+        ((2.0, 0.0, 0.0), (-0.5, 0.0, 0.0), 0.2),  # no stamp is later than 0.15 s
+        ((2.0, 0.0, 0.0), (0.5, 0.0, 0.0), 0.2),
+        ((2.0, 0.0, 0.0), (0.0, 0.3, 0.0), 0.3),  # nor does it turn a velocity
+        ((0.0, 1.0, 1.0), (0.0, -0.2, 0.0), math.hypot(0.1, 0.1)),
+    ],
+)
+def test_as_much_as_late_stamps_make_is_no_difference_of_velocities(accel: Vec3, slope: Vec3, left_mps: float) -> None:
+    left, contradicted = turning(accel, slope)
+    assert left == pytest.approx(left_mps, abs=1e-6)
+    assert contradicted == (left_mps > PARAMETERS.disagreement_mps)
+
+
+def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
+    times_ns = [AT_NS - ns * MS for ns in (512, 256)]
+    lines = tuple((at, np.array([(at - AT_NS) * -0.2e-9, 0.0, 0.0])) for at in times_ns)
+    for begins_ns in (times_ns[0], times_ns[0] + 1):
+        way = tuple(
+            (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
+        )
+        watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
+        assert watching.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
+
+
+# The ways of half a minute
+
+
+def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[Watching, Breach | None]:
+    """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
+    known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
+    middle_ns = AT_NS - 256 * MS
+    older = tuple((middle_ns - age_ns - n * S, np.zeros(3)) for n in range(before, 0, -1))
+    places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
+    return look(ZERO, own=AT_REST, places=places, **known)
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "within_m"), [(S, 0.25 * 2.16), (5 * S, 0.25 * 2.8), (30 * S - 1, 0.25 * 6.8), (30 * S, math.inf)]
+)
+def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within_m: float) -> None:
+    for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
+        watching, breach = creeping(off_m if math.isfinite(off_m) else 99.0, age_ns)
+        breached = breached and math.isfinite(within_m)
+        assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+        assert breach is None or breach.text.endswith(f"away from the vehicle's own way in {age_ns * 1e-9:.0f} s")
+        assert breach is None or f"(0.0, {off_m:.1f}, 0.0) m" in breach.text
+        assert not watching.contradicted
+
+
+def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
+    _, breach = creeping(9.0, S, before=3)
+    assert breach is not None and breach.text.endswith("in 1 s")
+
+
+@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1)])
+def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
+    watching, breach = creeping(0.0, age_ns)
+    assert breach is None
+    assert len(watching.places) == kept
+    if kept == 2 or age_ns == 30 * S:
+        at_ns, place = watching.places[-1]
+        assert at_ns == AT_NS - 256 * MS
+        np.testing.assert_allclose(place, ZERO, atol=1e-12)
+
+
+def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
+    ((at_ns, place),) = watching.places
+    assert at_ns == AT_NS - 200 * MS
+    np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
+
+
+def test_over_a_gap_the_way_is_not_compared() -> None:
+    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
+        watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
+        assert breach is None
+        assert watching.places == (places if kept else ())
+    silent, _ = look(ZERO, places=places, **offsets(0.0))
+    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, way=((AT_NS - 301 * MS, np.zeros(3)),)))
+    assert silent.places == missed.places == ()
+
+
+def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
+    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
+    assert breach is not None and breach.text.startswith("positions move otherwise")
+
+
+@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True)])
+def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
+    watching = Watching(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
+    assert watching.answered == answered
+    assert not structs.replace(watching, tick_ns=None).answered
+
+
+# What is compared how
 
 
 @pytest.mark.parametrize(

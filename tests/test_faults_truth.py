@@ -99,6 +99,28 @@ def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_en
     assert any("envelope-response" in alarm for alarm in flight.alarms)
 
 
+@pytest.mark.fault(42)
+@pytest.mark.parametrize("speed_mps", [0.1, 0.3])
+@pytest.mark.parametrize("axis", [0, 2])
+def test_positions_that_creep_away_from_the_vehicle(
+    prepared: Prepared, world: Config, speed_mps: float, axis: int
+) -> None:
+    creeps = (-speed_mps, 0.0, 0.0) if axis == 0 else (0.0, 0.0, speed_mps)
+    fault = FaultConfig(at_s=5.0, kind="drift", velocity_mps=creeps)
+    flight = bounded(fly_true(prepared, with_faults(world, fault)))
+    assert flight.moved_m < MOVED_M
+    assert any("envelope-velocity" in alarm for alarm in flight.alarms)
+    assert "LAND" in flight.ended
+
+
+@pytest.mark.fault(15, 45)
+def test_positions_that_cannot_be_from_the_start_let_it_land(prepared: Prepared, world: Config) -> None:
+    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=0.0, kind="frame", name="millimetres"))))
+    assert flight.moved_m < MOVED_M / 2
+    assert any("envelope-outside" in alarm for alarm in flight.alarms)
+    assert "LAND" in flight.ended
+
+
 @pytest.mark.fault(13)
 def test_another_body_in_motion(prepared: Prepared, world: Config) -> None:
     swapped = FaultConfig(at_s=2.0, kind="swapped", for_s=20.0)

@@ -116,6 +116,7 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "battery",
             "frame",
             "noise",
+            "drift",
             "parameter",
             "mode",
         ],
@@ -123,12 +124,12 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             description="`blackout`, `held`, `uplink_blackout`: a span of these of `[link]`; `occluded`, `swapped`, "
             "`frozen`: a span of these of `[sim.camera]`; `wind`: the steady wind of the quadrotor changes; `battery`: "
             "that of the quadrotor has another charge; `frame`: the cameras' axes are others from then on; `noise`: "
-            "so is the noise of their positions; `parameter`: one of the autopilot's has another value; `mode`: the "
+            "so is the noise of their positions; `drift`: their origin moves from then on; `parameter`: one of the autopilot's has another value; `mode`: the "
             "pilot changes the autopilot's mode with the stick"
         ),
     ]
     for_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="length of a span [s]")] = 0.0
-    velocity_mps: Annotated[Wind, Meta(description="of the air from then on, with `wind`, local NED [m/s]")] = (
+    velocity_mps: Annotated[Wind, Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]")] = (
         0.0,
         0.0,
         0.0,

@@ -17,6 +17,7 @@ _OF_KIND = {
     "battery": ("charge",),
     "frame": ("name",),
     "noise": ("value",),
+    "drift": ("velocity_mps",),
     "parameter": ("name", "value"),
     "mode": ("name",),
 }
@@ -79,7 +80,7 @@ def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[Problem]:
     elif fault.kind in ("parameter", "mode", "frame"):
         if not fault.name:
             yield Problem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
-    elif fault.kind == "noise":
+    elif fault.kind in ("noise", "drift"):
         return
     elif fault.for_s == 0.0:
         yield Problem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")

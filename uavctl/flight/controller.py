@@ -123,7 +123,10 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     def disbelieves(self) -> bool:
         """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
         jumped = self.fallback is not None and self.fallback.end is End.BARRED
-        return jumped or (self.breach is not None and self.breach.code in OF_POSITIONS)
+        if jumped or self.breach is None:
+            return jumped
+        # An estimate that is outside right after the start may be so because positions are not what they say.
+        return self.breach.code in OF_POSITIONS or not self.watching.answered
 
     @property
     def mode(self) -> ControlMode:

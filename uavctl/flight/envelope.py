@@ -8,7 +8,8 @@ Each tick of a flight, four questions:
    an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
    believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
    the acceleration sent a wrong direction or size, a marker that came loose none at all.
-3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)?
+3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)? Over a second or so
+   their velocities are compared; over half a minute the ways that both have come, which finds a frame that creeps.
 4. Does braking brake?
 
 The answer is a `Breach` that names the cause. What follows needs no position: level, and the vehicle's own landing
@@ -41,6 +42,7 @@ BRAKING = "envelope-braking"
 OF_POSITIONS = frozenset({RESPONSE, VELOCITY, SCATTER})  # after these no position is believed
 BREACHES = OF_POSITIONS | {OUTSIDE, BRAKING}
 
+ANSWERS_NS = 2_000_000_000  # of a flight: positions that did not answer would have been found out by then
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
 SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge
 TOLD_NS = 3_000_000_000  # setpoints and own velocities are remembered for so long
@@ -60,7 +62,10 @@ BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
 REACTION_S = 0.3  # from a setpoint to what it does: recorded autopilots need 0.18 to 0.32 s
 GUSTS = 0.3  # of the unexplained acceleration: what gusts make of it for as long as nobody looks
+LATE_S = 0.15  # by so much positions may be stamped later or earlier than the vehicle's own velocity
 SHORTEST = 0.3  # of the window: over less, two velocities are not compared
+WAYS_NS, WAY_NS = 30_000_000_000, 1_000_000_000  # ways are compared over so long, with the places of each such time
+WAYS_S, WAYS_PART = 2.0, 0.16  # of the disagreement: a way may be off by so long of it, and grow by so much of it
 MISLEADS = 4.0  # disagreements of a prediction that gusts alone do not make
 WITNESS_S = 10.0  # of a flight: as long as what was sent says something of the velocity
 GRAVITY_MPS2 = 9.81
@@ -159,6 +164,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
         clean_ns: Capture time of the last position at which all was quiet; None before any.
         way: (at_ns, distance (3,)) flown by the vehicle's own velocity; empty while it is silent.
         offsets: (capture time, position minus that distance (3,)), oldest first.
+        places: (capture time, mean of the offsets then (3,)), one for each second or so, oldest first.
         contradicted: Whether the vehicle's own velocity disagreed with positions when it was last compared.
         outside_ns: Since when the estimate has been outside; None while it is not.
         braking: When braking began, and the speed then [m/s]; None while it does not.
@@ -178,9 +184,16 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     clean_ns: int | None = None
     way: tuple[tuple[int, Array], ...] = ()
     offsets: tuple[tuple[int, Array], ...] = ()
+    places: tuple[tuple[int, Array], ...] = ()
     contradicted: bool = False
     outside_ns: int | None = None
     braking: tuple[int, float] | None = None
+
+    @property
+    def answered(self) -> bool:
+        """Whether positions have been held against a flight for so long that they are those of this vehicle."""
+        began_ns, tick_ns = self.began_ns, self.tick_ns
+        return began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS
 
 
 NOT_WATCHING = Watching()
@@ -286,9 +299,9 @@ def _told(watching: Watching, seen: Observation) -> Watching:
     watching = replace(watching, tick_ns=seen.at_ns, sent=sent[first:])
     velocity, way = _own(seen.motion, seen.at_ns), watching.way
     if velocity is None:
-        return replace(watching, way=(), offsets=())
+        return replace(watching, way=(), offsets=(), places=())
     if not way or seen.at_ns - way[-1][0] > MOTION_NS:  # missed ticks: nobody knows how far it flew in them
-        return replace(watching, way=((seen.at_ns, np.zeros(3)),), offsets=())
+        return replace(watching, way=((seen.at_ns, np.zeros(3)),), offsets=(), places=())
     last_ns, distance = way[-1]
     distance = distance + (seen.at_ns - last_ns) * 1e-9 * np.array(velocity)
     kept = (one for one in way if one[0] > horizon_ns)
@@ -460,16 +473,39 @@ def _compared(
     offsets = () if flown is None else (*kept, (at_ns, position - flown))
     apart = _slope(offsets, parameters)
     if apart is None:
-        return replace(watching, offsets=offsets, apart_mps=None, apart_ns=None), None
+        places = watching.places if len(offsets) > 1 else ()  # over a gap the vehicle's own way is not known so well
+        return replace(watching, offsets=offsets, places=places, apart_mps=None, apart_ns=None), None
+    off, places = _off(watching.places, offsets, parameters)
+    watching = replace(watching, places=places)
+    apart = _explained(apart, watching.way, offsets)
     speed_mps = math.hypot(*apart)
     contradicted = speed_mps > parameters.disagreement_mps
     apart_ns = (watching.apart_ns or at_ns) if contradicted else None
     watching = replace(watching, offsets=offsets, apart_mps=speed_mps, apart_ns=apart_ns, contradicted=contradicted)
     plain = hinted or speed_mps >= PLAIN * parameters.disagreement_mps
     if apart_ns is None or (not plain and at_ns - apart_ns < PERSISTS_NS):
-        return watching, None
+        if off is None:
+            return watching, None
+        text = f"positions have come {_vector(off[1])} m away from the vehicle's own way in {off[0]:.0f} s"
+        return watching, Breach(VELOCITY, text)
     text = f"positions move otherwise than the vehicle itself says, by {_vector(apart)} m/s"
     return watching, Breach(VELOCITY, text)
+
+
+def _off(
+    places: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters
+) -> tuple[tuple[float, Array] | None, tuple[tuple[int, Array], ...]]:
+    """In which time (s) positions have left the vehicle's own way too far, and how far (3,) [m]; and the places."""
+    at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
+    place: Array = np.mean([one for _, one in offsets], axis=0)
+    places = tuple(one for one in places if one[0] > at_ns - WAYS_NS)
+    for since_ns, before in places:
+        s, off = (at_ns - since_ns) * 1e-9, place - before
+        if math.hypot(*off) > (WAYS_S + WAYS_PART * s) * parameters.disagreement_mps:
+            return (s, off), places
+    if not places or at_ns - places[-1][0] >= WAY_NS:
+        places = (*places, (at_ns, place))
+    return None, places
 
 
 def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters) -> Array | None:
@@ -480,6 +516,22 @@ def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameter
     centred = times_s - times_s.mean()
     slope: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
     return slope
+
+
+def _explained(apart: Array, way: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...]) -> Array:
+    """What is left of a difference of velocities (3,) once as much of it as stamps that are late make is taken away.
+
+    They make the acceleration meanwhile, by the way that the vehicle says it has flown, times how late they are.
+    """
+    (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
+    begin, middle, end = (_flown(way, at_ns) for at_ns in (begin_ns, (begin_ns + end_ns) // 2, end_ns))
+    if begin is None or middle is None or end is None:
+        return apart
+    accel = (begin - 2.0 * middle + end) * 4.0 / ((end_ns - begin_ns) * 1e-9) ** 2
+    along = float(accel @ accel)
+    late_s = min(max(-float(apart @ accel) / along, -LATE_S), LATE_S) if along > 0.0 else 0.0
+    rest: Array = apart + late_s * accel
+    return rest
 
 
 def _flown(way: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
@@ -503,6 +555,11 @@ def _place(watching: Watching, seen: Observation, parameters: EnvelopeParameters
     since_ns = watching.outside_ns or seen.at_ns
     watching = replace(watching, outside_ns=since_ns)
     return watching, Breach(OUTSIDE, found) if seen.at_ns - since_ns >= OUTSIDE_NS else None
+
+
+def absurd() -> Breach:
+    """What is to be said of positions that are all further out than any can be."""
+    return Breach(OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
 
 
 def is_outside(seen: Observation, parameters: EnvelopeParameters) -> bool:

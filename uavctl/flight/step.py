@@ -24,11 +24,12 @@ from uavctl.data import (
     SetpointSource,
     Severity,
     StepInput,
+    VehicleStatus,
 )
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
-from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, is_outside, watch
+from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, absurd, is_outside, watch
 from uavctl.flight.estimator import begin, set_input, without
 from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array, captured_ns
@@ -103,6 +104,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     tick = place(state, inp, intake.history, controller)
     recalled = _recalled(state, tick, inp, controller)
     watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
+    if before is ControlMode.WAIT and intake.absurd and _is_ours(inp.vehicle) and controller.envelope is not None:
+        breach = absurd()  # nothing will be flown on them, and whoever waits in the air lands
     clean_ns = intake.clean_ns
     moved = intake.moved or (intake.absurd and before not in _NOT_FLOWN)
     if breach is not None or (moved and not lost):
@@ -181,6 +184,11 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     )
 
 
+def _is_ours(vehicle: VehicleStatus | None) -> bool:
+    """Whether it is in the air and takes setpoints, as far as it is known."""
+    return vehicle is not None and not unready(vehicle) and not vehicle.landed and not vehicle.own_climb
+
+
 def _recalled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
     """Whether a vehicle is on its way back from outside because the operator has asked for it."""
     asked = state.recalled or any(command.order is Order.ENGAGE for command in inp.commands)
@@ -196,9 +204,7 @@ def _watched(
     """Hold the tick against the envelope, as long as it is we who fly."""
     if state.breach is not None:
         return state.watching, None
-    vehicle = inp.vehicle
-    flies = state.mode not in _NOT_FLOWN and vehicle is not None and not unready(vehicle)
-    if controller.envelope is None or not flies or vehicle is None or vehicle.landed or vehicle.own_climb:
+    if controller.envelope is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
         return NOT_WATCHING, None
     seen = seen_of(
         tick,

@@ -1,0 +1,87 @@
+"""What a tick makes of what the envelope finds before a plan flies, and who is told of positions afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace as changed
+
+import pytest
+from envelope_rig import PARAMETERS
+from flight_rig import MS, START_NS, TICK_NS, inputs_of, make_controller, modes, run, sample, vehicle
+from msgspec.structs import replace
+
+from uavctl.data import ControlMode, Vec3, VehicleStatus
+from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
+from uavctl.flight.fallback import End, Fallback
+
+MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
+N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
+
+
+def controller() -> Controller:
+    return changed(make_controller(), envelope=PARAMETERS)
+
+
+def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLIMETRES) -> list[ControlMode]:
+    times_ns = [START_NS + n * 2 * TICK_NS for n in range(N_TICKS // 2)]
+    samples = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
+    outputs = run(ours, inputs_of(range(N_TICKS), samples, status=lambda tick: status))
+    found = [event.code for output in outputs for event in output.events if event.code == OUTSIDE]
+    assert len(found) == (ControlMode.LAND in modes(outputs))
+    assert sum(output.land for output in outputs) == len(found)
+    return modes(outputs)
+
+
+@pytest.mark.fault(45)
+def test_whoever_waits_in_the_air_for_a_position_that_can_be_lands() -> None:
+    seen = fly(controller(), vehicle())
+    landed = seen.index(ControlMode.LAND)
+    assert set(seen[:landed]) == {ControlMode.WAIT}
+    assert landed == 500 * MS // TICK_NS
+    assert set(seen[landed + 1 :]) == {ControlMode.STOPPED}
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        None,
+        vehicle(armed=False),
+        vehicle(external=False),
+        replace(vehicle(), landed=True),
+        replace(vehicle(), own_climb=True),
+    ],
+)
+def test_whoever_is_not_ours_waits_on(status: VehicleStatus | None) -> None:
+    assert set(fly(controller(), status)) == {ControlMode.WAIT}
+
+
+def test_without_an_envelope_it_waits_on() -> None:
+    assert set(fly(make_controller(), vehicle())) == {ControlMode.WAIT}
+
+
+@pytest.mark.parametrize(
+    ("code", "for_ns", "silent"),
+    [
+        (RESPONSE, 9_000 * MS, True),
+        (VELOCITY, 9_000 * MS, True),
+        (SCATTER, 9_000 * MS, True),
+        (OUTSIDE, 1_999 * MS, True),  # positions may be the reason
+        (OUTSIDE, 2_000 * MS, False),  # it is outside
+        (BRAKING, 2_000 * MS, False),
+        (OUTSIDE, None, True),
+    ],
+)
+def test_what_is_not_believed_is_told_to_nobody(code: str, for_ns: int | None, silent: bool) -> None:
+    began_ns = None if for_ns is None else START_NS - for_ns
+    state = ControlState(breach=Breach(code, ""), watching=Watching(tick_ns=START_NS, began_ns=began_ns))
+    assert state.disbelieves == silent
+
+
+@pytest.mark.parametrize(("end", "silent"), [(End.RECOVER, False), (End.BARRED, True), (End.STOP, False)])
+def test_what_jumped_is_told_to_nobody(end: End, silent: bool) -> None:
+    fallback = Fallback(mode=ControlMode.BRAKE, since_ns=START_NS, end=end)
+    assert ControlState(fallback=fallback).disbelieves == silent
+    outside = Breach(OUTSIDE, "")
+    old = Watching(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
+    assert ControlState(fallback=fallback, breach=outside, watching=old).disbelieves == silent
+    assert not ControlState().disbelieves
