@@ -35,6 +35,7 @@ from uavctl.flight.envelope import (
     Breach,
     Observation,
     Watching,
+    is_outside,
     lean_mps2,
     watch,
 )
@@ -47,6 +48,7 @@ def at(position: Vec3 | None, velocity: Vec3 = ZERO, *, since_ns: int | None = A
     """The answer to an estimate that has been outside since then."""
     ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=velocity)
     watching, breach = watch(Watching(outside_ns=since_ns), ours, PARAMETERS)
+    assert is_outside(ours, PARAMETERS) == (watching.outside_ns is not None)
     assert breach is None or (breach.code == OUTSIDE and watching.outside_ns == since_ns)
     return breach
 

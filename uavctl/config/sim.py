@@ -129,7 +129,10 @@ class FaultConfig(Section, frozen=True, kw_only=True):
         ),
     ]
     for_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="length of a span [s]")] = 0.0
-    velocity_mps: Annotated[Wind, Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]")] = (
+    velocity_mps: Annotated[
+        Wind,
+        Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]"),
+    ] = (
         0.0,
         0.0,
         0.0,

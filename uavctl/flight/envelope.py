@@ -108,6 +108,9 @@ class Breach(msgspec.Struct, frozen=True):
     text: str
 
 
+ABSURD = Breach(OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
+
+
 class Observation(msgspec.Struct, frozen=True):
     """What the envelope may know of a tick.
 
@@ -555,11 +558,6 @@ def _place(watching: Watching, seen: Observation, parameters: EnvelopeParameters
     since_ns = watching.outside_ns or seen.at_ns
     watching = replace(watching, outside_ns=since_ns)
     return watching, Breach(OUTSIDE, found) if seen.at_ns - since_ns >= OUTSIDE_NS else None
-
-
-def absurd() -> Breach:
-    """What is to be said of positions that are all further out than any can be."""
-    return Breach(OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
 
 
 def is_outside(seen: Observation, parameters: EnvelopeParameters) -> bool:

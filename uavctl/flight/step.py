@@ -29,7 +29,7 @@ from uavctl.data import (
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
-from uavctl.flight.envelope import NOT_WATCHING, Breach, Watching, absurd, is_outside, watch
+from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, is_outside, watch
 from uavctl.flight.estimator import begin, set_input, without
 from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array, captured_ns
@@ -105,7 +105,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     recalled = _recalled(state, tick, inp, controller)
     watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
     if before is ControlMode.WAIT and intake.absurd and _is_ours(inp.vehicle) and controller.envelope is not None:
-        breach = absurd()  # nothing will be flown on them, and whoever waits in the air lands
+        breach = ABSURD  # nothing will be flown on them, and whoever waits in the air lands
     clean_ns = intake.clean_ns
     moved = intake.moved or (intake.absurd and before not in _NOT_FLOWN)
     if breach is not None or (moved and not lost):
