@@ -124,8 +124,8 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             description="`blackout`, `held`, `uplink_blackout`: a span of these of `[link]`; `occluded`, `swapped`, "
             "`frozen`: a span of these of `[sim.camera]`; `wind`: the steady wind of the quadrotor changes; `battery`: "
             "that of the quadrotor has another charge; `frame`: the cameras' axes are others from then on; `noise`: "
-            "so is the noise of their positions; `drift`: their origin moves from then on; `parameter`: one of the autopilot's has another value; `mode`: the "
-            "pilot changes the autopilot's mode with the stick"
+            "so is the noise of their positions; `drift`: their origin moves from then on; `parameter`: one of the "
+            "autopilot's has another value; `mode`: the pilot changes the autopilot's mode with the stick"
         ),
     ]
     for_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="length of a span [s]")] = 0.0
