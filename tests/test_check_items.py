@@ -214,6 +214,26 @@ def test_armed_and_in_the_air_are_told() -> None:
     assert (state(found, "armed"), state(found, "landed")) == (State.NOTE, State.NOTE)
 
 
+@pytest.mark.parametrize(
+    ("periods_ms", "told", "wanted_state"),
+    [
+        ([], "not told", State.NOTE),
+        ([100], "10 Hz", State.GOOD),
+        ([300, 300, 300], "3.33 Hz", State.GOOD),
+        ([400, 400, 100], "2.5 Hz", State.NOTE),
+        ([100, 100, 900], "10 Hz", State.GOOD),  # a few that are lost
+    ],
+)
+def test_the_rate_of_the_vehicles_own_velocity_is_told(periods_ms: list[int], told: str, wanted_state: State) -> None:
+    flight, vehicle, at_ms = Preflight(load_config("room"), make_links, 0), Peer(1, 1), 1000
+    flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ms), at_ms * MS)
+    for period_ms in periods_ms:
+        at_ms += period_ms
+        flight.receive("vehicle", vehicle.local_position(at_ms), at_ms * MS)
+    one = next(one for one in flight.items((at_ms + 1) * MS) if one.name == "own velocity")
+    assert (one.value, one.state) == (told, wanted_state)
+
+
 @pytest.mark.parametrize("armed", [False, True])
 def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
     config = load_config("room")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from statistics import median
+
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.check.item import Item, State, item, judged
 from uavctl.check.seen import Seen
 from uavctl.config.types import Config
+from uavctl.flight.envelope import MOTION_NS
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 
 _SILENCE_S = 3.0
@@ -27,6 +31,7 @@ def vehicle_items(seen: Seen, config: Config, at_ns: int, take_off_m: float | No
         _others(seen),
         _armed(seen, takes_off=take_off_m is not None),
         _landed(seen),
+        _own_velocity(seen),
         _battery(seen, config),
     ]
 
@@ -80,6 +85,20 @@ def _landed(seen: Seen) -> Item:
         else "what it does not tell cannot be waited for"
     )
     return item("landed", state, told, "on the ground", hint)
+
+
+def _own_velocity(seen: Seen) -> Item:
+    """Whether positions can be held against the vehicle's own velocity in flight."""
+    want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, for positions to be held against it in flight"
+    hint = (
+        "without it a turned or mirrored frame is found later in flight, and one that creeps is not; "
+        "see to the vehicle's streams, and to its estimator"
+    )
+    if len(seen.own) < 2:
+        return item("own velocity", State.NOTE, "not told", want, hint)
+    period_ns = median(b - a for (a, _), (b, _) in pairwise(seen.own))
+    state = State.GOOD if period_ns <= MOTION_NS else State.NOTE
+    return item("own velocity", state, f"{1e9 / period_ns:.3g} Hz", want, hint)
 
 
 def _battery(seen: Seen, config: Config) -> Item:
