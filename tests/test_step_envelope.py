@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace as changed
 
 import pytest
-from envelope_rig import PARAMETERS
-from flight_rig import MS, START_NS, TICK_NS, inputs_of, make_controller, modes, run, sample, vehicle
+from envelope_rig import PARAMETERS, motion
+from flight_rig import MS, START_NS, TICK_NS, inputs_of, make_controller, modes, one_a_step, run, sample, vehicle
 from msgspec.structs import replace
 
 from uavctl.data import ControlMode, Vec3, VehicleStatus
@@ -18,8 +18,12 @@ MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
 N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
 
 
+# Of one axis; what a stub sends need not fit its samples.
+ANYTHING = changed(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3, disagreement_mps=1e3)
+
+
 def controller() -> Controller:
-    return changed(make_controller(), envelope=PARAMETERS)
+    return changed(make_controller(), envelope=ANYTHING)
 
 
 def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLIMETRES) -> list[ControlMode]:
@@ -57,6 +61,28 @@ def test_whoever_is_not_ours_waits_on(status: VehicleStatus | None) -> None:
 
 def test_without_an_envelope_it_waits_on() -> None:
     assert set(fly(make_controller(), vehicle())) == {ControlMode.WAIT}
+
+
+@pytest.mark.parametrize(
+    ("ours", "tells", "hold_s"),
+    [
+        (make_controller(), False, 3.0),
+        (controller(), False, 0.5),  # nobody says whether it drifts
+        (controller(), True, 3.0),
+        (changed(controller(), fallback=changed(controller().fallback, hold_s=0.2)), False, 0.2),
+    ],
+)
+def test_it_is_held_for_half_a_second_only_where_nothing_tells_whether_it_drifts(
+    ours: Controller, tells: bool, hold_s: float
+) -> None:
+    inputs = inputs_of(range(140), one_a_step(lost=range(4, 1000)))
+    if tells:
+        inputs = [replace(inp, motion=motion((0.0, 0.0, 0.0), inp.at_ns)) for inp in inputs]
+    outputs = run(ours, inputs)
+    seen = modes(outputs)
+    assert seen.count(ControlMode.HOLD) == hold_s * 1e9 / TICK_NS
+    landed = outputs[seen.index(ControlMode.LAND)].decision
+    assert landed.reason == f"held for {hold_s:.1f} s, and positions did not come back: landing"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace as changed
 
 import msgspec
 import numpy as np
@@ -48,6 +49,7 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
     mute: bool = False  # nothing may be sent in this tick
 
 
+BLIND_HOLD_S = 0.5  # longest time to hold where not even the vehicle itself tells whether it drifts
 PLAYED_OUT_STEPS = 2  # without a position: from there on a plan is held against the vehicle's own velocity
 MISSION_OVER = "the mission is over: landing"
 _FINAL = {
@@ -162,9 +164,10 @@ def _fall(
     state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller, reason: str
 ) -> Choice:
     """Let the fallback fly, and move it on in time; the count of fresh samples starts anew where it begins."""
-    fallback = _advanced(state, fallback, tick, inp, controller)
+    before, fallback = fallback, _advanced(state, fallback, tick, inp, controller)
     if fallback.mode is ControlMode.LAND and not fallback.final:
-        reason = f"held for {controller.fallback.hold_s:g} s, and positions did not come back: landing"
+        held_s = (inp.at_ns - (before.held_ns or inp.at_ns)) * 1e-9
+        reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
     fresh = 0 if state.fallback is None else state.fresh
     return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
 
@@ -186,12 +189,15 @@ def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
 
 def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Fallback:
     moving, measured = moving_mps(state, tick, inp, controller)
+    parameters = controller.fallback
+    if controller.envelope is not None and not measured:
+        parameters = changed(parameters, hold_s=min(parameters.hold_s, BLIND_HOLD_S))
     return fb.advance(
         fallback,
         inp.at_ns,
         math.hypot(*moving),
         state.accel_mps2,
-        controller.fallback,
+        parameters,
         held_mps2(state, fallback, controller),
         measured=measured,
     )
