@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from soak_rig import Watch, fly
 
 from sim.mocap import AXES
@@ -60,8 +61,21 @@ def beyond_m(config: Config, position_m: Vec3) -> float:
     return max(max(low - value, value - high) for value, low, high in rows)
 
 
-def fly_true(prepared: Prepared, config: Config, path: Path | None = None, flight_s: float = FLIGHT_S) -> TrueFlight:
-    """Fly from the air, and look at the true vehicle in every tick."""
+def silence_motion(world: World) -> None:
+    """Keep the vehicle's own position and velocity from being sent."""
+    streams = world.peers.autopilot.telemetry.streams
+    streams[mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED] = lambda at_ns: None
+
+
+def fly_true(
+    prepared: Prepared,
+    config: Config,
+    path: Path | None = None,
+    flight_s: float = FLIGHT_S,
+    *,
+    own_motion: bool = True,
+) -> TrueFlight:
+    """Fly from the air, and look at the true vehicle in every tick; with or without its own word of how it moves."""
     begins_s = min((fault.at_s for fault in config.sim.fault), default=0.0)
     outside_m, speed_mps, moved_m, hold_mps2 = -math.inf, 0.0, 0.0, 0.0
     start: Vec3 | None = None
@@ -69,7 +83,10 @@ def fly_true(prepared: Prepared, config: Config, path: Path | None = None, fligh
 
     def look(world: World, watch: Watch, at_ns: int) -> None:
         nonlocal outside_m, speed_mps, moved_m, hold_mps2, start
-        worlds[:] = [world]
+        if not worlds:
+            worlds.append(world)
+            if not own_motion:
+                silence_motion(world)
         place, decision = world.peers.vehicle.position_m, watch.loop.decision
         outside_m = max(outside_m, beyond_m(config, place))
         speed_mps = max(speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))

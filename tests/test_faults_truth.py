@@ -64,6 +64,21 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
     assert 0.0 <= bounded(flight).hold_mps2 <= 0.05
 
 
+@pytest.mark.fault(14)
+@pytest.mark.parametrize("seed", [0, 2, 22, 32])
+def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_nothing_itself(
+    prepared: Prepared, seed: int
+) -> None:
+    """The link loses the value when it is new, and so what comes first of it is stale already."""
+    config = load_config("room", ["sim.camera.message=vision", "link.loss=0.3", f"sim.seed={seed}"])
+    frozen = with_faults(config, FaultConfig(at_s=1.3, kind="frozen", for_s=20.0))
+    flight = bounded(fly_true(prepared, frozen, flight_s=14.0, own_motion=False))
+    # It flies on the stale value until that comes again, and drifts the faster for it.
+    assert flight.outside_m <= 0.7
+    blackout = with_faults(config, FaultConfig(at_s=1.3, kind="blackout", for_s=20.0))
+    assert bounded(fly_true(prepared, blackout, flight_s=14.0, own_motion=False)).outside_m <= 0.0
+
+
 @pytest.mark.fault(15, 45)
 @pytest.mark.parametrize("axes", IN_THE_AIR)
 def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(

@@ -13,7 +13,7 @@ from uavctl.data import PositionSample, StepInput
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
 from uavctl.flight.reach import GateParameters
 from uavctl.flight.samples import Intake, Trust, take
-from uavctl.flight.stuck import FROZEN
+from uavctl.flight.stuck import FROZEN, REPEATED
 
 CONTROLLER = make_controller()
 
@@ -145,3 +145,51 @@ def test_what_others_said_meanwhile_is_kept() -> None:
     assert back and found[back[0]].clean_ns == START_NS + 12 * TICK_NS - MS
     assert repr(found[-1].history) == repr(never[-1].history)
     assert found[-1].history.captured_ns == START_NS + 39 * TICK_NS
+
+
+def flown_on(values: dict[int, float], ticks: int) -> list[Intake]:
+    """Ticks that push all the time, and what a camera says in some of them (north) [m]."""
+    controller = replace(make_controller(), trust=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
+    intakes: list[Intake] = []
+    history, trust = begin(controller.kalman, START_NS, START_NS), Trust()
+    for tick in range(ticks):
+        at_ns = START_NS + tick * TICK_NS
+        said = (sample(at_ns, position_m=(values[tick], 0.0, 0.0)),) if tick in values else ()
+        inp = StepInput(tick=tick, at_ns=at_ns, samples=said, vehicle=vehicle())
+        intakes.append(take(controller.kalman, controller.reach, history, trust, inp, HORIZON, 0))
+        history = set_input(controller.kalman, intakes[-1].history, at_ns, np.ones(1))
+        trust = intakes[-1].trust
+    return intakes
+
+
+BEFORE = {tick: 0.5 * (tick * TICK_NS * 1e-9) ** 2 + 0.002 * (tick % 3) for tick in range(10)}
+
+
+def test_a_stale_value_whose_first_sample_was_lost_is_taken_back_as_soon_as_it_comes_again() -> None:
+    # It froze at tick 10, of which nothing came: the first that comes is a value that nobody has heard.
+    stale = BEFORE[9] + 0.03
+    found, never = flown_on({**BEFORE, 14: stale, 15: stale}, 18), flown_on(BEFORE, 18)
+    assert found[14].accepted
+    assert found[14].history.captured_ns == START_NS + 14 * TICK_NS
+    assert refused_as(found[15]) == {REPEATED}
+    # The newest position that is left: a plan made since is outdated by it.
+    assert found[15].clean_ns == START_NS + 9 * TICK_NS
+    assert found[15].history.captured_ns == START_NS + 9 * TICK_NS
+    assert found[15].history.newest.belief is not None and never[15].history.newest.belief is not None
+    assert found[17].history.captured_ns == never[17].history.captured_ns
+
+
+def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
+    found = flown_on({**BEFORE, 10: BEFORE[9] + 0.03, 15: BEFORE[9] + 0.03}, 16)
+    assert refused_as(found[15]) == {REPEATED}
+    assert found[15].clean_ns is None
+    assert found[15].history.captured_ns == START_NS + 10 * TICK_NS
+
+
+def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known() -> None:
+    found = flown_on({0: 0.0, 18: 0.0}, 19)
+    assert found[0].trust.watches["camera"].first_ns == START_NS
+    assert refused_as(found[18]) <= {REPEATED, FROZEN}
+    assert refused_as(found[18])
+    assert found[18].history.captured_ns == START_NS
+    assert found[18].clean_ns is None

@@ -226,3 +226,108 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
         watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
         assert stuck(watch, KALMAN, one, parameters) is found
+
+
+def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> None:
+    watches: Watches = {}
+    history = begin(KALMAN, START_NS, START_NS)
+    seen = []
+    for ticks, value in ((1, 0.0), (4, 0.5), (6, 0.7), (9, 0.7), (10, 0.7), (14, 0.9)):
+        one = sample(START_NS + ticks * TICK_NS, position_m=(value, 0.0, 0.0))
+        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
+        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+        seen.append((watches["camera"].gap_ns // TICK_NS, watches["camera"].spacing_ns // TICK_NS))
+    assert seen == [(0, 0), (3, 3), (2, 2), (2, 2), (2, 1), (4, 1)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "repeats", "gap_ns", "stale"),
+    [
+        (4, 1, 149, False),  # none can have been lost before it
+        (4, 1, 150, True),
+        (3, 1, 100, True),  # nobody knows how often it samples
+        (3, 2, 100, False),
+        (9, 9, 300, True),
+    ],
+)
+def test_the_value_that_first_came_may_be_stale_where_one_was_lost_before(
+    changes: int, repeats: int, gap_ns: int, stale: bool
+) -> None:
+    watch = Watch(9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100)
+    assert watch.stale_since_ns == (7 if stale else 8)
+
+
+def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> None:
+    assert watched([0.0, 0.5, 0.7])["camera"].usual == 0.0
+    assert watched([0.0, 0.0, 0.5])["camera"].usual == 1.0
+    assert watched([0.0, 0.0, 0.0, 0.5])["camera"].usual == 1.0
+    assert watched([0.0, 0.0, 0.0, 0.0, 0.5])["camera"].usual == 0.0
+    assert watched([0.0, 0.0, 0.5, 0.7])["camera"].usual == 0.5
+    assert watched([0.0, 0.0, 0.5, 0.7, 0.7])["camera"].usual == 0.5
+
+
+@pytest.mark.parametrize(
+    ("usual", "repeats", "as_usual", "unlike_it"),
+    [
+        (0.15, 2, True, False),
+        (0.1499, 2, False, True),
+        (1.0, 3, False, True),
+        (0.0, 1, False, True),
+        (0.0, 3, False, True),
+        (0.0, 4, False, False),
+        (0.0, 0, False, False),
+        (1.0, 1, True, False),
+    ],
+)
+def test_what_a_source_does_as_usual(usual: float, repeats: int, as_usual: bool, unlike_it: bool) -> None:
+    watch = Watch(9, (0.0, 0.0, 0.0), usual=usual, repeats=repeats)
+    assert (watch.as_usual, watch.unlike_it) == (as_usual, unlike_it)
+
+
+def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_vehicle_flew() -> None:
+    one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
+    belief = Belief(START_NS, START_NS, mean=np.array([3.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
+    watch = Watch(START_NS, one.position_m, repeats=2, usual=1.0, coasting=belief)
+    assert stuck(watch, KALMAN, one, PARAMETERS) is False
+    assert doubtful(watch, KALMAN, one, PARAMETERS) is True
+    assert stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS) is True
+    assert stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS) is True
+
+
+def test_its_axes_do_not_stand_still_for_it() -> None:
+    watch = watched([0.0, 0.0, 0.5, 0.5])["camera"]
+    assert (watch.repeats, watch.still) == (1, (0, 2, 2))
+    watch = watched([0.0, 0.0, 0.5, 0.5, 0.5, 0.5])["camera"]
+    assert (watch.repeats, watch.still) == (3, (1, 3, 3))
+
+
+def test_a_value_that_was_taken_back_is_not_believed_until_another_comes() -> None:
+    one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
+    belief = Belief(START_NS, START_NS, mean=np.array([2.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
+    watch = Watch(START_NS, one.position_m, repeats=1, coasting=belief)
+    assert doubtful(watch, KALMAN, one, PARAMETERS) is False
+    assert doubtful(replace(watch, doubted=True), KALMAN, one, PARAMETERS) is True
+    assert doubtful(replace(watch, doubted=True, coasting=None), KALMAN, one, PARAMETERS) is True
+    told = {"camera": replace(watch, doubted=True, at_ns=START_NS)}
+    history = begin(KALMAN, START_NS, START_NS)
+    again = sample(START_NS + 1, position_m=(2.0, 0.0, 0.0))
+    assert observe(told, KALMAN, history, again, np.zeros(1))["camera"].doubted
+    other = sample(START_NS + 1, position_m=(2.1, 0.0, 0.0))
+    assert not observe(told, KALMAN, history, other, np.zeros(1))["camera"].doubted
+
+
+def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_too() -> None:
+    """Else a repeat after a long silence would be believed."""
+    watches = watched([0.0, 0.5])
+    history = begin(KALMAN, START_NS, START_NS)
+    one = sample(START_NS + 2 * TICK_NS, position_m=(0.5, 0.0, 0.0))
+    history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
+    history = set_input(KALMAN, history, one.received_ns, np.array([1.0]))
+    late_ns = one.captured_ns + round(1.5e9 * KALMAN.parameters.window_s)
+    history, _, _ = absorb(KALMAN, history, late_ns, ())
+    assert history.horizon_ns > one.captured_ns
+    late = sample(late_ns, position_m=(0.5, 0.0, 0.0))
+    watch = observe(watches, KALMAN, history, late, np.zeros(1))["camera"]
+    assert watch.coasting is not None
+    assert watch.coasting.at_ns == late_ns
+    assert doubtful(watch, KALMAN, late, PARAMETERS)

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from uavctl.data import PositionSample, StepInput, VehicleStatus
-from uavctl.flight.estimator import LATEST_STAMP_NS, History, absorb, begin, belief_at, move_on, without
+from uavctl.flight.estimator import (
+    LATEST_STAMP_NS,
+    History,
+    absorb,
+    begin,
+    belief_at,
+    move_on,
+    newest_capture_ns,
+    without,
+)
 from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
 from uavctl.flight.stuck import FROZEN, REPEATED, Watches, doubtful, observe, stuck
@@ -147,11 +156,17 @@ def _believe(kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: 
     for sample in sorted(valid, key=captured_ns):
         at_ns = captured_ns(sample)
         belief = belief_at(kalman, history, at_ns) if at_ns > history.horizon_ns else None
+        if history.captured_ns is None:
+            first = observe(trust.watches, kalman, history, sample, np.zeros(len(kalman.axes)))
+            trust = replace(trust, watches=first)
         if belief is not None:  # else it is the first one, or too old
             found = _distrust(kalman, reach, history, trust, inp, sample, belief)
             trust = found.trust
-            if found.stuck_ns is not None:
-                history, clean_ns = _unstuck(kalman, history, sample.source, found.stuck_ns, clean_ns)
+            if found.stuck_ns is not None and found.reason is not None:
+                stale = _said_since(sample.source, found.stuck_ns)
+                history, clean_ns = _unstuck(kalman, history, stale, found.stuck_ns, clean_ns)
+                refused.extend((one, found.reason) for one in taken if stale(one))
+                taken = [one for one in taken if not stale(one)]
             if found.reason is not None:
                 refused.append((sample, found.reason))
                 continue
@@ -166,17 +181,26 @@ def _believe(kalman: Kalman, reach: Reach, history: History, trust: Trust, inp: 
     return _Believed(history, replace(trust, absurd=absurd), tuple(taken), tuple(refused), clean_ns)
 
 
+def _said_since(source: str, first_ns: int) -> Callable[[PositionSample], bool]:
+    """What a source has said since `first_ns`, and then."""
+    return lambda sample: sample.source == source and captured_ns(sample) >= first_ns
+
+
 def _unstuck(
-    kalman: Kalman, history: History, source: str, first_ns: int, clean_ns: int | None
+    kalman: Kalman, history: History, stale: Callable[[PositionSample], bool], first_ns: int, clean_ns: int | None
 ) -> tuple[History, int | None]:
-    """Take back what a stuck source said again after `first_ns`; and from when on anything was taken back so far."""
+    """Take back what a stuck source has said since `first_ns`; and after what anything was taken back so far.
 
-    def again(sample: PositionSample) -> bool:
-        return sample.source == source and captured_ns(sample) > first_ns
-
-    if not any(entry.sample is not None and again(entry.sample) for entry in history.entries):
+    The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
+    where nothing else is known.
+    """
+    cleaned = without(kalman, history, stale)
+    last_ns = newest_capture_ns(cleaned, first_ns)
+    if last_ns is None:
+        cleaned, last_ns = without(kalman, history, lambda one: stale(one) and captured_ns(one) > first_ns), first_ns
+    if len(cleaned.entries) == len(history.entries):
         return history, clean_ns
-    return without(kalman, history, again), first_ns if clean_ns is None else min(first_ns, clean_ns)
+    return cleaned, last_ns if clean_ns is None else min(last_ns, clean_ns)
 
 
 class _Distrust(msgspec.Struct, frozen=True, eq=False):
@@ -185,7 +209,7 @@ class _Distrust(msgspec.Struct, frozen=True, eq=False):
     Attributes:
         trust: That.
         reason: Why the sample is not believed; None if it is.
-        stuck_ns: When its source, now found to be stuck, first said what it says [ns].
+        stuck_ns: When its source first said what it says, where that is to be taken back [ns].
     """
 
     trust: Trust
@@ -214,9 +238,12 @@ def _distrust(
     if newest and _flies(inp.vehicle):
         if stuck(watch, kalman, sample, reach.parameters):
             found = {**watches, sample.source: replace(watch, found=True)}
-            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns or watch.first_ns)
+            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns or watch.stale_since_ns)
         if doubtful(watch, kalman, sample, reach.parameters):
-            return _Distrust(trust, REPEATED)
+            if not watch.unlike_it:
+                return _Distrust(trust, REPEATED)
+            again = {**watches, sample.source: replace(watch, doubted=True)}
+            return _Distrust(replace(trust, watches=again), REPEATED, watch.stale_since_ns)
     doubted = np.zeros(n_axes) if trust.doubt_mps is None else trust.doubt_mps
     width = radius(reach, kalman, belief, variances, doubted)
     believed, suspect = judge(trust.suspect, at_ns, off, width, n_axes)

@@ -12,7 +12,10 @@ The resolution is the smallest change that the source has shown.
 
 Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
 source's values have been news so far, or where inputs alone have carried the prediction away from it. What had been
-believed of a source that is then found to be stuck is taken back, to the moment at which the value first came.
+believed of a source that is then found to be stuck is taken back, to the moment at which the value first came. A link
+loses samples: what first came of a value may itself be a repeat, with a stamp that is too new, and so goes too where
+a sample can have been lost before it. That is done at the first repeat that is not believed, not only where the source
+is found to be stuck; but not with sources that say each value twice as a rule.
 """
 
 from __future__ import annotations
@@ -40,6 +43,9 @@ _SMOOTH = 0.1  # least weight of a sample in the mean of what was news
 _ENOUGH = round(1.0 / _SMOOTH)  # changes that tell the resolution
 _GRAIN_M = 2e-3  # what a few changes may be taken for
 _STILL = 5  # repeats of one axis in a row
+_SPACINGS = 4  # times between samples that tell how often it samples
+_GAP = 1.5  # of that time: none is lost in between
+_USUAL = 0.15  # of the values: so many come again from a source that sends each twice, over a link that loses most
 _NEAR = 0.5  # of the gate: how far a value that comes again may be off what inputs alone foretell
 _SOURCES = 8  # that are watched at once
 
@@ -57,9 +63,13 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         repeats: How often the value came again.
         coasting: The belief that the value first gave, moved on by inputs alone; None without repeats.
         moves: How often each axis has said something else, up to a number that is enough.
-        still: How often each axis came again in a row, whatever the others did.
+        still: How often each axis came again in a row, whatever the others did; not where all do so as usual.
         still_ns: Capture time at which the value of each axis first came [ns].
-        found: Whether it was found to be stuck, which holds until it says something else.
+        usual: Part of its values that came again once or twice before another did; the older the less they count.
+        gap_ns: Time from the sample before to that at which the value first came [ns].
+        spacing_ns: The smallest time between two of its samples [ns]; 0 before there were two.
+        doubted: Whether the value was taken back because it came again, which holds until it says something else.
+        found: Whether it was found to be stuck, which holds so long too.
     """
 
     at_ns: int
@@ -73,7 +83,30 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
     moves: tuple[int, ...] = (0, 0, 0)
     still: tuple[int, ...] = (0, 0, 0)
     still_ns: tuple[int, ...] = (0, 0, 0)
+    usual: float = 0.0
+    gap_ns: int = 0
+    spacing_ns: int = 0
+    doubted: bool = False
     found: bool = False
+
+    @property
+    def as_usual(self) -> bool:
+        """Whether this source says its values so often."""
+        return self.usual >= _USUAL and self.repeats < _REPEATS
+
+    @property
+    def stale_since_ns(self) -> int:
+        """Capture time from which on it said what was no news [ns].
+
+        The value that first came may be an older one already, which was lost when it was new; not where no sample was.
+        """
+        known = self.changes + self.repeats > _SPACINGS
+        return self.first_ns + (known and self.gap_ns < _GAP * self.spacing_ns)
+
+    @property
+    def unlike_it(self) -> bool:
+        """Whether the value has come again a few times, and this source does not do so."""
+        return 0 < self.repeats <= _REPEATS and not self.as_usual
 
     @property
     def grain_m(self) -> float:
@@ -111,16 +144,20 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
         }
     if at_ns <= watch.at_ns:
         return watches
+    waited_ns = at_ns - watch.at_ns
+    spacing_ns = min(waited_ns, watch.spacing_ns or waited_ns)
     moved_m = [abs(new - old) for new, old in zip(sample.position_m, watch.position_m, strict=True)]
     if not any(moved_m):
-        begun = watch.coasting or belief_at(kalman, history, watch.at_ns)
+        begun = watch.coasting or belief_at(kalman, history, max(watch.at_ns, history.horizon_ns))
         coasting = None if begun is None else coasted(kalman, history, begun, at_ns)
-        still = tuple(count + 1 for count in watch.still)
-        watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting, still=still)
+        watch = replace(watch, at_ns=at_ns, repeats=watch.repeats + 1, coasting=coasting, spacing_ns=spacing_ns)
+        if not watch.as_usual:
+            watch = replace(watch, still=tuple(count + 1 for count in watch.still))
     else:
         smallest = min(one for one in moved_m if one)
         news_m = float(np.abs(off_m).max())
         changes = min(watch.changes + 1, _ENOUGH)
+        again = float(0 < watch.repeats < _REPEATS)
         watch = Watch(
             at_ns=at_ns,
             position_m=sample.position_m,
@@ -131,6 +168,9 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
             moves=tuple(min(n + bool(moved), _ENOUGH) for moved, n in zip(moved_m, watch.moves, strict=True)),
             still=tuple(0 if moved else count + 1 for moved, count in zip(moved_m, watch.still, strict=True)),
             still_ns=tuple(at_ns if moved else since for moved, since in zip(moved_m, watch.still_ns, strict=True)),
+            gap_ns=waited_ns,
+            spacing_ns=spacing_ns,
+            usual=watch.usual + (again - watch.usual) / changes,
         )
     return {**watches, sample.source: watch}
 
@@ -148,7 +188,7 @@ def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: Gate
     variance = np.diagonal(belief.cov)[index]
     far_m = np.abs(belief.mean[index] - values[:n_axes])
     doubt_m = parameters.sigma * np.sqrt(variance + variances[:n_axes]) + parameters.margin_m + watch.grain_m
-    if (far_m > doubt_m).any():
+    if (far_m > doubt_m).any() and not watch.as_usual:
         return True
     spread_m = float(np.sqrt(variance.max()))
     return _noisy(watch, _NEWS) and spread_m >= _MANY * watch.resolution_m and watch.repeats >= _REPEATS
@@ -157,8 +197,8 @@ def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: Gate
 def doubtful(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
     """Whether a value that came again is not to be believed, though its source is not found to be stuck."""
     belief = watch.coasting
-    if belief is None:
-        return False
+    if belief is None or watch.doubted:
+        return watch.doubted
     n_axes = len(kalman.axes)
     values, variances = shown_by(kalman, sample)
     far_m = np.abs(belief.mean[kalman.shown[:n_axes]] - values[:n_axes])
