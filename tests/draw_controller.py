@@ -56,6 +56,7 @@ def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
         "schedule.joint": rng.choice(["true", "false"]),
         "link.loss": rng.uniform(0.0, 0.35),
         "fallback.hold_s": rng.uniform(0.0, 3.0),
+        "fallback.blind_hold_s": rng.uniform(0.0, 3.0),
         "fallback.recover_samples": int(rng.integers(1, 5)),
         "limits.slew_mps3": rng.uniform(3.0, 50.0),
         "source.rate_hz": rng.choice([0.0, 5.0]) if name == "room" else 0.0,

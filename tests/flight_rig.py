@@ -125,7 +125,9 @@ def make_controller(
 ) -> Controller:
     """A controller; with its `sigma` it believes any position, so that a stub's inputs need not fit the samples."""
     plant = solver.plant if solver is not None else small_plant()
-    fallback = FallbackParameters(brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, land=land, recover_samples=3)
+    fallback = FallbackParameters(
+        brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, blind_hold_s=3.0, land=land, recover_samples=3
+    )
     return Controller(
         plant=plant,
         design_id="stub",

@@ -29,7 +29,7 @@ from uavctl.lock import lock_paths
 # The machine may stand still for a while, and then neither side has failed: the vehicle bears with a pause in the
 # setpoints that is long for a flight, and the daemon with one in the positions and in the vehicle's answers.
 PATIENT_VEHICLE = "sim.setpoint_timeout_s=600.0"
-PATIENT_DAEMON = ("fallback.hold_s=60.0", "hand_over.engage_s=60.0")
+PATIENT_DAEMON = ("fallback.hold_s=60.0", "fallback.blind_hold_s=60.0", "hand_over.engage_s=60.0")
 MARK = b"the test's own mark"
 
 

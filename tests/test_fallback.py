@@ -23,7 +23,9 @@ from uavctl.flight.fallback import (
 from uavctl.flight.limits import ZERO
 
 S = 1_000_000_000
-PARAMETERS = FallbackParameters(brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, land=True, recover_samples=3)
+PARAMETERS = FallbackParameters(
+    brake_gain_1ps=1.5, brake_s=2.0, hold_s=3.0, blind_hold_s=3.0, land=True, recover_samples=3
+)
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
@@ -175,6 +177,19 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
 
 
 @pytest.mark.parametrize(
+    ("measured", "hold_s", "blind_hold_s", "held_s"),
+    [(True, 3.0, 0.5, 3.0), (False, 3.0, 0.5, 0.5), (False, 0.25, 0.5, 0.25), (True, 0.25, 0.5, 0.25)],
+)
+def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
+    measured: bool, hold_s: float, blind_hold_s: float, held_s: float
+) -> None:
+    parameters = replace(PARAMETERS, hold_s=hold_s, blind_hold_s=blind_hold_s)
+    before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
+    for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
+        assert advance(before, 5 * S + after_ns, 0.0, ZERO, parameters, measured=measured).mode is wanted
+
+
+@pytest.mark.parametrize(
     ("end", "measured", "speed_mps", "wanted"),
     [
         (RECOVER, True, 0.151, BRAKE),
@@ -188,7 +203,9 @@ def test_what_drifts_by_its_own_word_is_braked_again(
     end: End, measured: bool, speed_mps: float, wanted: ControlMode
 ) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, end=end, held_ns=4 * S)
-    after = advance(before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0), measured=measured)
+    after = advance(
+        before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0, blind_hold_s=9.0), measured=measured
+    )
     if end is STOP:
         assert after.mode is LAND  # its second for the zero is over
     else:

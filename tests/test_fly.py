@@ -89,7 +89,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dic
     out = tmp_path_factory.mktemp("flight")
     port = free_port()
     # It holds for as long as the pause lasts, also where the machine makes it longer.
-    with daemon(port, out, "--set", "fallback.hold_s=60") as process, source(port) as seen:
+    with (
+        daemon(port, out, "--set", "fallback.hold_s=60", "--set", "fallback.blind_hold_s=60") as process,
+        source(port) as seen,
+    ):
         process.send_signal(signal.SIGINT)
         summary, _ = process.communicate(timeout=LIMIT_S)
         return seen, json.loads(summary), process.returncode, out / "flight.mcap"

@@ -246,6 +246,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
             brake_gain_1ps=fallback.brake_gain_1ps,
             brake_s=fallback.brake_s,
             hold_s=fallback.hold_s,
+            blind_hold_s=fallback.blind_hold_s,
             land=fallback.land,
             recover_samples=fallback.recover_samples,
         ),

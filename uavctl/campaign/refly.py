@@ -148,7 +148,9 @@ def flight_config(config: Config, start: Array, steps: int, name: str, seed: int
             max_position_m=_NEVER,
             max_velocity_mps=_NEVER,
         ),
-        fallback=replace(config.fallback, brake_s=_NEVER, hold_s=_NEVER, land=False, recover_samples=1),
+        fallback=replace(
+            config.fallback, brake_s=_NEVER, hold_s=_NEVER, blind_hold_s=_NEVER, land=False, recover_samples=1
+        ),
         limits=replace(config.limits, accel_mps2=tuple(accel_mps2), slew_mps3=_NEVER),
         sim=replace(
             sim,

@@ -290,15 +290,16 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
     brake_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="longest time of braking on the prediction [s]")] = (
         2.0
     )
-    hold_s: Annotated[
+    hold_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="then zero acceleration for this long [s]")] = 3.0
+    blind_hold_s: Annotated[
         float,
         Meta(
             ge=0,
             le=LONGEST_S,
-            description="then zero acceleration for this long [s]; for half a second at most where the vehicle's own "
-            "velocity does not come or cannot be believed",
+            description="for no longer than this where nothing tells whether it drifts: the vehicle's own velocity "
+            "does not come, or nothing speaks for it [s]",
         ),
-    ] = 3.0
+    ] = 0.5
     land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
     recover_samples: Annotated[
         int, Meta(ge=1, le=1000, description="fresh samples in a row before plans are flown again")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace as changed
 
 import msgspec
 import numpy as np
@@ -49,7 +48,6 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
     mute: bool = False  # nothing may be sent in this tick
 
 
-BLIND_HOLD_S = 0.5  # longest time to hold where not even the vehicle itself tells whether it drifts
 PLAYED_OUT_STEPS = 2  # without a position: from there on a plan is held against the vehicle's own velocity
 MISSION_OVER = "the mission is over: landing"
 _FINAL = {
@@ -189,15 +187,12 @@ def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
 
 def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Fallback:
     moving, measured = moving_mps(state, tick, inp, controller)
-    parameters = controller.fallback
-    if controller.envelope is not None and not measured:
-        parameters = changed(parameters, hold_s=min(parameters.hold_s, BLIND_HOLD_S))
     return fb.advance(
         fallback,
         inp.at_ns,
         math.hypot(*moving),
         state.accel_mps2,
-        parameters,
+        controller.fallback,
         held_mps2(state, fallback, controller),
         measured=measured,
     )

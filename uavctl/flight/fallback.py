@@ -5,7 +5,7 @@ A state machine of four modes, each with a time limit:
     BRAKE --slow enough, or brake_s over--> HOLD --as its end says--> LAND --next tick--> STOPPED
 
     end       from HOLD
-    RECOVER   LAND after hold_s, if configured; else it holds on
+    RECOVER   LAND after hold_s, or blind_hold_s, if configured; else it holds on
     BARRED    LAND once its zero has been sent, if configured; else STOPPED
     LET_GO    the same; and nothing is braked on before, as no position is believed: level at once
     STOP      LAND once its zero has been sent, if configured; else STOPPED
@@ -43,6 +43,7 @@ class FallbackParameters:
         brake_gain_1ps: Deceleration per predicted speed [1/s].
         brake_s: Longest time of braking [s].
         hold_s: Time of zero acceleration before landing [s].
+        blind_hold_s: Longest time of it where not even the vehicle itself tells whether it drifts [s].
         land: Whether to hand over to the vehicle's own landing after that.
         recover_samples: Fresh samples in a row before plans are flown again.
     """
@@ -50,6 +51,7 @@ class FallbackParameters:
     brake_gain_1ps: float
     brake_s: float
     hold_s: float
+    blind_hold_s: float
     land: bool
     recover_samples: int
 
@@ -135,7 +137,8 @@ def advance(
         return replace(fallback, mode=ControlMode.STOPPED, since_ns=at_ns)
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
     held_ns = fallback.since_ns if fallback.held_ns is None else fallback.held_ns
-    due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= parameters.hold_s
+    hold_s = parameters.hold_s if measured else min(parameters.hold_s, parameters.blind_hold_s)
+    due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= hold_s
     if mode is ControlMode.BRAKE and not due:
         slow = speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s
         off_mps2 = max(abs(sent - held) for sent, held in zip(sent_mps2, held_mps2, strict=True))
