@@ -409,6 +409,17 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         assert watching.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
+@pytest.mark.parametrize(
+    ("since_ns", "breached"), [(None, False), (AT_NS - 600 * MS + 1, False), (AT_NS - 600 * MS, True)]
+)
+def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
+    since_ns: int | None, breached: bool
+) -> None:
+    _, breach = watch(Watching(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+    assert breach is None or breach.text.endswith("and none has come since")
+
+
 # The ways of half a minute
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, vehicle
 from msgspec import structs
 
-from uavctl.data import PositionSample, StepInput
+from uavctl.data import PositionSample, StepInput, Vec3, VehicleMotion
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
-from uavctl.flight.reach import GateParameters
+from uavctl.flight.reach import GateParameters, Suspect
 from uavctl.flight.samples import Intake, Trust, take
 from uavctl.flight.stuck import FROZEN, REPEATED
 
@@ -87,12 +88,16 @@ def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_t
     assert (len(intake.accepted), [why for _, why in intake.refused]) == (0, ["sample-future"])
 
 
-def pushed(says: dict[str, int], ticks: int, *, believes: bool = True) -> list[Intake]:
+def pushed(
+    says: dict[str, int], ticks: int, *, believes: bool = True, own: Vec3 | None = None, at_rest_mps: float = 0.0
+) -> list[Intake]:
     """Cameras, some millimetres off, of a vehicle pushed north from tick 12 on; each says the same from a tick on.
 
-    A tick of -1 is never. Where they are not to be believed, what is said again does not come.
+    A tick of -1 is never. Where they are not to be believed, what is said again does not come. `own` is the velocity
+    that the vehicle says it has.
     """
-    controller = replace(make_controller(), trust=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
+    trust = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS, at_rest_mps=at_rest_mps)
+    controller = replace(make_controller(), trust=trust)
     history = begin(controller.kalman, START_NS, START_NS)
     a, b, _ = controller.plant.transition(TICK_NS * 1e-9)
     x, intakes, last = np.zeros(3), [], dict.fromkeys(says, 0.0)
@@ -106,7 +111,8 @@ def pushed(says: dict[str, int], ticks: int, *, believes: bool = True) -> list[I
             last[source] = last[source] if again else float(x[0]) + 0.001 * (tick % 2)
             if believes or not again:
                 samples.append(sample(at_ns - n * MS, at_ns, (last[source], 0.0, 0.0), source=source))
-        inp = StepInput(tick=tick, at_ns=at_ns, samples=tuple(samples), vehicle=vehicle())
+        told = None if own is None else VehicleMotion(velocity_mps=own, velocity_ns=at_ns)
+        inp = StepInput(tick=tick, at_ns=at_ns, samples=tuple(samples), vehicle=vehicle(), motion=told)
         intake = take(controller.kalman, controller.reach, intake.history, intake.trust, inp, HORIZON, intake.fresh)
         u = np.full(1, float(tick >= 12))
         intake = structs.replace(intake, history=set_input(controller.kalman, intake.history, at_ns, u))
@@ -136,6 +142,30 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
     for one in found[tick + 1 :]:
         assert (refused_as(one), one.clean_ns, one.accepted) == ({FROZEN}, None, ())
     assert repr(found[-1].history) == repr(never[-1].history)
+
+
+@pytest.mark.parametrize(
+    ("own", "at_rest_mps", "believed"),
+    [
+        ((0.0, 0.0, 0.0), 0.1, True),
+        ((0.09, -0.09, 0.09), 0.1, True),
+        ((0.1, 0.0, 0.0), 0.1, False),
+        ((0.0, -0.1, 0.0), 0.1, False),
+        ((0.0, 0.0, 0.1), 0.1, False),
+        ((0.0, 0.0, 0.0), 0.0, False),  # its velocity is made of these positions
+        ((math.nan, 0.0, 0.0), 0.1, False),
+        (None, 0.1, False),
+    ],
+)
+def test_who_says_that_it_rests_may_be_where_it_was(own: Vec3 | None, at_rest_mps: float, believed: bool) -> None:
+    found = pushed({"stuck": 12}, 40, own=own, at_rest_mps=at_rest_mps)
+    assert any(FROZEN in refused_as(one) for one in found) != believed
+
+
+def test_what_cannot_be_is_a_jump_as_well_once_it_comes_again() -> None:
+    likely, once = (Suspect(START_NS, START_NS + 100 * MS, count, np.zeros(1)) for count in (2, 1))
+    assert Trust(suspect=likely).jumped and Trust(absurd=likely).jumped and Trust(suspect=once, absurd=likely).jumped
+    assert not Trust(suspect=once, absurd=once).jumped and not Trust().jumped
 
 
 def test_what_others_said_meanwhile_is_kept() -> None:

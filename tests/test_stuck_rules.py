@@ -133,8 +133,26 @@ def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
     moves: tuple[int, ...], still: tuple[int, ...], news_m: float, since: int | None
 ) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, news_m, moves=moves, still=still, still_ns=(1, 2, 3))
-    assert watch.still_since_ns == since
+    assert watch.still_since_ns() == since
     assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS) is (since is not None)
+
+
+@pytest.mark.parametrize(
+    ("rests", "since"),
+    [
+        ((False, False, False), 1),
+        ((False, True, True), 1),
+        ((True, False, False), 3),
+        ((True, True, False), 3),
+        ((True, False, True), None),
+    ],
+)
+def test_an_axis_in_which_the_vehicle_says_that_it_rests_may_stand_still(
+    rests: tuple[bool, bool, bool], since: int | None
+) -> None:
+    watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))
+    assert watch.still_since_ns(rests) == since
+    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, rests) is (since is not None)
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ from uavctl.smpc.sets import Polytope
 NANOSECONDS = 1e9
 
 # Where `[envelope]` says nothing; the figures of false alarms are in docs/soak.md.
+AT_REST_MPS = 0.1  # noise of a vehicle's own velocity at rest, and a little
 LEAST_OUTSIDE_M = 0.5
 LEAST_UNEXPLAINED_MPS2, ENVELOPE_SIGMA = 1.5, 6.0
 DISAGREES_S = 0.17
@@ -255,6 +256,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
             sigma=estimator.gate_sigma,
             margin_m=estimator.gate_m,
             jump_ns=round(fallback.jump_s * NANOSECONDS),
+            at_rest_mps=0.0 if config.relay.enabled else AT_REST_MPS,  # its velocity is made of these positions then
         ),
         dt_ns=round(config.plant.dt_s * NANOSECONDS),
         tick_ns=round(config.daemon.tick_s * NANOSECONDS),

@@ -52,6 +52,7 @@ SCATTERED, OF = 3, 5  # clipped innovations of the last ones that are no chance
 PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no time at all where it is beyond
 KNOWN = 1.5  # it is more than this many of its standard deviations
 PLAIN = 1.5  # this many times its bound
+UNRESOLVED_NS = 600_000_000  # positions that contradicted the vehicle's own velocity and then stop have so long
 HINT = 0.4  # of the bound of the unexplained acceleration
 QUIET = 0.5  # of the bound: below, positions are clean
 OUTSIDE_NS = 100_000_000
@@ -218,7 +219,7 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
         breach = breach or found
     watching, outside = _place(watching, seen, parameters)
     watching, brakes = _braking(watching, seen)
-    return watching, breach or outside or brakes
+    return watching, breach or _unresolved(watching, seen) or outside or brakes
 
 
 def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
@@ -232,7 +233,7 @@ def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters
         age_s: How old that prediction's newest position is [s]: gusts may have changed it since.
         parameters: What is possible.
     """
-    velocity = _own(seen.motion, seen.at_ns)
+    velocity = own_words(seen.motion, seen.at_ns)
     if velocity is None or watching.contradicted:
         return None
     within_mps = parameters.disagreement_mps + _gusts_mps(age_s, parameters)
@@ -284,7 +285,7 @@ def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
     return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion)
 
 
-def _own(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
+def own_words(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
     """The vehicle's own velocity; None where it is silent, or says what is no number."""
     if motion is None or motion.velocity_mps is None or motion.velocity_ns is None:
         return None
@@ -300,7 +301,7 @@ def _told(watching: Watching, seen: Observation) -> Watching:
         sent = (*sent, (watching.tick_ns or seen.at_ns, seen.sent_mps2))
     first = max((i for i, (at_ns, _) in enumerate(sent) if at_ns <= horizon_ns), default=0)
     watching = replace(watching, tick_ns=seen.at_ns, sent=sent[first:])
-    velocity, way = _own(seen.motion, seen.at_ns), watching.way
+    velocity, way = own_words(seen.motion, seen.at_ns), watching.way
     if velocity is None:
         return replace(watching, way=(), offsets=(), places=())
     if not way or seen.at_ns - way[-1][0] > MOTION_NS:  # missed ticks: nobody knows how far it flew in them
@@ -495,6 +496,13 @@ def _compared(
     return watching, Breach(VELOCITY, text)
 
 
+def _unresolved(watching: Watching, seen: Observation) -> Breach | None:
+    """What is to be made of velocities that contradicted each other where no position comes that tells any more."""
+    if watching.apart_ns is None or seen.at_ns - watching.apart_ns < UNRESOLVED_NS:
+        return None
+    return Breach(VELOCITY, "positions moved otherwise than the vehicle itself says, and none has come since")
+
+
 def _off(
     places: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters
 ) -> tuple[tuple[float, Array] | None, tuple[tuple[int, Array], ...]]:
@@ -592,7 +600,7 @@ def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
 
 def _braking(watching: Watching, seen: Observation) -> tuple[Watching, Breach | None]:
     """Whether braking brakes, by the vehicle's own velocity."""
-    velocity = _own(seen.motion, seen.at_ns)
+    velocity = own_words(seen.motion, seen.at_ns)
     if not seen.braking:
         return replace(watching, braking=None), None
     if velocity is None:

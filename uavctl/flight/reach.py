@@ -33,11 +33,13 @@ class GateParameters:
         sigma: Half-width of the set in standard deviations, beside what inputs can do.
         margin_m: And beside both, for what no model says [m].
         jump_ns: Time for which refused samples agree before the source counts as moved [ns].
+        at_rest_mps: Below this speed, by its own word, a vehicle may be where it was; 0 where its word proves nothing.
     """
 
     sigma: float
     margin_m: float
     jump_ns: int
+    at_rest_mps: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

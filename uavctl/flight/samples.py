@@ -10,6 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.data import PositionSample, StepInput, VehicleStatus
+from uavctl.flight.envelope import own_words
 from uavctl.flight.estimator import (
     LATEST_STAMP_NS,
     History,
@@ -22,7 +23,7 @@ from uavctl.flight.estimator import (
 )
 from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
-from uavctl.flight.stuck import FROZEN, REPEATED, Watches, doubtful, observe, stuck
+from uavctl.flight.stuck import FROZEN, MOVES, REPEATED, Rests, Watches, doubtful, observe, stuck
 
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
@@ -45,6 +46,11 @@ class Trust(msgspec.Struct, frozen=True, eq=False):
     absurd: Suspect | None = None
     doubt_mps: Array | None = None
     watches: Watches = msgspec.field(default_factory=dict)
+
+    @property
+    def jumped(self) -> bool:
+        """Whether a source may well have moved, or say what cannot be: nothing is flown on what is left of it."""
+        return any(one is not None and one.likely for one in (self.suspect, self.absurd))
 
 
 class Intake(msgspec.Struct, frozen=True, eq=False):
@@ -235,10 +241,11 @@ def _distrust(
     trust = replace(trust, watches=watches)
     watch = watches[sample.source]
     newest = watch.at_ns == at_ns
-    if newest and _flies(inp.vehicle):
-        if stuck(watch, kalman, sample, reach.parameters):
+    rests = _rests(inp, reach.parameters.at_rest_mps)
+    if newest and _flies(inp.vehicle) and not all(rests):
+        if stuck(watch, kalman, sample, reach.parameters, rests):
             found = {**watches, sample.source: replace(watch, found=True)}
-            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns or watch.stale_since_ns)
+            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns(rests) or watch.stale_since_ns)
         if doubtful(watch, kalman, sample, reach.parameters):
             if not watch.unlike_it:
                 return _Distrust(trust, REPEATED)
@@ -257,6 +264,15 @@ def _distrust(
 def _flies(vehicle: VehicleStatus | None) -> bool:
     """Whether the vehicle moves on its own, as far as it is known; one that is on the ground may stand still."""
     return vehicle is None or (vehicle.armed and not vehicle.landed)
+
+
+def _rests(inp: StepInput, at_rest_mps: float) -> Rests:
+    """In which axes the vehicle says itself that it is at rest."""
+    velocity = own_words(inp.motion, inp.at_ns)
+    if velocity is None:
+        return MOVES
+    north, east, down = (abs(v) < at_rest_mps for v in velocity)
+    return north, east, down
 
 
 def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:

@@ -10,6 +10,9 @@ without noise. It counts as stuck where
 
 The resolution is the smallest change that the source has shown.
 
+A vehicle that says itself that it is at rest is believed, as one on the ground is: cameras that round say the same of
+it again and again. (Where its own velocity is made of these positions it is not asked.)
+
 Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
 source's values have been news so far, or where inputs alone have carried the prediction away from it. What had been
 believed of a source that is then found to be stuck is taken back, to the moment at which the value first came. A link
@@ -48,6 +51,10 @@ _GAP = 1.5  # of that time: none is lost in between
 _USUAL = 0.15  # of the values: so many come again from a source that sends each twice, over a link that loses most
 _NEAR = 0.5  # of the gate: how far a value that comes again may be off what inputs alone foretell
 _SOURCES = 8  # that are watched at once
+
+
+Rests = tuple[bool, bool, bool]  # in which axes the vehicle says itself that it is at rest: north, east, down
+MOVES: Rests = (False, False, False)
 
 
 class Watch(msgspec.Struct, frozen=True, eq=False):
@@ -113,13 +120,19 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         """The resolution; of a few changes only as far as no motion is taken for it [m]."""
         return self.resolution_m if self.changes >= _ENOUGH else min(self.resolution_m, _GRAIN_M)
 
-    @property
-    def still_since_ns(self) -> int | None:
-        """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has."""
+    def still_since_ns(self, rests: Rests = MOVES) -> int | None:
+        """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has.
+
+        Args:
+            rests: In which axes the vehicle says itself that it is at rest: they may stand still.
+        """
         if not _noisy(self, _MANY):
             return None
-        axes = zip(self.moves, self.still, self.still_ns, strict=True)
-        return min((since for moves, still, since in axes if moves >= _ENOUGH and still >= _STILL), default=None)
+        axes = zip(self.moves, self.still, self.still_ns, rests, strict=True)
+        return min(
+            (since for moves, still, since, at_rest in axes if moves >= _ENOUGH and still >= _STILL and not at_rest),
+            default=None,
+        )
 
 
 Watches = Mapping[str, Watch]
@@ -175,9 +188,11 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
     return {**watches, sample.source: watch}
 
 
-def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
+def stuck(
+    watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters, rests: Rests = MOVES
+) -> bool:
     """Whether a source is stuck, as `observe` left it with its newest sample."""
-    if watch.still_since_ns is not None:
+    if watch.still_since_ns(rests) is not None:
         return True
     belief = watch.coasting
     if belief is None or watch.found:
