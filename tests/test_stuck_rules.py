@@ -13,7 +13,7 @@ from uavctl.data import PositionSample
 from uavctl.flight.estimator import absorb, begin, set_input
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.reach import GateParameters
-from uavctl.flight.stuck import Watch, Watches, doubtful, observe, stuck
+from uavctl.flight.stuck import Moved, Watch, Watches, doubtful, observe, stuck
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 PLANT = small_plant()
@@ -133,26 +133,37 @@ def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
     moves: tuple[int, ...], still: tuple[int, ...], news_m: float, since: int | None
 ) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, news_m, moves=moves, still=still, still_ns=(1, 2, 3))
-    assert watch.still_since_ns() == since
-    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS) is (since is not None)
+    assert watch.still_since_ns(ALWAYS) == since
+    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
+
+
+ALWAYS: Moved = (2**62,) * 3  # it moves all the time
 
 
 @pytest.mark.parametrize(
-    ("rests", "since"),
+    ("moved_ns", "since"),
     [
-        ((False, False, False), 1),
-        ((False, True, True), 1),
-        ((True, False, False), 3),
-        ((True, True, False), 3),
-        ((True, False, True), None),
+        ((1, 2, 3), 1),
+        ((0, 2, 3), 3),
+        ((0, 9, 2), None),
+        ((0, 0, 9), 3),
+        ((9, 0, 0), 1),
     ],
 )
-def test_an_axis_in_which_the_vehicle_says_that_it_rests_may_stand_still(
-    rests: tuple[bool, bool, bool], since: int | None
-) -> None:
+def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(moved_ns: Moved, since: int | None) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))
-    assert watch.still_since_ns(rests) == since
-    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, rests) is (since is not None)
+    assert watch.still_since_ns(moved_ns) == since
+    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, moved_ns) is (since is not None)
+
+
+@pytest.mark.parametrize(
+    ("moved_ns", "rests"), [((6, 6, 6), True), ((7, 6, 6), False), ((6, 7, 6), False), ((6, 6, 7), False)]
+)
+def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: Moved, rests: bool) -> None:
+    watch = Watch(START_NS, (0.0, 0.0, 0.0), first_ns=7)
+    assert watch.may_rest(moved_ns) == rests
+    assert not replace(watch, found=True).may_rest(moved_ns)
+    assert not replace(watch, doubted=True).may_rest(moved_ns)
 
 
 @pytest.mark.parametrize(
@@ -194,9 +205,9 @@ def test_what_counts_as_stuck(
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
     watch = Watch(START_NS, one.position_m, resolution_m, news_m, changes=10, repeats=repeats, coasting=belief)
-    assert stuck(watch, KALMAN, one, PARAMETERS) is found
-    assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
-    assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS) is True
+    assert stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
+    assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS, ALWAYS) is False
+    assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 @pytest.mark.parametrize(
@@ -243,7 +254,7 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
     for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
         watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
-        assert stuck(watch, KALMAN, one, parameters) is found
+        assert stuck(watch, KALMAN, one, parameters, ALWAYS) is found
 
 
 def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> None:
@@ -306,10 +317,10 @@ def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_veh
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([3.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
     watch = Watch(START_NS, one.position_m, repeats=2, usual=1.0, coasting=belief)
-    assert stuck(watch, KALMAN, one, PARAMETERS) is False
+    assert stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
     assert doubtful(watch, KALMAN, one, PARAMETERS) is True
-    assert stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS) is True
-    assert stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS) is True
+    assert stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
+    assert stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 def test_its_axes_do_not_stand_still_for_it() -> None:

@@ -23,7 +23,7 @@ from uavctl.flight.estimator import (
 )
 from uavctl.flight.kalman import Array, Belief, EstimatorParameters, Kalman, captured_ns, shown_by
 from uavctl.flight.reach import JUMP, Reach, Suspect, doubt, judge, radius
-from uavctl.flight.stuck import FROZEN, MOVES, REPEATED, Rests, Watches, doubtful, observe, stuck
+from uavctl.flight.stuck import FROZEN, REPEATED, Moved, Watches, doubtful, observe, stuck
 
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
@@ -40,12 +40,14 @@ class Trust(msgspec.Struct, frozen=True, eq=False):
         absurd: Positions further out than any can be, since one was believed; None without any.
         doubt_mps: How wrong the velocity may be, each axis of the plant [m/s]; None before it was held against one.
         watches: What each source has said.
+        moved_ns: When the vehicle last moved north, east and down, as far as it says so [ns].
     """
 
     suspect: Suspect | None = None
     absurd: Suspect | None = None
     doubt_mps: Array | None = None
     watches: Watches = msgspec.field(default_factory=dict)
+    moved_ns: Moved = (0, 0, 0)
 
     @property
     def jumped(self) -> bool:
@@ -98,6 +100,7 @@ def take(
     """
     newest_ns = history.captured_ns
     history = move_on(kalman, history, inp.at_ns)
+    trust = replace(trust, moved_ns=_moved_ns(trust.moved_ns, inp, reach.parameters.at_rest_mps))
     believed = _Believed(history=history, trust=trust)
     if inp.samples:
         believed = _believe(kalman, reach, history, trust, inp)
@@ -241,11 +244,13 @@ def _distrust(
     trust = replace(trust, watches=watches)
     watch = watches[sample.source]
     newest = watch.at_ns == at_ns
-    rests = _rests(inp, reach.parameters.at_rest_mps)
-    if newest and _flies(inp.vehicle) and not all(rests):
-        if stuck(watch, kalman, sample, reach.parameters, rests):
+    moved_ns = trust.moved_ns
+    if newest and _flies(inp.vehicle) and not watch.may_rest(moved_ns):
+        if stuck(watch, kalman, sample, reach.parameters, moved_ns):
             found = {**watches, sample.source: replace(watch, found=True)}
-            return _Distrust(replace(trust, watches=found), FROZEN, watch.still_since_ns(rests) or watch.stale_since_ns)
+            return _Distrust(
+                replace(trust, watches=found), FROZEN, watch.still_since_ns(moved_ns) or watch.stale_since_ns
+            )
         if doubtful(watch, kalman, sample, reach.parameters):
             if not watch.unlike_it:
                 return _Distrust(trust, REPEATED)
@@ -266,12 +271,11 @@ def _flies(vehicle: VehicleStatus | None) -> bool:
     return vehicle is None or (vehicle.armed and not vehicle.landed)
 
 
-def _rests(inp: StepInput, at_rest_mps: float) -> Rests:
-    """In which axes the vehicle says itself that it is at rest."""
-    velocity = own_words(inp.motion, inp.at_ns)
-    if velocity is None:
-        return MOVES
-    north, east, down = (abs(v) < at_rest_mps for v in velocity)
+def _moved_ns(before_ns: Moved, inp: StepInput, at_rest_mps: float) -> Moved:
+    """When it last moved, as far as it says so; a vehicle that says nothing moves."""
+    velocity = own_words(inp.motion, inp.at_ns) or (math.inf,) * 3
+    rows = zip(before_ns, velocity, strict=True)
+    north, east, down = (ns if abs(v) < at_rest_mps else inp.at_ns for ns, v in rows)
     return north, east, down
 
 

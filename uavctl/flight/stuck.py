@@ -53,8 +53,7 @@ _NEAR = 0.5  # of the gate: how far a value that comes again may be off what inp
 _SOURCES = 8  # that are watched at once
 
 
-Rests = tuple[bool, bool, bool]  # in which axes the vehicle says itself that it is at rest: north, east, down
-MOVES: Rests = (False, False, False)
+Moved = tuple[int, int, int]  # when the vehicle last moved north, east and down, as far as it says so [ns]
 
 
 class Watch(msgspec.Struct, frozen=True, eq=False):
@@ -120,19 +119,20 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         """The resolution; of a few changes only as far as no motion is taken for it [m]."""
         return self.resolution_m if self.changes >= _ENOUGH else min(self.resolution_m, _GRAIN_M)
 
-    def still_since_ns(self, rests: Rests = MOVES) -> int | None:
+    def still_since_ns(self, moved_ns: Moved) -> int | None:
         """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has.
 
-        Args:
-            rests: In which axes the vehicle says itself that it is at rest: they may stand still.
+        One that has rested since then, by the vehicle's own word, may stand still.
         """
         if not _noisy(self, _MANY):
             return None
-        axes = zip(self.moves, self.still, self.still_ns, rests, strict=True)
-        return min(
-            (since for moves, still, since, at_rest in axes if moves >= _ENOUGH and still >= _STILL and not at_rest),
-            default=None,
-        )
+        axes = zip(self.moves, self.still, self.still_ns, moved_ns, strict=True)
+        lost = (since for moves, still, since, ns in axes if moves >= _ENOUGH and still >= _STILL and ns >= since)
+        return min(lost, default=None)
+
+    def may_rest(self, moved_ns: Moved) -> bool:
+        """Whether the value comes again because the vehicle rests, by its own word, and has rested all the time."""
+        return max(moved_ns) < self.first_ns and not (self.doubted or self.found)
 
 
 Watches = Mapping[str, Watch]
@@ -188,11 +188,9 @@ def observe(watches: Watches, kalman: Kalman, history: History, sample: Position
     return {**watches, sample.source: watch}
 
 
-def stuck(
-    watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters, rests: Rests = MOVES
-) -> bool:
+def stuck(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: GateParameters, moved_ns: Moved) -> bool:
     """Whether a source is stuck, as `observe` left it with its newest sample."""
-    if watch.still_since_ns(rests) is not None:
+    if watch.still_since_ns(moved_ns) is not None:
         return True
     belief = watch.coasting
     if belief is None or watch.found:
