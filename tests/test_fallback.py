@@ -177,16 +177,16 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
 
 
 @pytest.mark.parametrize(
-    ("measured", "hold_s", "blind_hold_s", "held_s"),
-    [(True, 3.0, 0.5, 3.0), (False, 3.0, 0.5, 0.5), (False, 0.25, 0.5, 0.25), (True, 0.25, 0.5, 0.25)],
+    ("blind", "hold_s", "blind_hold_s", "held_s"),
+    [(False, 3.0, 0.5, 3.0), (True, 3.0, 0.5, 0.5), (True, 0.25, 0.5, 0.25), (False, 0.25, 0.5, 0.25)],
 )
 def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
-    measured: bool, hold_s: float, blind_hold_s: float, held_s: float
+    blind: bool, hold_s: float, blind_hold_s: float, held_s: float
 ) -> None:
     parameters = replace(PARAMETERS, hold_s=hold_s, blind_hold_s=blind_hold_s)
     before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
-        assert advance(before, 5 * S + after_ns, 0.0, ZERO, parameters, measured=measured).mode is wanted
+        assert advance(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
 
 
 @pytest.mark.parametrize(

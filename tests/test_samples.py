@@ -12,7 +12,7 @@ from msgspec import structs
 
 from uavctl.data import PositionSample, StepInput, Vec3, VehicleMotion
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
-from uavctl.flight.reach import GateParameters, Suspect
+from uavctl.flight.reach import GateParameters
 from uavctl.flight.samples import Intake, Trust, take
 from uavctl.flight.stuck import FROZEN, REPEATED
 
@@ -160,12 +160,6 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
 def test_who_says_that_it_rests_may_be_where_it_was(own: Vec3 | None, at_rest_mps: float, believed: bool) -> None:
     found = pushed({"stuck": 12}, 40, own=own, at_rest_mps=at_rest_mps)
     assert any(FROZEN in refused_as(one) for one in found) != believed
-
-
-def test_what_cannot_be_is_a_jump_as_well_once_it_comes_again() -> None:
-    likely, once = (Suspect(START_NS, START_NS + 100 * MS, count, np.zeros(1)) for count in (2, 1))
-    assert Trust(suspect=likely).jumped and Trust(absurd=likely).jumped and Trust(suspect=once, absurd=likely).jumped
-    assert not Trust(suspect=once, absurd=once).jumped and not Trust().jumped
 
 
 def test_what_others_said_meanwhile_is_kept() -> None:

@@ -296,8 +296,8 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=0,
             le=LONGEST_S,
-            description="for no longer than this where nothing tells whether it drifts: the vehicle's own velocity "
-            "does not come, or nothing speaks for it [s]",
+            description="for no longer than this where nothing tells whether it drifts: no position of late, and the "
+            "vehicle's own velocity does not come, or nothing speaks for it [s]",
         ),
     ] = 0.5
     land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True

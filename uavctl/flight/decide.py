@@ -98,7 +98,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
         if state.fallback.end is End.LET_GO and state.breach is not None:
             why = state.breach.text
         return _fall(state, state.fallback, tick, inp, controller, why)
-    if state.plan is not None and state.trust.jumped:
+    if state.plan is not None and state.trust.suspect is not None and state.trust.suspect.likely:
         why = "positions jumped: braking until they are believed again, or not any more"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
     if state.plan is not None and _misled(state, tick, inp, controller):
@@ -195,6 +195,7 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
         controller.fallback,
         held_mps2(state, fallback, controller),
         measured=measured,
+        blind=not measured and (tick.age_steps is None or tick.age_steps >= controller.horizon),
     )
 
 

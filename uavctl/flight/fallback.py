@@ -118,6 +118,7 @@ def advance(
     held_mps2: Vec3 = ZERO,
     *,
     measured: bool = False,
+    blind: bool = False,
 ) -> Fallback:
     """The fallback at `at_ns`, with all transitions that are due.
 
@@ -129,6 +130,7 @@ def advance(
         parameters: Times and choices.
         held_mps2: What HOLD sends [m/s²].
         measured: Whether the speed is the vehicle's own word, not a prediction.
+        blind: Whether it is a prediction without a position of late: nothing tells a drift.
     """
     mode = fallback.mode
     if mode is ControlMode.STOPPED:
@@ -137,7 +139,7 @@ def advance(
         return replace(fallback, mode=ControlMode.STOPPED, since_ns=at_ns)
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
     held_ns = fallback.since_ns if fallback.held_ns is None else fallback.held_ns
-    hold_s = parameters.hold_s if measured else min(parameters.hold_s, parameters.blind_hold_s)
+    hold_s = min(parameters.hold_s, parameters.blind_hold_s) if blind else parameters.hold_s
     due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= hold_s
     if mode is ControlMode.BRAKE and not due:
         slow = speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s

@@ -49,11 +49,6 @@ class Trust(msgspec.Struct, frozen=True, eq=False):
     watches: Watches = msgspec.field(default_factory=dict)
     moved_ns: Moved = (0, 0, 0)
 
-    @property
-    def jumped(self) -> bool:
-        """Whether a source may well have moved, or say what cannot be: nothing is flown on what is left of it."""
-        return any(one is not None and one.likely for one in (self.suspect, self.absurd))
-
 
 class Intake(msgspec.Struct, frozen=True, eq=False):
     """What came of a tick's samples.
