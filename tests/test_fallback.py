@@ -189,6 +189,17 @@ def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
         assert advance(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
 
 
+def test_nobody_is_blind_unless_it_is_said() -> None:
+    parameters = replace(PARAMETERS, blind_hold_s=0.5)
+    assert advance(Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S), 6 * S, 0.0, ZERO, parameters).mode is HOLD
+
+
+def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew() -> None:
+    before = Fallback(mode=BRAKE, since_ns=5 * S, held_ns=S)
+    after = advance(before, 6 * S, 9.0, (1.0, 0.0, 0.0), replace(PARAMETERS, land=False), measured=True)
+    assert after == before
+
+
 @pytest.mark.parametrize(
     ("end", "measured", "speed_mps", "wanted"),
     [

@@ -157,7 +157,8 @@ def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(move
 
 
 @pytest.mark.parametrize(
-    ("moved_ns", "rests"), [((6, 6, 6), True), ((7, 6, 6), False), ((6, 7, 6), False), ((6, 6, 7), False)]
+    ("moved_ns", "rests"),
+    [((6, 6, 6), True), ((7, 6, 6), False), ((6, 7, 6), False), ((6, 6, 7), False), ((9, 6, 6), False)],
 )
 def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: Moved, rests: bool) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), first_ns=7)
@@ -276,6 +277,7 @@ def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> No
         (4, 1, 150, True),
         (3, 1, 100, True),  # nobody knows how often it samples
         (3, 2, 100, False),
+        (2, 1, 100, True),
         (9, 9, 300, True),
     ],
 )
@@ -291,6 +293,7 @@ def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> 
     assert watched([0.0, 0.0, 0.5])["camera"].usual == 1.0
     assert watched([0.0, 0.0, 0.0, 0.5])["camera"].usual == 1.0
     assert watched([0.0, 0.0, 0.0, 0.0, 0.5])["camera"].usual == 0.0
+    assert watched([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])["camera"].usual == 0.0
     assert watched([0.0, 0.0, 0.5, 0.7])["camera"].usual == 0.5
     assert watched([0.0, 0.0, 0.5, 0.7, 0.7])["camera"].usual == 0.5
 
@@ -301,6 +304,7 @@ def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> 
         (0.15, 2, True, False),
         (0.1499, 2, False, True),
         (1.0, 3, False, True),
+        (1.0, 4, False, False),
         (0.0, 1, False, True),
         (0.0, 3, False, True),
         (0.0, 4, False, False),
@@ -321,6 +325,35 @@ def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_veh
     assert doubtful(watch, KALMAN, one, PARAMETERS) is True
     assert stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
     assert stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
+
+
+def test_nothing_is_known_of_a_source_at_first() -> None:
+    watch = Watch(START_NS, (0.0, 0.0, 0.0))
+    assert (watch.resolution_m, watch.news_m, watch.changes, watch.first_ns, watch.repeats) == (0.0, 0.0, 0, 0, 0)
+    assert (watch.moves, watch.still, watch.still_ns) == ((0, 0, 0),) * 3
+    assert (watch.usual, watch.gap_ns, watch.spacing_ns) == (0.0, 0, 0)
+    assert not (watch.doubted or watch.found or watch.coasting)
+
+
+def test_news_is_a_mean_of_which_the_first_values_are_equal_parts() -> None:
+    watches, history = watched([0.0]), begin(KALMAN, START_NS, START_NS)
+    means = []
+    for n, off_m in enumerate((0.001, 0.004, 0.001)):
+        one = sample(START_NS + (n + 2) * TICK_NS, position_m=(0.5 + 0.1 * n, 0.0, 0.0))
+        watches = observe(watches, KALMAN, history, one, np.array([-off_m]))
+        means.append(watches["camera"].news_m)
+    assert means == pytest.approx([0.001, 0.0025, 0.002])
+
+
+def test_the_time_between_two_values_does_not_go_by_when_it_was() -> None:
+    history = begin(KALMAN, 0, 0)
+    watches = observe({}, KALMAN, history, sample(10), np.array([0.001]))
+    watches = observe(watches, KALMAN, history, sample(50, position_m=(1.0, 0.0, 0.0)), np.array([0.001]))
+    assert (watches["camera"].gap_ns, watches["camera"].spacing_ns) == (40, 40)
+
+
+def test_each_repeat_of_an_axis_counts() -> None:
+    assert [watched([0.5, *[1.0] * n])["camera"].still[1] for n in range(1, 6)] == [1, 2, 3, 4, 5]
 
 
 def test_its_axes_do_not_stand_still_for_it() -> None:
