@@ -160,3 +160,7 @@ def test_who_is_suspected_and_how_far_inputs_carry_are_objects_that_nobody_chang
     # Nor are they compared by their arrays, which have no one truth.
     assert suspect != replace(suspect)
     assert reach != replace(reach)
+
+
+def test_a_vehicles_own_word_proves_nothing_unless_it_is_said_to() -> None:
+    assert GateParameters(sigma=1.0, margin_m=1.0, jump_ns=1).at_rest_mps == 0.0
