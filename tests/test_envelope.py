@@ -14,6 +14,7 @@ from envelope_rig import (
     TICK_NS,
     Array,
     just_less,
+    just_more,
     look,
     motion,
     seen,
@@ -69,7 +70,7 @@ def test_an_estimate_beyond_a_limit_and_its_margin_is_outside_unless_it_comes_ba
         assert at(on_axis(axis, edge)) is None
         breach = at(on_axis(axis, edge + outward * 1e-9))
         assert breach is not None and f"limit of {word}" in breach.text and "beyond" in breach.text
-        for speed, comes_back in ((0.3, True), (just_less(0.3), False)):
+        for speed, comes_back in ((1.0, True), (0.3, True), (just_less(0.3), False)):
             speeds = on_axis(axis, -outward * speed, ZERO)
             assert (at(on_axis(axis, edge + outward), speeds) is None) == comes_back
 
@@ -91,6 +92,13 @@ def test_an_estimate_that_leaves_faster_than_it_can_brake_is_outside_before_it_i
         assert at(rests, ZERO) is None
         assert at(rests, on_axis(axis, outward * 1e-6, ZERO)) is not None
         assert at(rests, on_axis(axis, -outward * 2.0, ZERO)) is None
+
+
+def test_an_estimate_that_comes_to_rest_at_the_margin_is_not_outside() -> None:
+    parameters = replace(PARAMETERS, outside_m=(0.3 + 1.0 / (2.0 * 2.0), 9.0, 9.0))
+    for speed, outside in ((1.0, False), (1.0 + 1e-9, True)):
+        ours = structs.replace(seen(AT_NS), position_m=(3.0, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
+        assert is_outside(ours, parameters) == outside
 
 
 def test_being_outside_has_to_persist() -> None:
@@ -153,6 +161,14 @@ def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple
     assert {breach.code for _, breach in breaches} <= {BRAKING}
 
 
+@pytest.mark.parametrize(("for_ns", "breached"), [(10**9 - 1, False), (10**9, True), (10**9 + 1, True)])
+def test_braking_has_a_second_to_show(for_ns: int, breached: bool) -> None:
+    for north, fast in ((0.3, False), (just_more(0.3), True)):
+        ours = structs.replace(seen(AT_NS, own=motion((north, 0.0, 0.0), AT_NS)), braking=True)
+        _, breach = watch(Watching(braking=(AT_NS - for_ns, 0.0)), ours, PARAMETERS)
+        assert (breach is not None) == (breached and fast)
+
+
 # Attitude
 
 
@@ -181,6 +197,30 @@ def test_the_lean_is_what_a_thrust_that_carries_the_vehicle_does_along_the_floor
 )
 def test_an_attitude_that_is_old_or_on_its_side_says_nothing(words: VehicleMotion, known: bool) -> None:
     assert (lean_mps2(words, AT_NS) is not None) == known
+
+
+def test_an_attitude_that_is_just_not_on_its_side_says_something() -> None:
+    pitches = np.linspace(0.0, 0.5, 1001).tolist()
+    leans = ((math.acos(0.1 / math.cos(pitch)), pitch, 0.0) for pitch in pitches)
+    lean = next(one for one in leans if math.cos(one[0]) * math.cos(one[1]) == 0.1)
+    assert lean_mps2(VehicleMotion(attitude_rad=lean, attitude_ns=AT_NS), AT_NS) is not None
+
+
+@pytest.mark.parametrize(
+    ("accel", "level", "words"),
+    [
+        ((2.0, 0.0, 0.0), True, "as it was told"),  # exactly half of the 4 m/s² that nobody asked for
+        ((just_more(2.0), 0.0, 0.0), True, "otherwise than it was told"),
+        ((0.0, 1.5, -1.5), False, "as it was told"),
+        ((0.0, -1.5, 1.5), False, "otherwise than it was told"),
+    ],
+)
+def test_the_lean_is_held_against_what_was_told_along_the_floor(accel: Vec3, level: bool, words: str) -> None:
+    """It is level, or leans 1.5 m/s² east."""
+    roll = 0.0 if level else math.atan(1.5 / 9.81)
+    own = VehicleMotion(attitude_rad=(roll, 0.0, 0.0), attitude_ns=AT_NS)
+    _, breach = look((0.0, 0.0, 4.0), accel=accel, own=own)
+    assert breach is not None and breach.text.endswith(words)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from envelope_rig import (
@@ -33,7 +35,10 @@ from scipy.optimize import minimize_scalar
 
 from uavctl.data import Vec3, VehicleMotion
 from uavctl.flight.envelope import (
+    BRAKING,
+    BREACHES,
     NOT_WATCHING,
+    OUTSIDE,
     RESPONSE,
     SCATTER,
     VELOCITY,
@@ -53,10 +58,19 @@ from uavctl.flight.limits import ZERO
 class Textbook:
     """A Kalman filter of (position, velocity, unexplained acceleration) of an axis; the lag is exact."""
 
-    def __init__(self, at_ns: int, position_m: float, velocity_mps: float, velocity_std_mps: float, lag_s: float):
+    def __init__(
+        self,
+        at_ns: int,
+        position_m: float,
+        velocity_mps: float,
+        velocity_std_mps: float,
+        lag_s: float,
+        unexplained_mps2: float = 2.0,
+    ):
         self.at_ns = at_ns
         self.mean = np.array([position_m, velocity_mps, 0.0])
-        self.cov = np.diag([0.02**2, velocity_std_mps**2, (2.0 / 3.0) ** 2])
+        self.cov = np.diag([0.02**2, velocity_std_mps**2, (unexplained_mps2 / 3.0) ** 2])
+        self.unexplained_mps2 = unexplained_mps2
         self.accel = 0.0
         self.lag_s = lag_s
 
@@ -73,7 +87,7 @@ class Textbook:
         # Van Loan: the noise of a random walk of the unexplained acceleration.
         step = np.zeros((6, 6))
         step[:3, :3], step[3:, 3:] = -g[:3, :3], g[:3, :3].T
-        step[2, 5] = 2.0**2
+        step[2, 5] = self.unexplained_mps2**2
         moved = expm(step * (at_ns - self.at_ns) * 1e-9)
         f = moved[3:, 3:].T
         self.cov = f @ self.cov @ f.T + f @ moved[:3, 3:]
@@ -100,11 +114,14 @@ def same(watching: Watching, want: Sequence[Textbook]) -> None:
         assert observer.accel_mps2[axis] == pytest.approx(one.accel, rel=1e-9, abs=1e-11)
 
 
-@pytest.mark.parametrize(("seed", "lag_s"), [(0, (0.2, 0.3, 0.4)), (1, (0.2, 0.2, 0.2)), (2, (0.0, 0.001, 0.0005))])
-def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Vec3) -> None:
+@pytest.mark.parametrize(
+    ("seed", "lag_s", "unexplained_mps2"),
+    [(0, (0.2, 0.3, 0.4), 2.0), (1, (0.2, 0.2, 0.2), 3.0), (2, (0.0, 0.001, 0.0005), 2.0)],
+)
+def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Vec3, unexplained_mps2: float) -> None:
     """Setpoints at odd ticks, positions late and in bursts, some of them metres off."""
     rng = np.random.default_rng(seed)
-    parameters = replace(PARAMETERS, lag_s=lag_s)
+    parameters = replace(PARAMETERS, lag_s=lag_s, unexplained_mps2=unexplained_mps2)
     at_ns, captured_ns = START_NS, START_NS - 7 * MS
     inputs: list[list[tuple[int, float]]] = [[], [], []]
     watching, sent, clipped = NOT_WATCHING, ZERO, 0
@@ -128,7 +145,7 @@ def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Ve
             if not books:
                 speeds, std = (ZERO, 0.3) if one.velocity_mps is None else (one.velocity_mps, 0.1)
                 books = [
-                    Textbook(one.captured_ns, p, v, std, max(lag, 0.001))
+                    Textbook(one.captured_ns, p, v, std, max(lag, 0.001), unexplained_mps2)
                     for p, v, lag in zip(one.position_m, speeds, lag_s, strict=True)
                 ]
             elif one.captured_ns - books[0].at_ns >= 40 * MS:
@@ -179,9 +196,11 @@ def test_what_is_left_as_unexplained(unexplained: Vec3, velocity: Vec3, rest_mps
     [
         (2.0, None, None, False),
         (2.0, AT_NS - 200 * MS, None, False),
+        (1.5, AT_NS - 200 * MS, None, False),
         (just_more(2.0), None, AT_NS, False),
         (just_more(2.0), AT_NS - 100 * MS + 1, AT_NS - 100 * MS + 1, False),
         (just_more(2.0), AT_NS - 100 * MS, AT_NS - 100 * MS, True),
+        (just_more(2.0), AT_NS - 150 * MS, AT_NS - 150 * MS, True),
         (just_less(3.0), None, AT_NS, False),
         (3.0, None, AT_NS, True),
         (-3.0, None, AT_NS, True),
@@ -227,6 +246,8 @@ def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: fl
         ((True, False), 0.2, False),
         ((True, True), 0.1, False),
         ((True, True, True, True, False), 0.0, True),  # it persists
+        ((True, True, True), 0.2, True),
+        ((True, True, True, True), 0.2, True),
     ],
 )
 def test_three_of_five_positions_that_are_far_off_are_no_chance(
@@ -255,6 +276,13 @@ def test_an_innovation_counts_up_to_six_standard_deviations() -> None:
             assert watching.clipped == (clipped,)
 
 
+def test_an_innovation_at_its_bound_is_not_clipped() -> None:
+    bound_m = 6.0 * math.sqrt(2.0**2 * ((LOOK_NS * 1e-9) ** 5 / 20) + 0.02**2)
+    for off_m, clipped in ((bound_m, False), (just_more(bound_m), True)):
+        watching, _ = look(ZERO, off_m=off_m)
+        assert watching.clipped == (clipped,)
+
+
 @pytest.mark.parametrize(("since_ns", "counts"), [(40 * MS, True), (40 * MS - 1, False), (0, False), (-S, False)])
 def test_positions_that_are_late_or_close_to_one_another_say_nothing_new(since_ns: int, counts: bool) -> None:
     watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
@@ -270,7 +298,7 @@ def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
     assert watching.observer is not None and watching.observer.at_ns == START_NS - MS
 
 
-@pytest.mark.parametrize(("silent_ns", "anew"), [(3 * S, True), (3 * S - 1, False)])
+@pytest.mark.parametrize(("silent_ns", "anew"), [(3 * S, True), (3 * S + MS, True), (3 * S - 1, False)])
 def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: bool) -> None:
     watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
     watching = structs.replace(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
@@ -299,6 +327,12 @@ def test_what_was_sent_is_remembered_for_three_seconds_and_no_longer() -> None:
         old = [one for one in all_sent if one[0] <= at_ns - 3 * S]
         assert watching.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * S))
         assert watching.tick_ns == at_ns
+
+
+def test_of_what_was_sent_earlier_only_the_last_still_acts() -> None:
+    sent = tuple((AT_NS - 5 * S + n * S, (float(n), 0.0, 0.0)) for n in range(5))
+    watching, _ = watch(Watching(tick_ns=START_NS, sent=sent), seen(AT_NS + 1, sent=sent[-1][1]), PARAMETERS)
+    assert watching.sent == sent[2:]
 
 
 # Positions against the vehicle's own velocity
@@ -409,8 +443,30 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         assert watching.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
+def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None:
+    """A position that comes three seconds late may still be compared with those before."""
+    captured_ns = AT_NS - 2900 * MS
+    state = Watching(
+        observer=Observer(AT_NS - 3 * S, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
+        tick_ns=START_NS,
+        way=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
+        offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
+    )
+    watching, breach = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+    assert watching.apart_mps == pytest.approx(0.3) and watching.contradicted
+    assert watching.apart_ns == captured_ns
+    assert breach is not None and breach.text.endswith("and none has come since")
+
+
 @pytest.mark.parametrize(
-    ("since_ns", "breached"), [(None, False), (AT_NS - 600 * MS + 1, False), (AT_NS - 600 * MS, True)]
+    ("since_ns", "breached"),
+    [
+        (None, False),
+        (AT_NS - 600 * MS + 1, False),
+        (AT_NS - 600 * MS, True),
+        (AT_NS - 600 * MS - 1, True),
+        (AT_NS - 700 * MS, True),
+    ],
 )
 def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
     since_ns: int | None, breached: bool
@@ -445,20 +501,32 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
         assert not watching.contradicted
 
 
+def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
+    within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
+    for off_m, breached in ((within_m, False), (just_more(within_m), True)):
+        _, breach = creeping(off_m, S)
+        assert (breach is not None) == breached
+
+
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
     _, breach = creeping(9.0, S, before=3)
     assert breach is not None and breach.text.endswith("in 1 s")
 
 
-@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1)])
+@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1), (31 * S, 1)])
 def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
     watching, breach = creeping(0.0, age_ns)
     assert breach is None
     assert len(watching.places) == kept
-    if kept == 2 or age_ns == 30 * S:
+    if kept == 2 or age_ns >= 30 * S:
         at_ns, place = watching.places[-1]
-        assert at_ns == AT_NS - 256 * MS
+        assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
         np.testing.assert_allclose(place, ZERO, atol=1e-12)
+
+
+def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
+    watching, _ = creeping(0.0, S // 2, before=5)
+    assert len(watching.places) == 6
 
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
@@ -477,6 +545,9 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
     silent, _ = look(ZERO, places=places, **offsets(0.0))
     missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, way=((AT_NS - 301 * MS, np.zeros(3)),)))
     assert silent.places == missed.places == ()
+    state = Watching(way=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
+    early, _ = watch(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
+    assert early.offsets == early.places == ()
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
@@ -485,7 +556,7 @@ def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() ->
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
 
-@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True)])
+@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True), (3 * S, True)])
 def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
     watching = Watching(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
     assert watching.answered == answered
@@ -503,6 +574,7 @@ def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | Non
         (just_less(EXACT_MPS), 0.0, None, AT_NS, False),
         (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS + 1, AT_NS - 100 * MS + 1, False),
         (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS, AT_NS - 100 * MS, True),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 150 * MS, AT_NS - 150 * MS, True),
         (just_less(EXACT_MPS), 0.8, None, AT_NS, False),
         (just_less(EXACT_MPS), just_more(0.8), None, AT_NS, True),  # the observer too has a hint
         (EXACT_MPS, 1.0, None, None, False),
@@ -530,6 +602,19 @@ def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
         state = Watching(way=((START_NS, np.zeros(3)),))
         watching, _ = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
         assert [at for at, _ in watching.offsets] == [captured_ns] * known
+
+
+def test_the_way_is_not_known_after_the_last_tick() -> None:
+    way = tuple((START_NS - n * MS, np.zeros(3)) for n in range(300, -1, -1))
+    after = sample(AT_NS + 1, AT_NS + 1)
+    watching, _ = watch(Watching(way=way), seen(AT_NS, after, own=AT_REST), PARAMETERS)
+    assert len(watching.way) == 302 and watching.offsets == ()
+
+
+def test_the_way_is_remembered_for_three_seconds() -> None:
+    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * S, AT_NS - 3 * S + 1, START_NS))
+    watching, _ = watch(Watching(way=way), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert [at for at, _ in watching.way] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
 
 
 @pytest.mark.parametrize(
@@ -604,6 +689,19 @@ def test_a_flight_that_began_before_its_first_position_has_the_velocity_that_was
     assert watching.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.0) ** 2)
 
 
+def test_a_first_position_has_the_velocity_of_all_that_was_sent_before() -> None:
+    rng, watching = np.random.default_rng(6), NOT_WATCHING
+    for n in range(31):
+        at_ns = START_NS + n * TICK_NS
+        first = [sample(at_ns)] if n == 30 else []
+        watching, _ = watch(watching, seen(at_ns, *first, sent=vec3(rng.uniform(-2.0, 2.0, 3))), PARAMETERS)
+    assert watching.observer is not None
+    np.testing.assert_allclose(watching.observer.mean[1], watching.flown_mps, atol=1e-12)
+    np.testing.assert_allclose(watching.observer.accel_mps2, watching.flown_mps2, atol=1e-12)
+    # Gusts have had a second and a half for it.
+    assert watching.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.5) ** 2)
+
+
 @pytest.mark.parametrize(("std_m", "noise_m"), [(0.005, 0.02), (0.02, 0.02), (0.1, 0.1)])
 def test_a_position_counts_by_its_own_standard_deviation(std_m: float, noise_m: float) -> None:
     begun, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS, std_m=std_m)), PARAMETERS)
@@ -618,15 +716,29 @@ def test_a_position_counts_by_its_own_standard_deviation(std_m: float, noise_m: 
     assert watching.observer.mean[0, 0] == pytest.approx(0.1 * gain)
 
 
-@pytest.mark.parametrize(("std_mps2", "over"), [(0.0, True), (1.55, True), (1.6, False)])
-def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over: bool) -> None:
-    mean = np.array([ZERO, ZERO, (2.5, 0.0, 0.0)])
+def unsure(unexplained_mps2: float, std_mps2: float) -> Watching:
+    """What comes of a position that tells next to nothing, where the observer knows so much."""
+    mean = np.array([ZERO, ZERO, (unexplained_mps2, 0.0, 0.0)])
     observer = Observer(START_NS, mean, np.diag([0.0, 0.0, std_mps2**2]), np.zeros(3))
     s = LOOK_NS * 1e-9
-    there = sample(AT_NS, AT_NS, (0.5 * 2.5 * s * s, 0.0, 0.0), std_m=50.0)  # which tells next to nothing
+    there = sample(AT_NS, AT_NS, (0.5 * unexplained_mps2 * s * s, 0.0, 0.0), std_m=50.0)
     watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, there), PARAMETERS)
-    assert watching.unexplained_mps2 == pytest.approx(2.5, rel=1e-6)
-    assert (watching.over_ns is not None) == over
+    assert watching.unexplained_mps2 == pytest.approx(unexplained_mps2, rel=1e-6)
+    return watching
+
+
+@pytest.mark.parametrize(("std_mps2", "over"), [(0.0, True), (1.55, True), (1.6, False)])
+def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over: bool) -> None:
+    assert (unsure(2.5, std_mps2).over_ns is not None) == over
+
+
+def test_an_acceleration_of_just_so_many_standard_deviations_is_none() -> None:
+    observer = unsure(0.0, 1.6).observer
+    assert observer is not None
+    bound_mps2 = 1.5 * math.sqrt(observer.cov[2, 2])
+    assert bound_mps2 > PARAMETERS.unexplained_mps2
+    assert unsure(bound_mps2, 1.6).over_ns is None
+    assert unsure(just_more(bound_mps2), 1.6).over_ns is not None
 
 
 # The vehicle's own velocity as a witness
@@ -674,13 +786,15 @@ def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
 
 
 def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
-    rng, watching = np.random.default_rng(4), NOT_WATCHING
+    rng, watching, at_ns = np.random.default_rng(4), NOT_WATCHING, START_NS
     velocity, accel, sent = np.zeros(3), np.zeros(3), ZERO
     for n in range(30):
-        watching, _ = watch(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
+        for_ns = TICK_NS * (10 if n % 5 == 4 else 1)  # now and then one is late
+        at_ns += for_ns if n else 0
+        watching, _ = watch(watching, seen(at_ns, sent=sent), PARAMETERS)
         if n:
             for axis, lag_s in enumerate(PARAMETERS.lag_s):
-                step = expm(np.array([[0, 1, 0], [0, -1 / lag_s, 1 / lag_s], [0, 0, 0]]) * TICK_NS * 1e-9)
+                step = expm(np.array([[0, 1, 0], [0, -1 / lag_s, 1 / lag_s], [0, 0, 0]]) * for_ns * 1e-9)
                 velocity[axis], accel[axis], _ = step @ (velocity[axis], accel[axis], sent[axis])
         np.testing.assert_allclose(watching.flown_mps, velocity, atol=1e-12)
         np.testing.assert_allclose(watching.flown_mps2, accel, atol=1e-12)
@@ -691,3 +805,99 @@ def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
 def test_what_is_recorded_of_it_is_plain_numbers() -> None:
     watching, _ = look((0.1, 0.2, -0.9), own=AT_REST, **offsets(0.1))
     assert [type(watching.unexplained_mps2), type(watching.apart_mps)] == [float, float]
+
+
+# No clock's zero says anything
+
+
+def later(watching: Watching, by_ns: int) -> Watching:
+    """The same, all of it so much later."""
+
+    def moved(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
+        return tuple((at_ns + by_ns, value) for at_ns, value in pairs)
+
+    names = ("tick_ns", "began_ns", "over_ns", "apart_ns", "clean_ns", "outside_ns")
+    times = {name: at_ns + by_ns for name in names if (at_ns := getattr(watching, name)) is not None}
+    rows = {name: moved(getattr(watching, name)) for name in ("sent", "way", "offsets", "places")}
+    observer, braking = watching.observer, watching.braking
+    return structs.replace(
+        watching,
+        observer=None if observer is None else structs.replace(observer, at_ns=observer.at_ns + by_ns),
+        braking=None if braking is None else moved((braking,))[0],
+        **times,
+        **rows,
+    )
+
+
+def random_tick(rng: np.random.Generator, at_ns: int, before: Observation) -> Observation:
+    """A tick that may bring anything; much stays as it was before."""
+
+    def anew(chance: float) -> bool:
+        return bool(rng.random() < chance)
+
+    samples = []
+    for late_ms in sorted(rng.integers(0, 100, size=rng.integers(0, 3)), reverse=True):
+        scale = 5.0 if anew(0.05) else 0.01
+        samples.append(sample(at_ns - int(late_ms) * MS, at_ns, vec3(rng.normal(scale=scale, size=3))))
+    was = before.motion
+    words = VehicleMotion(
+        velocity_mps=vec3(rng.normal(scale=0.3, size=3)) if was is None or anew(0.1) else was.velocity_mps,
+        velocity_ns=at_ns if was is None or not anew(0.2) else was.velocity_ns,
+        attitude_rad=vec3(rng.normal(scale=0.2, size=3)),
+        attitude_ns=at_ns if was is None or anew(0.3) else was.attitude_ns,
+    )
+    return Observation(
+        at_ns=at_ns,
+        samples=samples,
+        sent_mps2=vec3(rng.normal(scale=0.5, size=3)) if anew(0.2) else before.sent_mps2,
+        position_m=vec3(rng.uniform((-4, 0, -3), (4, 0, -2))) if anew(0.2) else before.position_m,
+        velocity_mps=vec3(rng.normal(scale=0.3, size=3)),
+        motion=None if anew(0.02) else words,
+        braking=before.braking != anew(0.05),
+    )
+
+
+def tick_later(tick: Observation, by_ns: int) -> Observation:
+    words = tick.motion
+    return structs.replace(
+        tick,
+        at_ns=tick.at_ns + by_ns,
+        samples=[
+            structs.replace(one, captured_ns=one.captured_ns + by_ns, received_ns=one.received_ns + by_ns)
+            for one in tick.samples
+        ],
+        motion=words
+        and structs.replace(
+            words,
+            velocity_ns=None if words.velocity_ns is None else words.velocity_ns + by_ns,
+            attitude_ns=None if words.attitude_ns is None else words.attitude_ns + by_ns,
+        ),
+    )
+
+
+def plain(watching: Watching) -> Any:
+    return msgspec.to_builtins(watching, enc_hook=lambda array: array.tolist())
+
+
+def test_what_time_it_is_makes_no_difference() -> None:
+    """The same flights under a clock whose zero is long after them, and under one whose zero is as they begin."""
+    found: set[str] = set()
+    for seed in range(6):
+        by_ns = MS - START_NS if seed % 3 == 2 else -1000 * S
+        rng, at_ns = np.random.default_rng(seed), START_NS + 1
+        one = two = NOT_WATCHING
+        tick = seen(at_ns)
+        for n in range(60):
+            tick = random_tick(rng, at_ns, tick)
+            tick = structs.replace(tick, samples=tick.samples if n > seed else ())  # the first ones come a little later
+            same_tick = tick_later(tick, by_ns)
+            one, breach = watch(one, tick, PARAMETERS)
+            two, same_breach = watch(two, same_tick, PARAMETERS)
+            found |= {breach.code} if breach else set()
+            assert same_breach == breach
+            assert plain(two) == plain(later(one, by_ns))
+            assert two.answered == one.answered
+            for says in (own_velocity, misled):
+                assert says(two, same_tick, 0.1, PARAMETERS) == says(one, tick, 0.1, PARAMETERS)
+            at_ns += int(rng.choice([int(rng.integers(30, 90)), 400, 3500], p=[0.96, 0.03, 0.01])) * MS
+    assert found == BREACHES == {RESPONSE, VELOCITY, SCATTER, OUTSIDE, BRAKING}

@@ -40,7 +40,7 @@ VELOCITY = "envelope-velocity"
 SCATTER = "envelope-scatter"
 BRAKING = "envelope-braking"
 OF_POSITIONS = frozenset({RESPONSE, VELOCITY, SCATTER})  # after these no position is believed
-BREACHES = OF_POSITIONS | {OUTSIDE, BRAKING}
+BREACHES = OF_POSITIONS.union({OUTSIDE, BRAKING})
 
 ANSWERS_NS = 2_000_000_000  # of a flight: positions that did not answer would have been found out by then
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
