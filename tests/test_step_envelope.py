@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import replace as changed
+from typing import Any
 
 import pytest
 from envelope_rig import PARAMETERS, motion
-from flight_rig import MS, START_NS, TICK_NS, inputs_of, make_controller, modes, one_a_step, run, sample, vehicle
+from flight_rig import (
+    DT_NS,
+    MS,
+    START_NS,
+    TICK_NS,
+    TICKS,
+    StubSolver,
+    inputs_of,
+    make_controller,
+    modes,
+    moving,
+    one_a_step,
+    run,
+    sample,
+    small_plant,
+    vehicle,
+)
 from msgspec.structs import replace
 
 from uavctl.data import ControlMode, Vec3, VehicleStatus
+from uavctl.flight import samples, step
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
 from uavctl.flight.fallback import End, Fallback
@@ -28,8 +46,8 @@ def controller() -> Controller:
 
 def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLIMETRES) -> list[ControlMode]:
     times_ns = [START_NS + n * 2 * TICK_NS for n in range(N_TICKS // 2)]
-    samples = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
-    outputs = run(ours, inputs_of(range(N_TICKS), samples, status=lambda tick: status))
+    said = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
+    outputs = run(ours, inputs_of(range(N_TICKS), said, status=lambda tick: status))
     found = [event.code for output in outputs for event in output.events if event.code == OUTSIDE]
     assert len(found) == (ControlMode.LAND in modes(outputs))
     assert sum(output.land for output in outputs) == len(found)
@@ -77,6 +95,25 @@ def test_where_nothing_tells_whether_it_drifts_it_is_not_held_for_long(
     assert seen.count(ControlMode.HOLD) == held_s * 1e9 / TICK_NS
     landed = outputs[seen.index(ControlMode.LAND)].decision
     assert landed.reason == f"held for {held_s:.1f} s, and positions did not come back: landing"
+
+
+def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit_has_let_them_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def taking_back(*arguments: Any) -> samples.Intake:
+        intake = samples.take(*arguments)
+        tick = arguments[4].tick
+        return replace(intake, clean_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
+
+    solver = StubSolver(small_plant(), 20)
+    inputs = inputs_of(range(12 * TICKS), moving(3))
+    run(make_controller(solver, horizon=20), inputs)
+    asked = [number for number, _ in solver.asked]
+    assert asked == [0, 1, 2, 3]  # as there is news
+    monkeypatch.setattr(step, "take", taking_back)
+    again = StubSolver(small_plant(), 20)
+    run(make_controller(again, horizon=20), inputs)
+    assert [number for number, _ in again.asked] == [0, 1, 2, 3, 5, 6, 7]
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         breach: What it found that cannot be; None for nothing.
         recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
         biases: Estimated biases of late.
+        taken_back: The step in which positions were last taken back; None for none.
     """
 
     history: History | None = None
@@ -118,6 +119,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     breach: Breach | None = None
     recalled: bool = False
     biases: Biases = ()
+    taken_back: int | None = None
 
     @property
     def disbelieves(self) -> bool:

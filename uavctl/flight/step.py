@@ -51,6 +51,7 @@ _SOURCES = {
 }
 
 
+AFRESH_STEPS = 3  # for which a plan is made anew once positions were taken back
 _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
@@ -118,6 +119,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)
+    taken_back = state.taken_back if clean_ns is None else tick.number
+    afresh = tick.boundary and taken_back is not None and 0 < tick.number - taken_back <= AFRESH_STEPS
     begun = replace(
         ordered,
         history=intake.history,
@@ -126,7 +129,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         fresh=0 if stale else intake.fresh,
         watching=watching,
         recalled=recalled,
-        plan=_outdated(ordered.plan, clean_ns),
+        plan=_outdated(ordered.plan, clean_ns, afresh=afresh),
+        taken_back=taken_back,
         biases=_biases(state, tick, clean_ns),
     )
     choice = choose(begun, tick, inp, controller)
@@ -225,9 +229,16 @@ def _cleaned(intake: Intake, clean_ns: int, controller: Controller) -> Intake:
     return replace(intake, history=history, fresh=0)
 
 
-def _outdated(plan: Plan | None, clean_ns: int | None) -> Plan | None:
-    """The plan that is flown; where it was made of what has been taken back, any estimate is news beside it."""
-    if plan is None or clean_ns is None or plan.captured_ns <= clean_ns:
+def _outdated(plan: Plan | None, clean_ns: int | None, *, afresh: bool) -> Plan | None:
+    """The plan that is flown; where it was made of what has been taken back, any estimate is news beside it.
+
+    So it is for some steps (`afresh`): the setpoint was far from where the new plan begins, and is slew-limited.
+    """
+    if plan is None:
+        return None
+    if afresh:
+        return replace(plan, captured_ns=plan.captured_ns - 1)
+    if clean_ns is None or plan.captured_ns <= clean_ns:
         return plan
     return replace(plan, captured_ns=clean_ns - 1)
 
