@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -192,6 +193,8 @@ def test_an_interruption_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-X", "importtime", "-m", "uavctl", "log", "info", str(tmp_path / "flight.mcap")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
+    # What is not read yet holds it up: else a machine that is busy lets it end before it is interrupted.
+    fcntl.fcntl(process.stderr, fcntl.F_SETPIPE_SZ, 4096)
     lines = iter(process.stderr.readline, "")
     assert any("cyclopts" in line for line in lines)
     process.send_signal(signal.SIGINT)
