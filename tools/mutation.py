@@ -39,7 +39,11 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "safety-core.md"
 # The safety core, and the tests that must see every change of it.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "uavctl/flight/envelope.py": ("tests/test_envelope_observer.py", "tests/test_envelope.py"),
+    "uavctl/flight/envelope.py": (
+        "tests/test_envelope_observer.py",
+        "tests/test_envelope_velocity.py",
+        "tests/test_envelope.py",
+    ),
     "uavctl/flight/fallback.py": ("tests/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/test_limits.py",),
     "uavctl/flight/reach.py": ("tests/test_reach_rules.py",),

@@ -218,6 +218,11 @@ def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     )
 
 
+def _has_own_velocity(config: Config) -> bool:
+    """Whether the vehicle's velocity is another witness than our positions, as far as we know."""
+    return not config.relay.enabled and "LOCAL_POSITION_NED" not in config.source.messages
+
+
 def _vec3(values: list[float]) -> Vec3:
     north, east, down = values
     return north, east, down
@@ -256,7 +261,7 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
             sigma=estimator.gate_sigma,
             margin_m=estimator.gate_m,
             jump_ns=round(fallback.jump_s * NANOSECONDS),
-            at_rest_mps=0.0 if config.relay.enabled else AT_REST_MPS,  # its velocity is made of these positions then
+            at_rest_mps=AT_REST_MPS if _has_own_velocity(config) else 0.0,
         ),
         dt_ns=round(config.plant.dt_s * NANOSECONDS),
         tick_ns=round(config.daemon.tick_s * NANOSECONDS),

@@ -132,11 +132,7 @@ class FaultConfig(Section, frozen=True, kw_only=True):
     velocity_mps: Annotated[
         Wind,
         Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]"),
-    ] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    ] = (0.0, 0.0, 0.0)
     charge: Annotated[float, Meta(ge=0, le=1, description="of the battery, with `battery`")] = 0.0
     name: Annotated[
         str,

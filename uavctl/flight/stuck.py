@@ -10,8 +10,9 @@ without noise. It counts as stuck where
 
 The resolution is the smallest change that the source has shown.
 
-A vehicle that says itself that it is at rest is believed, as one on the ground is: cameras that round say the same of
-it again and again. (Where its own velocity is made of these positions it is not asked.)
+Of a vehicle that says itself that it is at rest cameras that round say the same again and again: they are believed, as
+of one on the ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of what they
+say (where we know that, it is not asked at all).
 
 Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
 source's values have been news so far, or where inputs alone have carried the prediction away from it. What had been
@@ -45,6 +46,7 @@ _LEAST_NEWS_M = 2e-5  # nor do the numbers of a message, however large the room 
 _SMOOTH = 0.1  # least weight of a sample in the mean of what was news
 _ENOUGH = round(1.0 / _SMOOTH)  # changes that tell the resolution
 _GRAIN_M = 2e-3  # what a few changes may be taken for
+_ROUNDED_M = 5e-5  # the resolution of a source that rounds; noise makes smaller changes before long
 _STILL = 5  # repeats of one axis in a row
 _SPACINGS = 4  # times between samples that tell how often it samples
 _GAP = 1.5  # of that time: none is lost in between
@@ -131,8 +133,9 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
         return min(lost, default=None)
 
     def may_rest(self, moved_ns: Moved) -> bool:
-        """Whether the value comes again because the vehicle rests, by its own word, and has rested all the time."""
-        return max(moved_ns) < self.first_ns and not (self.doubted or self.found)
+        """Whether a rounded value comes again because the vehicle rests, and has all the time, by its own word."""
+        rounds = self.resolution_m >= _ROUNDED_M
+        return rounds and max(moved_ns) < self.first_ns and not (self.doubted or self.found)
 
 
 Watches = Mapping[str, Watch]

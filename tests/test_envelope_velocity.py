@@ -1,0 +1,373 @@
+"""Positions against the vehicle's own velocity: over a second or so, and over the ways of half a minute."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from envelope_rig import (
+    AT_NS,
+    AT_REST,
+    LOOK_NS,
+    NAN3,
+    PARAMETERS,
+    Array,
+    S,
+    just_less,
+    just_more,
+    look,
+    motion,
+    offsets,
+    seen,
+    vec3,
+)
+from flight_rig import MS, START_NS, sample
+from msgspec import structs
+from scipy.optimize import minimize_scalar
+
+from uavctl.data import Vec3, VehicleMotion
+from uavctl.flight.envelope import (
+    NOT_WATCHING,
+    VELOCITY,
+    Breach,
+    Observer,
+    Watching,
+    own_velocity,
+    watch,
+)
+from uavctl.flight.limits import ZERO
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    parameters = replace(PARAMETERS, disagreement_mps=100.0)
+    watching, at_ns = NOT_WATCHING, START_NS
+    ticks_ns: list[int] = []
+    flown: list[Array] = []
+    taken: list[tuple[int, Array]] = []
+    for _ in range(80):
+        at_ns += int(rng.integers(30, 90)) * MS
+        velocity = rng.normal(size=3)
+        flown.append(flown[-1] + velocity * (at_ns - ticks_ns[-1]) * 1e-9 if flown else np.zeros(3))
+        ticks_ns.append(at_ns)
+        captured_ns = at_ns - int(rng.integers(0, 30)) * MS
+        one = sample(captured_ns, at_ns, vec3(rng.normal(size=3)))
+        if captured_ns > ticks_ns[0] and (not taken or captured_ns - taken[-1][0] >= 40 * MS):
+            distance = [np.interp(captured_ns, ticks_ns, axis) for axis in np.array(flown).T]
+            taken.append((captured_ns, np.array(one.position_m) - distance))
+        watching, _ = watch(watching, seen(at_ns, one, own=motion(vec3(velocity), at_ns)), parameters)
+        if not taken or taken[-1][0] != captured_ns:
+            continue
+        window = [one for one in taken if one[0] > captured_ns - 1200 * MS]
+        assert [at for at, _ in watching.offsets] == [at for at, _ in window]
+        if len(window) < 3 or captured_ns - window[0][0] < 360 * MS:
+            assert watching.apart_mps is None
+            continue
+        slope, _ = np.polyfit([(at - captured_ns) * 1e-9 for at, _ in window], [off for _, off in window], 1)
+        # As much of it as stamps that are up to 0.15 s late or early make is no difference.
+        middle_ns = (window[0][0] + captured_ns) // 2
+        places = [[np.interp(at, ticks_ns, axis) for axis in np.array(flown).T] for at in (window[0][0], middle_ns)]
+        half_s = (captured_ns - window[0][0]) * 0.5e-9
+        accel = (np.array(places[0]) - 2.0 * np.array(places[1]) + distance) / half_s**2
+        left = minimize_scalar(
+            lambda late_s, by=slope, a=accel: float(np.linalg.norm(by + late_s * a)),
+            bounds=(-0.15, 0.15),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        assert watching.apart_mps == pytest.approx(left.fun, rel=1e-6)
+    kept = [at for at in ticks_ns if at > at_ns - 3 * S]
+    assert [at for at, _ in watching.way] == kept
+
+
+@pytest.mark.parametrize(
+    ("spans_ns", "compared"),
+    [
+        ((360 * MS,), False),
+        ((100 * MS, 360 * MS), True),
+        ((100 * MS, 360 * MS - 1), False),
+        ((100 * MS, 1200 * MS - 1), True),
+        ((100 * MS, 1200 * MS), False),  # one is too old
+    ],
+)
+def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
+    spans_ns: tuple[int, ...], compared: bool
+) -> None:
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
+    assert watching.apart_mps == (pytest.approx(0.125) if compared else None)
+    assert watching.apart_ns is None
+    assert not watching.contradicted
+
+
+# 0.4375 m/s are exactly what is shown of 0.4375 m/s, and 1.5 times 0.4375 / 1.5.
+EXACT_MPS = 0.4375
+
+
+def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
+    """What is left of offsets with that slope while the vehicle accelerates, and whether it contradicts."""
+    times_ns = [AT_NS - ns * MS for ns in (512, 256)]
+    nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
+    way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
+    lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
+    watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
+    return watching.apart_mps, watching.contradicted
+
+
+@pytest.mark.parametrize(
+    ("accel", "slope", "left_mps"),
+    [
+        (ZERO, (0.3, 0.0, 0.0), 0.3),
+        ((2.0, 0.0, 0.0), (-0.2, 0.0, 0.0), 0.0),  # positions are 0.1 s late
+        ((2.0, 0.0, 0.0), (0.2, 0.0, 0.0), 0.0),  # or early
+        ((2.0, 0.0, 0.0), (-0.5, 0.0, 0.0), 0.2),  # no stamp is later than 0.15 s
+        ((2.0, 0.0, 0.0), (0.5, 0.0, 0.0), 0.2),
+        ((2.0, 0.0, 0.0), (0.0, 0.3, 0.0), 0.3),  # nor does it turn a velocity
+        ((0.0, 1.0, 1.0), (0.0, -0.2, 0.0), math.hypot(0.1, 0.1)),
+    ],
+)
+def test_as_much_as_late_stamps_make_is_no_difference_of_velocities(accel: Vec3, slope: Vec3, left_mps: float) -> None:
+    left, contradicted = turning(accel, slope)
+    assert left == pytest.approx(left_mps, abs=1e-6)
+    assert contradicted == (left_mps > PARAMETERS.disagreement_mps)
+
+
+def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
+    times_ns = [AT_NS - ns * MS for ns in (512, 256)]
+    lines = tuple((at, np.array([(at - AT_NS) * -0.2e-9, 0.0, 0.0])) for at in times_ns)
+    for begins_ns in (times_ns[0], times_ns[0] + 1):
+        way = tuple(
+            (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
+        )
+        watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
+        assert watching.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
+
+
+def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None:
+    """A position that comes three seconds late may still be compared with those before."""
+    captured_ns = AT_NS - 2900 * MS
+    state = Watching(
+        observer=Observer(AT_NS - 3 * S, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
+        tick_ns=START_NS,
+        way=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
+        offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
+    )
+    watching, breach = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+    assert watching.apart_mps == pytest.approx(0.3) and watching.contradicted
+    assert watching.apart_ns == captured_ns
+    assert breach is not None and breach.text.endswith("and none has come since")
+
+
+@pytest.mark.parametrize(
+    ("since_ns", "breached"),
+    [
+        (None, False),
+        (AT_NS - 600 * MS + 1, False),
+        (AT_NS - 600 * MS, True),
+        (AT_NS - 600 * MS - 1, True),
+        (AT_NS - 700 * MS, True),
+    ],
+)
+def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
+    since_ns: int | None, breached: bool
+) -> None:
+    _, breach = watch(Watching(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+    assert breach is None or breach.text.endswith("and none has come since")
+
+
+# The ways of half a minute
+
+
+def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[Watching, Breach | None]:
+    """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
+    known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
+    middle_ns = AT_NS - 256 * MS
+    older = tuple((middle_ns - age_ns - n * S, np.zeros(3)) for n in range(before, 0, -1))
+    places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
+    return look(ZERO, own=AT_REST, places=places, **known)
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "within_m"), [(S, 0.25 * 2.16), (5 * S, 0.25 * 2.8), (30 * S - 1, 0.25 * 6.8), (30 * S, math.inf)]
+)
+def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within_m: float) -> None:
+    for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
+        watching, breach = creeping(off_m if math.isfinite(off_m) else 99.0, age_ns)
+        breached = breached and math.isfinite(within_m)
+        assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+        assert breach is None or breach.text.endswith(f"away from the vehicle's own way in {age_ns * 1e-9:.0f} s")
+        assert breach is None or f"(0.0, {off_m:.1f}, 0.0) m" in breach.text
+        assert not watching.contradicted
+
+
+def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
+    within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
+    for off_m, breached in ((within_m, False), (just_more(within_m), True)):
+        _, breach = creeping(off_m, S)
+        assert (breach is not None) == breached
+
+
+def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
+    _, breach = creeping(9.0, S, before=3)
+    assert breach is not None and breach.text.endswith("in 1 s")
+
+
+@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1), (31 * S, 1)])
+def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
+    watching, breach = creeping(0.0, age_ns)
+    assert breach is None
+    assert len(watching.places) == kept
+    if kept == 2 or age_ns >= 30 * S:
+        at_ns, place = watching.places[-1]
+        assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
+        np.testing.assert_allclose(place, ZERO, atol=1e-12)
+
+
+def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
+    watching, _ = creeping(0.0, S // 2, before=5)
+    assert len(watching.places) == 6
+
+
+def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
+    ((at_ns, place),) = watching.places
+    assert at_ns == AT_NS - 200 * MS
+    np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
+
+
+def test_over_a_gap_the_way_is_not_compared() -> None:
+    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
+        watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
+        assert breach is None
+        assert watching.places == (places if kept else ())
+    silent, _ = look(ZERO, places=places, **offsets(0.0))
+    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, way=((AT_NS - 301 * MS, np.zeros(3)),)))
+    assert silent.places == missed.places == ()
+    state = Watching(way=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
+    early, _ = watch(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
+    assert early.offsets == early.places == ()
+
+
+def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
+    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
+    assert breach is not None and breach.text.startswith("positions move otherwise")
+
+
+@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True), (3 * S, True)])
+def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
+    watching = Watching(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
+    assert watching.answered == answered
+    assert not structs.replace(watching, tick_ns=None).answered
+
+
+# What is compared how
+
+
+@pytest.mark.parametrize(
+    ("bound_mps", "unexplained_mps2", "apart_ns", "since_ns", "breached"),
+    [
+        (EXACT_MPS, 0.0, None, None, False),
+        (EXACT_MPS, 0.0, 1, None, False),
+        (just_less(EXACT_MPS), 0.0, None, AT_NS, False),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS + 1, AT_NS - 100 * MS + 1, False),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 100 * MS, AT_NS - 100 * MS, True),
+        (just_less(EXACT_MPS), 0.0, AT_NS - 150 * MS, AT_NS - 150 * MS, True),
+        (just_less(EXACT_MPS), 0.8, None, AT_NS, False),
+        (just_less(EXACT_MPS), just_more(0.8), None, AT_NS, True),  # the observer too has a hint
+        (EXACT_MPS, 1.0, None, None, False),
+        (EXACT_MPS / 1.5, 0.0, None, AT_NS, True),
+        (just_more(EXACT_MPS / 1.5), 0.0, None, AT_NS, False),
+    ],
+)
+def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plain(
+    bound_mps: float, unexplained_mps2: float, apart_ns: int | None, since_ns: int | None, breached: bool
+) -> None:
+    parameters = replace(PARAMETERS, disagreement_mps=bound_mps)
+    # The position is a little off where something is unexplained: so are the offsets.
+    s = LOOK_NS * 1e-9
+    place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
+    known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
+    watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
+    assert watching.apart_mps == EXACT_MPS
+    assert watching.apart_ns == since_ns
+    assert watching.contradicted == (since_ns is not None)
+    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+
+
+def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
+    for captured_ns, known in ((START_NS, False), (START_NS + 1, True), (AT_NS, True)):
+        state = Watching(way=((START_NS, np.zeros(3)),))
+        watching, _ = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+        assert [at for at, _ in watching.offsets] == [captured_ns] * known
+
+
+def test_the_way_is_not_known_after_the_last_tick() -> None:
+    way = tuple((START_NS - n * MS, np.zeros(3)) for n in range(300, -1, -1))
+    after = sample(AT_NS + 1, AT_NS + 1)
+    watching, _ = watch(Watching(way=way), seen(AT_NS, after, own=AT_REST), PARAMETERS)
+    assert len(watching.way) == 302 and watching.offsets == ()
+
+
+def test_the_way_is_remembered_for_three_seconds() -> None:
+    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * S, AT_NS - 3 * S + 1, START_NS))
+    watching, _ = watch(Watching(way=way), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert [at for at, _ in watching.way] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
+
+
+@pytest.mark.parametrize(
+    ("words", "known"),
+    [
+        (None, False),
+        (VehicleMotion(), False),
+        (VehicleMotion(velocity_mps=ZERO), False),
+        (VehicleMotion(velocity_ns=AT_NS), False),
+        (motion(ZERO, AT_NS - 300 * MS), True),
+        (motion(ZERO, AT_NS - 300 * MS - 1), False),
+        (motion((0.0, math.nan, 0.0), AT_NS), False),
+        (motion((0.0, 0.0, math.inf), AT_NS), False),
+    ],
+)
+def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
+    watching, _ = look(ZERO, own=words, **offsets(0.125))
+    assert (watching.apart_mps is not None) == (len(watching.offsets) == 3) == known
+    assert len(watching.way) == (3 if known else 0)
+    ours = structs.replace(seen(AT_NS, own=words), velocity_mps=ZERO)
+    assert (own_velocity(watching, ours, 0.0, PARAMETERS) is not None) == known
+
+
+@pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
+def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
+    before = offsets(0.0, way=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
+    watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
+    assert watching.way[-1][0] == AT_NS
+    assert watching.way[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
+    assert [at for at, _ in watching.way[:-1]] == [AT_NS - gap_ns] * known
+    assert len(watching.offsets) == (3 if known else 0)
+
+
+@pytest.mark.parametrize(
+    ("own", "known", "age_s", "contradicted", "believed"),
+    [
+        ((0.25, 0.0, 0.0), ZERO, 0.0, False, True),
+        ((just_more(0.25), 0.0, 0.0), ZERO, 0.0, False, False),
+        ((0.0, -0.26, 0.0), ZERO, 0.0, False, False),
+        ((0.0, 0.0, 1.5), (0.0, 0.0, 1.3), 0.0, False, True),
+        ((0.84, 0.0, 0.0), ZERO, 1.0, False, True),  # 0.25 and 0.3 of 2 m/s² for a second
+        ((0.86, 0.0, 0.0), ZERO, 1.0, False, False),
+        ((0.0, 0.0, 0.0), ZERO, 0.0, True, False),
+        ((9.0, 9.0, 0.1), (math.nan, math.nan, 0.0), 0.0, False, True),
+        ((9.0, 9.0, 0.3), (math.nan, math.nan, 0.0), 0.0, False, False),
+        ((9.0, 9.0, 9.0), NAN3, 0.0, False, True),
+    ],
+)
+def test_which_own_velocity_may_be_braked_on(
+    own: Vec3, known: Vec3, age_s: float, contradicted: bool, believed: bool
+) -> None:
+    ours = structs.replace(seen(AT_NS, own=motion(own, AT_NS)), velocity_mps=known)
+    watching = Watching(contradicted=contradicted)
+    assert own_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
