@@ -13,8 +13,9 @@ from uavctl.cli.prepare import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 
-# The swap of two axes looks like the right ones along their diagonal, and the mission of the preset leads along it.
-AT_ONCE = ("turned-90", "turned-180", "mirrored-north", "kilometres")
+# The swap of two axes looks like the right ones along their diagonal, and the mission of the preset leads along it; it
+# is found because one axis leads.
+AT_ONCE = ("turned-90", "turned-180", "mirrored-north", "swapped", "kilometres")
 IN_THE_AIR = ("turned-180", "mirrored-east", "enu", "millimetres", "swapped")
 MOVED_M = 3.0
 BLACKOUT_AND_M = 0.3

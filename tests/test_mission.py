@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flight_rig import room_of, small_plant
 from numpy.typing import NDArray
 
 from uavctl.build import build_controller, build_design
 from uavctl.build_mission import build_mission, build_trajectory
 from uavctl.config import load_config
 from uavctl.config.types import Config
-from uavctl.data import GaveWay
+from uavctl.data import GaveWay, Vec3
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.mission import (
     Fence,
@@ -24,6 +25,7 @@ from uavctl.flight.mission import (
     Waypoint,
     advance,
     ask_for,
+    lead,
     over,
     resume,
     stay,
@@ -87,6 +89,58 @@ def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
     assert target.tolist() == [1.0, 0.0]
     assert outlook.nominal
     assert wanted(mission, MissionState(start_ns=0, waypoint=1), DT_NS) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("begins", "ends", "first"),
+    [
+        ((-2.0, -1.5, -1.0), (2.0, 2.0, -2.0), (-2.0, 2.0, -2.0)),  # north has the longer way; down is no matter
+        ((-2.0, 1.5, -1.0), (1.0, -2.0, -2.0), (1.0, 1.5, -2.0)),
+        ((-2.0, -2.0, -1.0), (2.0, 2.0, -1.0), (-2.0, 2.0, -1.0)),  # alike: north follows
+        ((-2.0, -5.2, -1.0), (0.0, 0.0, -1.0), (0.0, -5.0, -1.0)),  # east has to come in by little: it waits there
+        ((-2.0, -5.4, -1.0), (0.0, 0.0, -1.0), (-2.0, 0.0, -1.0)),  # by much: it does not wait
+        ((-5.4, -5.5, -1.0), (0.0, 0.5, -1.0), (0.0, -5.0, -1.0)),  # both
+        ((-2.0, 0.6, -1.0), (2.0, 0.2, -1.0), None),  # one way is short
+        ((1.0, 1.0, -1.0), (1.0, 1.0, -2.0), None),
+    ],
+)
+def test_the_longer_horizontal_way_follows_unless_the_vehicle_may_not_rest_there(
+    begins: Vec3, ends: Vec3, first: Vec3 | None
+) -> None:
+    room = room_of(small_plant(("north", "east", "down")))
+    found = room.first(room.at(begins), room.at(ends))
+    if first is None:
+        assert found is None
+    else:
+        assert found == pytest.approx(room.at(first), abs=1e-9)
+
+
+def test_no_axis_leads_where_there_is_one_or_where_one_goes_up() -> None:
+    for axes in (("north",), ("north", "down")):
+        room = room_of(small_plant(axes))
+        assert room.first(room.at((0.0, 0.0, 0.0)), room.at((3.0, 3.0, 3.0))) is None
+
+
+def test_one_axis_leads_for_a_time_where_the_first_motion_begins_and_never_again() -> None:
+    room = room_of(small_plant(("north", "east")))
+    begin, end, back = (room.at(place) for place in ((0.0, 0.0, 0.0), (3.0, 2.0, 0.0), (-3.0, -2.0, 0.0)))
+    mission = replace(on_a_line(0.0), room=room, lead_ns=2 * DT_NS)
+    at_rest = lead(mission, stay(MissionState(start_ns=0), begin, 0), begin, 0)
+    assert at_rest.led is None  # there is no way to go
+    led = lead(mission, stay(at_rest, end, 3 * DT_NS), begin, 3 * DT_NS)
+    targets = [ask_for(mission, led, number * DT_NS)[0].tolist() for number in (3, 4, 5)]
+    assert targets == [list(room.at((0.0, 2.0, 0.0)))] * 2 + [list(end)]
+    assert wanted(mission, led, 3 * DT_NS) == end
+    ordered = stay(led, back, 4 * DT_NS)
+    assert lead(mission, ordered, begin, 4 * DT_NS) == ordered
+    assert ask_for(mission, ordered, 4 * DT_NS)[0].tolist() == list(back)  # an order is obeyed at once
+    assert ask_for(replace(mission, lead_ns=0), led, 3 * DT_NS)[0].tolist() == list(end)
+
+
+def test_no_axis_leads_on_a_trajectory_or_without_a_room() -> None:
+    state = MissionState(start_ns=0)
+    assert lead(moving_north(8), state, (0.0, 0.0), 0) == state
+    assert lead(on_a_line(1.0), state, (0.0, 0.0), 0) == state
 
 
 def test_a_fence_is_a_line_between_its_samples_and_constant_outside() -> None:

@@ -50,6 +50,7 @@ def build_mission(config: Config, design: Design) -> Mission:
         trajectory=build_trajectory(given.trajectory, design) if given.trajectory.times_s else None,
         fences=tuple(_fence(number, one, design) for number, one in enumerate(config.fence)),
         land=given.then == "land",
+        lead_ns=round(config.envelope.lead_s * NANOSECONDS),
     )
 
 

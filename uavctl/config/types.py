@@ -354,6 +354,15 @@ class EnvelopeConfig(Section, frozen=True, kw_only=True):
             "without it what unexplained_mps2 makes in 0.17 s [m/s]"
         ),
     ] = None
+    lead_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="a flight's first motion begins with the horizontal axis that has the shorter way to go, and "
+            "the other one follows after this time: a frame mirrored along the way shows nothing on it [s]",
+        ),
+    ] = 0.3
 
 
 class Config(Section, frozen=True, kw_only=True):

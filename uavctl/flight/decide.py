@@ -17,7 +17,7 @@ from uavctl.flight.estimator import History, belief_at, estimate, estimated, new
 from uavctl.flight.fallback import End, Fallback
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
-from uavctl.flight.mission import MissionState, advance, ask_for, over
+from uavctl.flight.mission import MissionState, advance, ask_for, lead, over
 from uavctl.flight.orders import obey, told, unready
 from uavctl.flight.planning import ask
 from uavctl.smpc.answer import Outlook
@@ -147,6 +147,7 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
         return Choice(state, "no news: the plan plays out")
     reason = "news: a new plan" if state.order is None else f"news: a new plan, as ordered: {told(state.order)}"
     mission = obey(controller.mission, mission, state.order, base.mean, tick.boundary_ns)
+    mission = lead(controller.mission, mission, base.mean, tick.boundary_ns)
     state = replace(state, mission=mission, order=None)
     target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
     late = min(tick.age_steps or 0, controller.late_steps)

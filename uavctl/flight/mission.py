@@ -17,6 +17,9 @@ from uavctl.smpc.answer import Outlook, Path
 
 Array = NDArray[np.float64]
 
+LEADS_M = 0.5  # of way in each of two horizontal axes: one of them leads
+PUSHED_M = 0.3  # by more than this an axis that may not rest where it is moves from the start, and so it leads
+
 
 @dataclass(frozen=True, eq=False)
 class Waypoint:
@@ -96,6 +99,25 @@ class Room:
         """The equilibrium (n_x,) that a state is braked to, inside the limits."""
         return self._equilibrium(np.clip(self.stop @ np.array(state), self.lower, self.upper))
 
+    def first(self, state: Vector, target: Vector) -> Vector | None:
+        """The equilibrium (n_x,) without the longer horizontal way; None where there are not two of them to go.
+
+        The longer one follows: so it is also flown alone at the end, where the other one has arrived.
+
+        Args:
+            state: Where the motion begins (n_x,).
+            target: Equilibrium to go to (n_x,).
+        """
+        stops, ends = self.stop @ np.array(state), self.stop @ np.array(target)
+        begins = np.clip(stops, self.lower, self.upper)
+        way, pushed = np.abs(ends - begins), np.abs(begins - stops)
+        level = [i for i, axis in enumerate(self.axes) if AXES[axis] != "down"]
+        if len(level) < 2 or not way[level].min() > LEADS_M:
+            return None
+        follows = min(level, key=lambda i: (float(pushed[i]) > PUSHED_M, -float(way[i])))
+        ends[follows] = begins[follows]
+        return self._equilibrium(ends)
+
     def _equilibrium(self, places: Array) -> Vector:
         return tuple((places @ self.rest).tolist())
 
@@ -115,6 +137,7 @@ class Mission:
         trajectory: The motion to follow; None to fly to the waypoints.
         fences: Moving limits.
         land: Whether to land at the end; else the last place is held.
+        lead_ns: Time for which the first motion is that of one horizontal axis alone [ns].
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -127,6 +150,22 @@ class Mission:
     trajectory: Trajectory | None = None
     fences: tuple[Fence, ...] = ()
     land: bool = False
+    lead_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Lead:
+    """The beginning of a flight's first motion.
+
+    Attributes:
+        at_ns: When it began [ns].
+        target: Where it goes to (n_x,).
+        first: Equilibrium (n_x,) of its leading axis alone.
+    """
+
+    at_ns: int
+    target: Vector
+    first: Vector
 
 
 @dataclass(frozen=True)
@@ -140,6 +179,7 @@ class MissionState:
         stay: Equilibrium (n_x,) that the operator ordered instead; None on the mission.
         left_ns: When the mission was left for that [ns]; None on the mission.
         paused_ns: Time that a trajectory has stood still for orders [ns]; fences move on all the same.
+        led: How the first motion began; None before it.
     """
 
     start_ns: int
@@ -148,6 +188,7 @@ class MissionState:
     stay: Vector | None = None
     left_ns: int | None = None
     paused_ns: int = 0
+    led: Lead | None = None
 
 
 def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:
@@ -189,6 +230,24 @@ def resume(state: MissionState, at_ns: int) -> MissionState:
     return replace(state, stay=None, left_ns=None, paused_ns=state.paused_ns + at_ns - state.left_ns)
 
 
+def lead(mission: Mission, state: MissionState, estimate: Vector, at_ns: int) -> MissionState:
+    """Let one horizontal axis lead where a flight's first motion begins at a boundary; once.
+
+    A frame that is mirrored along the way to go shows nothing on that way. Off it, it is found out at once.
+
+    Args:
+        mission: What is asked for.
+        state: State at the boundary, orders taken up.
+        estimate: Estimated state at the boundary (n_x,).
+        at_ns: The boundary [ns].
+    """
+    if state.led is not None or mission.room is None or (mission.trajectory is not None and state.stay is None):
+        return state
+    target = wanted(mission, state, at_ns)
+    first = mission.room.first(estimate, target)
+    return state if first is None else replace(state, led=Lead(at_ns, target, first))
+
+
 def over(mission: Mission, state: MissionState, at_ns: int) -> bool:
     """Whether all of the mission has been flown, the last waypoint's time too."""
     if state.stay is not None:
@@ -212,6 +271,9 @@ def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Outlook]:
     """Question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
     limits = _limits(mission, at_ns - state.start_ns)
+    led = state.led
+    if led is not None and at_ns - led.at_ns < mission.lead_ns and led.target == wanted(mission, state, at_ns):
+        return np.array(led.first), Outlook(limits=limits)
     if state.stay is not None:
         return np.array(state.stay), Outlook(limits=limits)
     motion = mission.trajectory
