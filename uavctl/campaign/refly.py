@@ -151,6 +151,7 @@ def flight_config(config: Config, start: Array, steps: int, name: str, seed: int
         fallback=replace(
             config.fallback, brake_s=_NEVER, hold_s=_NEVER, blind_hold_s=_NEVER, land=False, recover_samples=1
         ),
+        envelope=replace(config.envelope, lead_s=0.0),
         limits=replace(config.limits, accel_mps2=tuple(accel_mps2), slew_mps3=_NEVER),
         sim=replace(
             sim,
