@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, read, table
 
+from uavctl.build import build_problem
 from uavctl.campaign.cells import cell_of, cells_of, document, told
 from uavctl.campaign.chance import draw
 from uavctl.campaign.controllers import TUNING_FIRST, build, built
 from uavctl.campaign.links import newest
-from uavctl.campaign.setting import Met, met, problem_of, start_of
+from uavctl.campaign.setting import Met, met, start_of
 from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.tasks import tasks_of
 from uavctl.campaign.world import fly
@@ -55,7 +56,7 @@ def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> No
     assert weak.recipe.config.link.loss == 0.1 and weak.setting.link.loss == 0.6
     assert met(first.setting, 0, 1).scene.plant.b[1, 0] == 0.39
     assert met(weak.setting, 0, 1).scene.plant.b[1, 0] == 0.2
-    assert problem_of(weak.recipe.config).plant.b[1, 0] == 0.39
+    assert build_problem(weak.recipe.config).plant.b[1, 0] == 0.39
 
 
 def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
@@ -135,7 +136,7 @@ def test_the_worst_case_delay_is_tau_with_the_promised_likelihoods(tmp_path: Pat
     (found,) = cells(tmp_path, 'set = ["smpc.tau=3"]\n', controller("worst-case-delay"))
     config, recipe = load_config("paper", ["smpc.tau=3"]), found.recipe
     assert recipe is not None
-    own, problem = build(recipe), problem_of(config)
+    own, problem = build(recipe), build_problem(config)
     expected = WorstCaseDelay(problem, 3, kappa(0.95, 4, 8, "ellipsoid"), kappa(0.9, 2, 4, "ellipsoid"))
     meets = met(found.setting, 0, 5)
     one, other = (fly(meets.scene, each, meets.newest, meets.disturbances) for each in (own, expected))
@@ -150,7 +151,7 @@ def test_a_margin_goes_to_the_plans_that_it_is_for(tmp_path: Path) -> None:
     without, own = (
         fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances) for cell in found if cell.recipe
     )
-    expected = PacketisedPredictive(problem_of(load_config("paper")), 3.0)
+    expected = PacketisedPredictive(build_problem(load_config("paper")), 3.0)
     np.testing.assert_array_equal(own.inputs, fly(meets.scene, expected, meets.newest, meets.disturbances).inputs)
     assert np.abs(own.inputs - without.inputs).max() > 0.1
 

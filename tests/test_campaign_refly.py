@@ -49,7 +49,9 @@ def flown(link: LinkConfig, number: int, *changes: str) -> Again:
         plant, DESIGN.state_set, DESIGN.input_set, DESIGN.q_x, DESIGN.q_u, DESIGN.target, np.zeros(2), start[None]
     )
     solver = LibrarySolver(DESIGN, library_for(DESIGN).library)
-    controller = BatchSmpc(DESIGN, OneByOne(solver, DESIGN.target, (DESIGN.horizon, 2)), believed, 0.5)
+    controller = BatchSmpc(
+        OneByOne(solver, DESIGN.target, (DESIGN.horizon, 2)), believed, DESIGN.horizon, len(DESIGN.late), 0.5
+    )
     found = fly(scene, controller, known, w)
     return Again(BASE, true.plant, start, known[0], w[0], found, "test", 5)
 

@@ -200,7 +200,7 @@ def test_plans_play_out_fail_and_run_out() -> None:
     """News in steps 0, 1, 4, then silence: plan 1, plan 2 played to step 3, no plan in step 4, then the brake."""
     given = config()
     design, plant = build_design(given), build_plant(given)
-    pilot = BatchSmpc(design, _Numbered(design.horizon), plant, brake_gain_1ps=0.5)
+    pilot = BatchSmpc(_Numbered(design.horizon), plant, design.horizon, len(design.late), brake_gain_1ps=0.5)
     pilot.begin(1)
     known = [0, 1, 1, 1, *[4] * 14]
     state, asked = np.array([[1.0, 2.0, 3.0, -4.0]]), []

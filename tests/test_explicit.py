@@ -240,7 +240,7 @@ def flown(decider: Decider) -> tuple[Flown, Tally]:
     chances = draw(21, 0, runs, steps, plant.n_w)
     start = np.tile([35.0, -2.0, -20.0, -4.0], (runs, 1))
     scene = Scene(plant, design.state_set, design.input_set, design.q_x, design.q_u, design.target, np.zeros(2), start)
-    controller = BatchSmpc(design, decider, plant, 0.5)
+    controller = BatchSmpc(decider, plant, design.horizon, len(design.late), 0.5)
     known = newest(config.link, config.plant.dt_s, chances.link)
     result = fly(scene, controller, known, chances.normal @ np.linalg.cholesky(plant.w).T)
     return result, controller.tally

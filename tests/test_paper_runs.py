@@ -45,7 +45,7 @@ def directly(setup: Setup) -> tuple[Flown, BatchSmpc]:
         plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
         np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
     )  # fmt: skip
-    smpc = BatchSmpc(design, OneByOne(LibrarySolver(design, setup.library), np.zeros(4), (12, 2)), plant, 0.5)
+    smpc = BatchSmpc(OneByOne(LibrarySolver(design, setup.library), np.zeros(4), (12, 2)), plant, 12, 0, 0.5)
     w = chances.normal * np.sqrt(0.6)
     return fly(scene, smpc, newest(setup.config.link, 1.0, chances.link), w), smpc
 

@@ -10,9 +10,8 @@ from loopback_rig import Memory
 from whatif_rig import PAPER, config_of, far, flown, history
 
 from sim.vehicle import linear_model
-from uavctl.build import build_controller
+from uavctl.build import build_controller, build_problem
 from uavctl.campaign.controllers import build, recipe_for
-from uavctl.campaign.setting import problem_of
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
 from uavctl.data import Plan, Truth
 from uavctl.smpc.batch import News
@@ -26,8 +25,8 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: Kind) -> None:
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
     recipe = recipe_for(spec, config, campaign, lambda *_: None)
-    solver = BaselineSolver(kind, lambda target: (problem_of(config), build(recipe)))
-    alone, problem = build(recipe), problem_of(config)
+    solver = BaselineSolver(kind, lambda target: (build_problem(config), build(recipe)))
+    alone, problem = build(recipe), build_problem(config)
     alone.begin(1)
     low, high = problem.input_set.bounds
     acted = np.zeros((1, 0, 2))
@@ -54,7 +53,7 @@ def test_a_baseline_flies_and_its_plans_say_so() -> None:
     spec = ControllerSpec(name="lqg", kind="lqg")
     recipe = recipe_for(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)), lambda *_: None)
     controller = build_controller(config)
-    solver = BaselineSolver("lqg", lambda target: (problem_of(config), build(recipe)))
+    solver = BaselineSolver("lqg", lambda target: (build_problem(config), build(recipe)))
     memory = Memory()
     fly(
         history(PAPER),

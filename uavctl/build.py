@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.build_late import build_delayed_link, late_steps
 from uavctl.build_link import promised
-from uavctl.build_mission import build_mission, build_names
+from uavctl.build_mission import build_mission, build_names, build_rests
 from uavctl.config.types import Config
 from uavctl.data import Vec3
 from uavctl.errors import DesignError
@@ -22,8 +23,11 @@ from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.reach import GateParameters
 from uavctl.library_store import library_for
 from uavctl.smpc.answer import Solver
+from uavctl.smpc.baselines.problem import Problem
+from uavctl.smpc.conditioned import ConditionedSolver
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.equilibria import equilibria
 from uavctl.smpc.feasibility import check_schedule, optimal_cost
 from uavctl.smpc.innovation import innovations
 from uavctl.smpc.late import with_late
@@ -112,6 +116,40 @@ def build_spec(config: Config) -> DesignSpec:
     )
 
 
+def build_problem(config: Config) -> Problem:
+    """The control problem of a configuration, without a scheme.
+
+    Raises:
+        DesignError: The plant is none, or cannot rest at the target.
+    """
+    plant, sets = build_plant(config), config.sets
+    q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
+    rests = equilibria(plant.a, plant.b, q_x, q_u, np.array(plant.position_index, dtype=np.intp))
+    target = plant.equilibrium(config.target.position_m)
+    return Problem(
+        plant=plant,
+        state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
+        input_set=Polytope.from_box(sets.input_lower, sets.input_upper),
+        q_x=q_x,
+        q_u=q_u,
+        target=target,
+        u_target=rests.u_eq @ target[rests.held],
+        horizon=config.smpc.horizon,
+        slack_linear=config.smpc.slack_linear,
+        slack_quadratic=config.smpc.slack_quadratic,
+    )
+
+
+def build_conditioned(config: Config) -> ConditionedSolver:
+    """The solver of the scheme with risk conditioned on the age.
+
+    Raises:
+        DesignError: See `build_problem` and `ConditionedSolver`.
+    """
+    problem = replace(build_problem(config), input_set=_planned_inputs(config))
+    return ConditionedSolver(problem, build_delayed_link(config), 1.0 - config.smpc.delta_x)
+
+
 def _planned_inputs(config: Config) -> Polytope:
     """U of the plans: what is flown against a bias of up to bias_max stays free, and both together keep the limits."""
     free = config.estimator.bias_max
@@ -146,7 +184,7 @@ def build_design(config: Config) -> Design:
 
 
 def build_solver(design: Design, config: Config, library: Library | None = None) -> Solver:
-    """The solver of `solver.method`.
+    """The solver of `smpc.scheme` and `solver.method`.
 
     Args:
         design: The design.
@@ -156,6 +194,8 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     Raises:
         DesignError: The design does not fit the solver, or the library does not fit the design.
     """
+    if config.conditioned:
+        return build_conditioned(config)
     if config.solver.method == "library":
         found = library_for(design).library if library is None else library
         solver = LibrarySolver(design, found, exact=config.solver.exact)
@@ -172,6 +212,15 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     from uavctl.smpc.printed import PrintedSolver  # CVXPY takes long to load, and nothing else here needs it
 
     return PrintedSolver(design)
+
+
+def resting(config: Config, design: Design) -> NDArray[np.float64]:
+    """Right sides (m_x,) of the state rows, less what a plan of the scheme keeps from them that rests.
+
+    Raises:
+        DesignError: See `build_conditioned`.
+    """
+    return build_conditioned(config).rests(design.estimate_cov) if config.conditioned else build_rests(design)
 
 
 def build_estimator(config: Config) -> EstimatorParameters:
@@ -242,10 +291,10 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
         design_id=design.design_id,
         horizon=design.horizon,
         solver=build_solver(design, config, library),
-        mission=build_mission(config, design),
+        mission=build_mission(config, design, resting(config, design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
-        late_steps=len(design.late),
+        late_steps=design.horizon if config.conditioned else len(design.late),
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
         fallback=FallbackParameters(

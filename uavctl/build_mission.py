@@ -23,8 +23,13 @@ NANOSECONDS = 1e9
 _ROUNDING = 1e-9
 
 
-def build_mission(config: Config, design: Design) -> Mission:
+def build_mission(config: Config, design: Design, rests: Array) -> Mission:
     """Waypoints or trajectory, and fences; without any, `target.position_m` is held.
+
+    Args:
+        config: The configuration.
+        design: Its design.
+        rests: Right sides (m_x,) of the state rows, less what a plan keeps from them that rests.
 
     Raises:
         DesignError: The plant cannot rest or move there, or a fence limits what has no limit.
@@ -36,7 +41,7 @@ def build_mission(config: Config, design: Design) -> Mission:
         design.state_set.b,
         horizon=design.horizon,
         dt_ns=round(plant.dt_s * NANOSECONDS),
-        room=_resting(design),
+        room=_resting(design, rests),
     )
     if given.waypoints:
         holds_s = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,) * len(given.waypoints)
@@ -47,7 +52,7 @@ def build_mission(config: Config, design: Design) -> Mission:
         mission = replace(mission, waypoints=waypoints, accept_m=given.accept_m)
     return replace(
         mission,
-        trajectory=build_trajectory(given.trajectory, design) if given.trajectory.times_s else None,
+        trajectory=build_trajectory(given.trajectory, design, rests) if given.trajectory.times_s else None,
         fences=tuple(_fence(number, one, design) for number, one in enumerate(config.fence)),
         land=given.then == "land",
         lead_ns=round(config.envelope.lead_s * NANOSECONDS),
@@ -60,8 +65,10 @@ def build_names(design: Design) -> Names:
     return names_of(design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index)
 
 
-def build_trajectory(given: TrajectoryConfig, design: Design) -> Trajectory:
+def build_trajectory(given: TrajectoryConfig, design: Design, rests: Array) -> Trajectory:
     """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
+
+    For `rests` see `build_mission`.
 
     Raises:
         DesignError: The motion leaves the state limits.
@@ -85,31 +92,36 @@ def build_trajectory(given: TrajectoryConfig, design: Design) -> Trajectory:
         )
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
-    return along(plant, motion, design.horizon, design.horizon - design.terminal.tau, *_room(design))
+    return along(plant, motion, design.horizon, design.horizon - design.terminal.tau, *_room(design, rests))
 
 
-def _resting(design: Design) -> Room | None:
+def build_rests(design: Design) -> Array:
+    """Right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
+    rests = design.state_set.b.copy()
+    for part in decompose(design):
+        rests[part.rows_x] -= terminal_backoff_x(design, part)
+    return rests
+
+
+def _resting(design: Design, rests: Array) -> Room | None:
     try:
-        return room(design.plant, design.horizon - design.terminal.tau, *_room(design))
+        return room(design.plant, design.horizon - design.terminal.tau, *_room(design, rests))
     except DesignError:
         return None
 
 
-def _room(design: Design) -> tuple[Array, Array]:
-    """Least and largest place to rest at of each axis [m]: the terminal set fits the constant limits there."""
+def _room(design: Design, rests: Array) -> tuple[Array, Array]:
+    """Least and largest place to rest at of each axis [m]."""
     index = design.plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
-    for part in decompose(design):
-        room = part.b_x - terminal_backoff_x(design, part)
-        for c, side in zip(part.c_x, room, strict=True):
-            (used,) = np.nonzero(c)
-            state = int(part.states[used[0]])
-            if used.size == 1 and state in index:
-                axis, place = index.index(state), side / c[used[0]]
-                if c[used[0]] > 0:
-                    upper[axis] = min(upper[axis], place)
-                else:
-                    lower[axis] = max(lower[axis], place)
+    for c, side in zip(design.state_set.c, rests, strict=True):
+        (used,) = np.nonzero(c)
+        if used.size == 1 and used[0] in index:
+            axis, place = index.index(int(used[0])), side / c[used[0]]
+            if c[used[0]] > 0:
+                upper[axis] = min(upper[axis], place)
+            else:
+                lower[axis] = max(lower[axis], place)
     return lower, upper
 
 

@@ -11,6 +11,7 @@ from uavctl import __version__
 from uavctl.campaign.compose import Campaign
 from uavctl.campaign.controllers import LibraryFor, Recipe, recipe_for
 from uavctl.campaign.setting import Setting, met
+from uavctl.campaign.verdict import SMPC
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import PidGains
@@ -114,7 +115,7 @@ def told(cell: Cell) -> dict[str, object]:
     """What `campaign.json` holds of a cell."""
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
     design = None if recipe is None else recipe.design
-    smpc = None if recipe is None or design is None else recipe.config.smpc
+    smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
     return {
         "index": cell.index,
         "controller": controller,

@@ -11,16 +11,18 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from uavctl.build import build_design, build_plant, build_solver
-from uavctl.campaign.setting import Setting, met, problem_of, start_of
+from uavctl.build import build_conditioned, build_design, build_plant, build_problem, build_solver
+from uavctl.campaign.setting import Setting, met, start_of
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
 from uavctl.config import Config
 from uavctl.library_bytes import StoredLibrary, decode
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.baselines import (
     CascadedPid,
+    Governor,
     HoldLast,
     Lqg,
+    MeanQp,
     PacketisedPredictive,
     PidGains,
     WorstCaseDelay,
@@ -29,6 +31,7 @@ from uavctl.smpc.baselines import (
 )
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.batch_smpc import BatchSmpc, Decider, OneByOne
+from uavctl.smpc.conditioned import ConditionedDecider
 from uavctl.smpc.design import Design
 from uavctl.smpc.explicit import ExplicitDecider
 from uavctl.smpc.library import Library
@@ -49,7 +52,7 @@ class Recipe:
         key: Hash of all the others.
         kind: What it is.
         config: The configuration that it believes in.
-        design: Its design, of the SMPC.
+        design: Its design, of the SMPC with scheme `hahn-stursberg`.
         library: Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`.
         library_id: The library's hash.
         gains: The gains of a PID.
@@ -79,7 +82,7 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
         DesignError: There is no such controller.
     """
     made = Recipe("", given.kind, config, margin=given.margin)
-    if given.kind == "smpc":
+    if given.kind == "smpc" and not config.conditioned:
         design = build_design(config)
         stored = library_for(config, design)
         if stored is None:
@@ -89,8 +92,8 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
     elif given.kind == "pid":
         made = replace(made, gains=_tuned(config, spec))
     made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
-    if given.kind != "smpc":
-        build(made)  # a baseline is refused here, not in a worker
+    if made.design is None:
+        build(made)  # what needs no design is refused here, not in a worker
     return made
 
 
@@ -103,11 +106,15 @@ def build(recipe: Recipe) -> BatchController:
     config = recipe.config
     if recipe.kind == "smpc":
         return _smpc(recipe)
-    problem = problem_of(config)
+    problem = build_problem(config)
     if recipe.kind == "lqg":
         return Lqg(problem)
     if recipe.kind == "packetised":
         return PacketisedPredictive(problem, recipe.margin)
+    if recipe.kind == "mean-qp":
+        return MeanQp(problem, recipe.margin)
+    if recipe.kind == "governor":
+        return Governor(problem, recipe.margin)
     if recipe.kind == "hold-last":
         return HoldLast(problem, recipe.margin)
     if recipe.kind == "zero-on-loss":
@@ -136,12 +143,16 @@ def built(recipe: Recipe) -> BatchController:
 
 
 def _smpc(recipe: Recipe) -> BatchSmpc:
-    config, design = recipe.config, recipe.design
+    config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
+    brake_gain_1ps = config.fallback.brake_gain_1ps
+    if config.conditioned:
+        solver, steps = build_conditioned(config), config.smpc.horizon
+        return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
     if design is None:
         raise ValueError("an SMPC without a design")
     library = None if recipe.library is None else decode(recipe.library).library
     decider = _decider(design, library, build_solver(design, config, library))
-    return BatchSmpc(design, decider, build_plant(config), config.fallback.brake_gain_1ps)
+    return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 
 def _decider(design: Design, library: Library | None, solver: Solver) -> Decider:
@@ -156,4 +167,4 @@ def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
     believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
     meets = met(believed, TUNING_FIRST, TUNING_RUNS)
     start = start_of(spec, config)
-    return tune(problem_of(config), np.asarray(start), meets.newest, meets.disturbances)
+    return tune(build_problem(config), np.asarray(start), meets.newest, meets.disturbances)

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_plant, start_state
+from uavctl.build import build_plant, build_problem, start_state
 from uavctl.campaign.chance import draw
 from uavctl.campaign.disturbances import disturbances
 from uavctl.campaign.links import newest
@@ -17,10 +17,7 @@ from uavctl.campaign.world import Scene
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
-from uavctl.smpc.baselines import Problem
 from uavctl.smpc.batch import Counts
-from uavctl.smpc.equilibria import equilibria
-from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
 
@@ -68,7 +65,7 @@ def met(setting: Setting, first: int, runs: int) -> Met:
         DesignError: The plant that flies is none.
     """
     spec, flown = setting.spec, msgspec.structs.replace(setting.base, plant=setting.plant)
-    plant, judged = build_plant(flown), problem_of(setting.base)
+    plant, judged = build_plant(flown), build_problem(setting.base)
     chances = draw(spec.master, first, runs, spec.steps, plant.n_w)
     scene = Scene(
         plant=plant,
@@ -84,30 +81,6 @@ def met(setting: Setting, first: int, runs: int) -> Met:
         scene,
         newest(setting.link, plant.dt_s, chances.link),
         disturbances(setting.disturbance, plant.w, chances.normal),
-    )
-
-
-def problem_of(config: Config) -> Problem:
-    """The control problem of a configuration, as baselines are given it.
-
-    Raises:
-        DesignError: The plant is none, or cannot rest at the target.
-    """
-    plant, sets = build_plant(config), config.sets
-    q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
-    rests = equilibria(plant.a, plant.b, q_x, q_u, np.array(plant.position_index, dtype=np.intp))
-    target = plant.equilibrium(config.target.position_m)
-    return Problem(
-        plant=plant,
-        state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
-        input_set=Polytope.from_box(sets.input_lower, sets.input_upper),
-        q_x=q_x,
-        q_u=q_u,
-        target=target,
-        u_target=rests.u_eq @ target[rests.held],
-        horizon=config.smpc.horizon,
-        slack_linear=config.smpc.slack_linear,
-        slack_quadratic=config.smpc.slack_quadratic,
     )
 
 

@@ -13,7 +13,9 @@ from uavctl.config.section import LARGEST_PLANT, LARGEST_SEED, Floats, Rows, Sec
 
 TRUE = "true"  # a controller that believes in the link it flies on
 
-Kind = Literal["smpc", "lqg", "packetised", "worst-case-delay", "hold-last", "zero-on-loss", "pid"]
+Kind = Literal[
+    "smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid"
+]
 Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
@@ -42,7 +44,8 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
             ge=0,
             le=1000,
             description="with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, "
-            "in standard deviations of one step's disturbance",
+            "in standard deviations of one step's disturbance; with `mean-qp` and `governor`: in those of a prediction "
+            "as old as the stage",
         ),
     ] = 0.0
 

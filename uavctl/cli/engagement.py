@@ -6,6 +6,7 @@ import math
 
 from rich.markup import escape
 
+from uavctl.build import resting
 from uavctl.build_mission import build_mission
 from uavctl.cli.common import messages
 from uavctl.config import Config
@@ -121,7 +122,7 @@ def check_places(config: Config, design: Design, take_off_m: float | None, goal:
         raise UsageError("--takeoff: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
     if take_off_m is None and goal is None:
         return
-    room = build_mission(config, design).room
+    room = build_mission(config, design, resting(config, design)).room
     if room is None:
         raise UsageError("--takeoff, --goto: this plant cannot rest wherever it is sent; see plant")
     why = "" if goal is None else room.refusal(goal)

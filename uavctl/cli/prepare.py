@@ -48,7 +48,7 @@ def prepare(config: Config, design: Design) -> Prepared:
 
 def ready_library(config: Config, design: Design) -> StoredLibrary | None:
     """The policy library of a design, if `solver.method` asks for one: from the cache, or made under a progress bar."""
-    if config.solver.method != "library":
+    if not config.uses_library:
         return None
     with ExitStack() as stack:
         bar: list[Callable[[str], None]] = []  # from the first round on: there is none for what the cache holds

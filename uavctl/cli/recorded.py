@@ -26,7 +26,7 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
         RecordingError: It carries no policy library though it flew with one, or one that does not fit.
     """
     design = build_design(config)
-    if config.solver.method != "library":
+    if not config.uses_library:
         return prepare(config, design)
     try:
         return _with_library(flight, config, design)
@@ -46,7 +46,7 @@ def changed_flyer(flight: Path, before: Config, loaded: Loaded) -> Prepared:
     config = loaded.config
     with located(loaded):
         design = build_design(config)
-        if config.solver.method == before.solver.method == "library":
+        if config.uses_library and before.uses_library:
             with suppress(LibraryError):
                 return _with_library(flight, config, design)
         return prepare(config, design)

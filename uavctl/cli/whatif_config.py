@@ -11,9 +11,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from sim.vehicle import LinearModel, linear_model
-from uavctl.build import build_design
+from uavctl.build import build_design, build_problem
 from uavctl.campaign.controllers import build, recipe_for
-from uavctl.campaign.setting import problem_of
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
 from uavctl.cli.common import located
 from uavctl.cli.prepare import Prepared, prepare, ready_library
@@ -117,7 +116,7 @@ def baseline_flyer(loaded: Loaded, kind: Kind, start: Array) -> Prepared:
 
     def make(target: Array) -> tuple[Problem, BatchController]:
         there = replace(config, target=TargetConfig(position_m=_place(config.plant.axes, prepared, target)))
-        return problem_of(there), build(dataclasses.replace(recipe, config=there))
+        return build_problem(there), build(dataclasses.replace(recipe, config=there))
 
     controller = dataclasses.replace(prepared.controller, solver=BaselineSolver(kind, make))
     return dataclasses.replace(prepared, controller=controller)

@@ -101,9 +101,19 @@ class CostConfig(Section, frozen=True, kw_only=True):
     input: Annotated[Weights, Meta(max_length=3, description="diagonal of Q_u (n_u)")]
 
 
-class SmpcConfig(Section, frozen=True, kw_only=True):
-    """The paper's scheme."""
+Scheme = Literal["hahn-stursberg", "age-conditioned"]
 
+
+class SmpcConfig(Section, frozen=True, kw_only=True):
+    """The predictive controller."""
+
+    scheme: Annotated[
+        Scheme,
+        Meta(
+            description="`hahn-stursberg`: the paper's, with planned feedback, its library and terminal law; "
+            "`age-conditioned`: plans without feedback, back-offs by the age of information, the regulator's tail"
+        ),
+    ] = "hahn-stursberg"
     horizon: Annotated[
         int,
         Meta(
@@ -395,3 +405,13 @@ class Config(Section, frozen=True, kw_only=True):
     log: LogConfig = LogConfig()
     mission: MissionConfig = MissionConfig()
     fence: Annotated[tuple[FenceConfig, ...], Meta(max_length=50, description="limits that change in flight")] = ()
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether plans are made by the scheme with risk conditioned on the age."""
+        return self.smpc.scheme == "age-conditioned"
+
+    @property
+    def uses_library(self) -> bool:
+        """Whether plans come from a policy library."""
+        return self.solver.method == "library" and not self.conditioned

@@ -151,7 +151,7 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
     state = replace(state, mission=mission, order=None)
     target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
     late = min(tick.age_steps or 0, controller.late_steps)
-    outlook = Outlook(limits=outlook.limits, path=outlook.path, late=late)
+    outlook = Outlook(limits=outlook.limits, path=outlook.path, late=late, cov=np.array(base.cov))
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_plant, start_state
+from uavctl.build import build_plant, build_problem, start_state
 from uavctl.campaign.chance import draw
 from uavctl.campaign.links import newest
-from uavctl.campaign.setting import problem_of
 from uavctl.campaign.world import Flown, Scene, fly
 from uavctl.config import Config
 from uavctl.smpc.batch import BatchController
@@ -98,7 +97,9 @@ class Pilot:
         else:
             decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
         self._watched = Watched(decider, design)
-        self._smpc = BatchSmpc(design, self._watched, build_plant(config), config.fallback.brake_gain_1ps)
+        self._smpc = BatchSmpc(
+            self._watched, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
+        )
 
     def fly(self, seed: int, first: int, runs: int, steps: int) -> Chunk:
         """The runs `first` … `first` + `runs` - 1 of a seed, whatever else is flown."""
@@ -129,7 +130,7 @@ def fly_runs(
         steps: T.
         input_set: The actuators' limits; those of the configuration if it is not given.
     """
-    config, problem = setup.config, problem_of(setup.config)
+    config, problem = setup.config, build_problem(setup.config)
     plant = problem.plant
     chances = draw(seed, runs.start, len(runs), steps, plant.n_w)
     scene = Scene(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.campaign.setting import problem_of
+from uavctl.build import build_problem
 from uavctl.paper.flights import Setup, fly_runs, planes
 from uavctl.paper.result import WorstCase
 from uavctl.smpc.baselines.lqg import Lqg
@@ -23,7 +23,7 @@ def worst_case(setup: Setup, seed: int, runs: int, steps: int) -> WorstCase:
     """MPC for a constant delay of τ, with the likelihoods of the constraints themselves."""
     design, smpc = setup.design, setup.config.smpc
     controller = WorstCaseDelay(
-        problem_of(setup.config),
+        build_problem(setup.config),
         smpc.tau,
         kappa(smpc.delta_x, design.plant.n_x, design.state_set.b.size, "ellipsoid"),
         kappa(smpc.delta_u, design.plant.n_u, design.input_set.b.size, "ellipsoid"),
@@ -44,7 +44,7 @@ def lqg_asking(setup: Setup, seed: int, runs: int, steps: int) -> float:
     """Share of settled steps and inputs in which LQG breaks the input limits, where nothing stops it from doing so."""
     limits = setup.design.input_set
     open_sides = Polytope(limits.c, np.full(limits.b.size, np.inf))
-    problem = replace(problem_of(setup.config), input_set=open_sides)
+    problem = replace(build_problem(setup.config), input_set=open_sides)
     flown = fly_runs(setup, Lqg(problem), seed, range(runs), steps, open_sides)
     beyond = flown.asked[:, steps // 2 :] @ limits.c.T > limits.b  # opposite rows are never broken together
     return float(beyond.sum() / flown.asked[:, steps // 2 :].size)

@@ -35,11 +35,13 @@ class Outlook:
             last τ + 1 stages holds for the reference.
         path: Trajectory to follow; None: stay at the target.
         late: Age of the position that the state was predicted from [steps].
+        cov: Covariance of the state estimate's error (n_x, n_x); None: the design's.
     """
 
     limits: Array | None = None
     path: Path | None = None
     late: int = 0
+    cov: Array | None = None
 
     @property
     def nominal(self) -> bool:
@@ -52,7 +54,7 @@ NOMINAL = Outlook()
 
 def finite(x: Array, target: Array, outlook: Outlook) -> bool:
     """Whether a question is made of finite numbers."""
-    given = [x, target]
+    given = [x, target] if outlook.cov is None else [x, target, outlook.cov]
     if outlook.limits is not None:
         given.append(outlook.limits)
     if outlook.path is not None:

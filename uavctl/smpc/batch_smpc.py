@@ -12,7 +12,6 @@ from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer, Outlook, Solver
 from uavctl.smpc.assemble import KEPT
 from uavctl.smpc.batch import News, predict
-from uavctl.smpc.design import Design
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -104,21 +103,23 @@ class BatchSmpc:
     played out; where it has run out, the predicted velocity is braked until a plan is there again.
 
     Args:
-        design: The design.
         decider: Who plans.
-        plant: The plant that is predicted with; the design's own may be an estimator's.
+        plant: The plant that is predicted with; a design's own may be an estimator's.
+        horizon: H [steps].
+        late: Age up to which the decider counts what it has not seen since [steps].
         brake_gain_1ps: Deceleration per predicted speed once no plan is left [1/s].
     """
 
-    def __init__(self, design: Design, decider: Decider, plant: Plant, brake_gain_1ps: float) -> None:
-        self._design, self._decider, self._plant = design, decider, plant
+    def __init__(self, decider: Decider, plant: Plant, horizon: int, late: int, brake_gain_1ps: float) -> None:
+        self._decider, self._plant = decider, plant
+        self._horizon, self._late = horizon, late
         self._brake = brake_gain_1ps
         self._input_of_accel = np.linalg.pinv(plant.accel_map)
         self.begin(0)
 
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
-        steps, n_u = self._design.horizon, self._design.plant.n_u
+        steps, n_u = self._horizon, self._plant.n_u
         self._plans = np.zeros((runs, steps, n_u))
         self._made = np.full(runs, -steps, dtype=np.intp)  # step of the plan's first input
         self._captured = np.full(runs, -1, dtype=np.intp)
@@ -126,16 +127,16 @@ class BatchSmpc:
 
     def act(self, news: News) -> Array:
         """See `BatchController`."""
-        steps, age = self._design.horizon, news.age
+        steps, age = self._horizon, news.age
         x = predict(self._plant, news)
         fresh = (news.newest > self._captured) & (age < steps) & np.isfinite(x).all(axis=1)
-        late = np.minimum(age, len(self._design.late))
+        late = np.minimum(age, self._late)
         for j in np.unique(late[fresh]):
             self._replan(news, x, np.flatnonzero(fresh & (late == j)), int(j))
         index = news.step - self._made
         playing = (index < steps) & (age < steps)
         self._made[~playing] = -steps
-        asked = np.zeros((x.shape[0], self._design.plant.n_u))
+        asked = np.zeros((x.shape[0], self._plant.n_u))
         (who,) = np.nonzero(playing)
         asked[who] = self._plans[who, index[who]]
         (lost,) = np.nonzero(~playing)

@@ -53,7 +53,7 @@ class _PartMpc:
 
     def __init__(self, problem: Problem, law: Lqr, part: Part, sides_x: Array, sides_u: Array) -> None:
         self.states, self.inputs, self._steps = part.states, part.inputs, problem.horizon
-        states_of, inputs_of = _rollout(problem, law, part)
+        states_of, inputs_of = regulated(problem, law, part)
         n_x = part.states.size
         of_x = np.einsum("mi,tij->tmj", problem.state_set.c[np.ix_(part.rows_x, part.states)], states_of[1:])
         of_u = np.einsum("mi,tij->tmj", problem.input_set.c[np.ix_(part.rows_u, part.inputs)], inputs_of)
@@ -91,8 +91,11 @@ class _PartMpc:
         return nothing if solved is None else solved[0]
 
 
-def _rollout(problem: Problem, law: Lqr, part: Part) -> tuple[Array, Array]:
-    """x_t (H+1, n_x, n_x + H n_u) and u_t (H, n_u, …) as maps of (x, z), z = L'c with L L' = R + B'PB."""
+def regulated(problem: Problem, law: Lqr, part: Part) -> tuple[Array, Array]:
+    """Regulated predictions: x_t (H+1, n_x, n_x + H n_u) and u_t (H, n_u, …) as maps of (x, z), z = L'c.
+
+    L L' = R + B'PB, and c is what is added to the regulator's inputs.
+    """
     plant, steps = problem.plant, problem.horizon
     n_x, n_u = part.states.size, part.inputs.size
     a, b = plant.a[np.ix_(part.states, part.states)], plant.b[np.ix_(part.states, part.inputs)]

@@ -28,10 +28,14 @@ class _OnReceipt(ABC):
 
     def __init__(self, problem: Problem, margin: float = 0.0) -> None:
         self._problem = problem
-        plant = problem.plant
-        step = plant.e @ plant.w @ plant.e.T
-        self._mpc = BatchMpc(problem, margin * deviations(problem.state_set, step))
+        self._mpc = self._planner(margin)
         self.begin(0)
+
+    def _planner(self, margin: float) -> BatchMpc:
+        """Who plans."""
+        plant = self._problem.plant
+        step = plant.e @ plant.w @ plant.e.T
+        return BatchMpc(self._problem, margin * deviations(self._problem.state_set, step))
 
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
@@ -78,3 +82,25 @@ class ZeroOnLoss(_OnReceipt):
 
     def _played(self, index: Index, /) -> Array:
         return np.where((index == 0)[:, None], self._plans[:, 0], self._problem.u_target)
+
+
+class MeanQp(PacketisedPredictive):
+    """Packetised predictive control with open-loop back-offs: stage t keeps κ σ_t from the state limits.
+
+    σ_t is the standard deviation of a prediction over t steps, and κ the same at every age, however likely it is.
+
+    Args:
+        problem: The problem.
+        margin: κ.
+
+    Raises:
+        DesignError: The plant has no regulator.
+    """
+
+    def _planner(self, margin: float) -> BatchMpc:
+        plant, backoffs = self._problem.plant, [np.zeros(self._problem.state_set.b.size)]
+        spread = np.zeros((plant.n_x, plant.n_x))
+        for _ in range(self._problem.horizon):
+            spread = plant.a @ spread @ plant.a.T + plant.e @ plant.w @ plant.e.T
+            backoffs.append(margin * deviations(self._problem.state_set, spread))
+        return BatchMpc(self._problem, np.array(backoffs))

@@ -1,0 +1,261 @@
+"""Risk conditioned on the age: against the same problem in CVXPY, against its own promise, against chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from baseline_rig import PAPER_START, arrivals, flown, noise, problem, unlimited
+from numpy.typing import NDArray
+from scipy.stats import binomtest, norm
+
+from uavctl.data import SolveStatus
+from uavctl.errors import DesignError
+from uavctl.smpc.answer import NOMINAL, Answer, Outlook, Path
+from uavctl.smpc.baselines import PacketisedPredictive, Problem
+from uavctl.smpc.batch_smpc import BatchSmpc
+from uavctl.smpc.conditioned import METHOD, ConditionedDecider, ConditionedSolver, age_risk
+from uavctl.smpc.link import bernoulli, gilbert_elliott
+from uavctl.smpc.lqg_bound import lqr
+
+Array = NDArray[np.float64]
+LOSS, ALLOWED = 0.3, 0.05
+LINK = bernoulli(np.array([1.0 - LOSS]))
+
+
+def in_cvxpy(given: Problem, x: Array, answer: Answer, outlook: Outlook) -> tuple[float, Array]:
+    """Least cost and inputs (H, n_u) with the back-offs, the reference and the limits of an answer."""
+    plant, steps, reference = given.plant, given.horizon, answer.reference
+    hold = np.linalg.lstsq(plant.b, reference - plant.a @ reference)[0]
+    limits = np.tile(given.state_set.b, (steps + 1, 1)) if outlook.limits is None else outlook.limits
+    path = outlook.path or Path(np.zeros((steps, plant.n_x)), np.zeros((steps, plant.n_u)))
+    states, inputs = cp.Variable((steps + 1, plant.n_x)), cp.Variable((steps, plant.n_u))
+    slack = cp.Variable((steps, given.state_set.b.size), nonneg=True)
+    rules = [states[0] == x]
+    for t in range(steps):
+        rules += [
+            states[t + 1] == plant.a @ states[t] + plant.b @ inputs[t],
+            given.input_set.c @ inputs[t] <= given.input_set.b,
+            given.state_set.c @ states[t + 1] <= limits[t + 1] - answer.backoff_x[t + 1] + slack[t],
+        ]
+    dx, du = states[:-1] - reference - path.states, inputs - hold - path.inputs
+    root_x, root_u = np.linalg.cholesky(given.q_x).T, np.linalg.cholesky(given.q_u).T
+    tail = np.linalg.cholesky(lqr(plant, given.q_x, given.q_u).p).T
+    cost = (
+        sum(cp.sum_squares(root_x @ dx[t]) + cp.sum_squares(root_u @ du[t]) for t in range(steps))
+        + cp.sum_squares(tail @ (states[steps] - reference))
+        + given.slack_linear * cp.sum(slack)
+        + given.slack_quadratic * cp.sum_squares(slack)
+    )
+    asked = cp.Problem(cp.Minimize(cost), rules)
+    asked.solve(
+        solver=cp.CLARABEL, canon_backend=cp.SCIPY_CANON_BACKEND, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11
+    )
+    return float(asked.value), np.asarray(inputs.value)
+
+
+def somewhere(given: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A state within wide limits, and a target that may be beyond them."""
+    low, high = (np.where(np.isfinite(side), side, 0.0) for side in given.state_set.bounds)
+    x = rng.uniform(low, high)
+    places = rng.uniform(1.1 * low, 1.1 * high)[list(given.plant.position_index)]
+    at = dict(zip(given.plant.axes, places.tolist(), strict=True))
+    return x, given.plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
+
+
+def outlook_of(kind: str, given: Problem, rng: np.random.Generator) -> Outlook:
+    steps, n_x, n_u = given.horizon, given.plant.n_x, given.plant.n_u
+    if kind == "covariance":
+        root = rng.normal(size=(n_x, n_x)) * 0.1
+        return Outlook(cov=root @ root.T, late=2)
+    if kind == "fence":
+        return Outlook(limits=given.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, given.state_set.b.size)))
+    if kind == "path":
+        return Outlook(path=Path(rng.normal(size=(steps, n_x)), 0.3 * rng.normal(size=(steps, n_u))))
+    return NOMINAL
+
+
+@pytest.mark.parametrize("kind", ["plain", "covariance", "fence", "path"])
+@pytest.mark.parametrize("name", ["paper", "room"])
+def test_the_answer_is_the_optimum_of_the_same_problem(name: str, kind: str) -> None:
+    given, rng = problem(name), np.random.default_rng(5)
+    solver = ConditionedSolver(given, LINK, ALLOWED)
+    for seq in range(6):
+        x, target = somewhere(given, rng)
+        outlook = outlook_of(kind, given, rng)
+        answer = solver.solve(seq, x, target, outlook)
+        assert (answer.seq, answer.status, answer.method) == (seq, SolveStatus.OPTIMAL, METHOD)
+        cost, inputs = in_cvxpy(given, x, answer, outlook)
+        assert answer.cost == pytest.approx(cost, rel=1e-7)
+        assert answer.inputs == pytest.approx(inputs, abs=2e-4)
+        assert answer.states[1:] == pytest.approx(
+            answer.states[:-1] @ given.plant.a.T + answer.inputs @ given.plant.b.T, abs=1e-9
+        )
+
+
+def spent(given: Problem, answer: Answer, cov: Array) -> Array:
+    """Risk (H,) that the rows of each stage take together, from the definition of the open-loop covariance."""
+    plant, risk = given.plant, []
+    for state in answer.states[1:]:
+        cov = plant.a @ cov @ plant.a.T + plant.e @ plant.w @ plant.e.T
+        sigma = np.sqrt(np.diagonal(given.state_set.c @ cov @ given.state_set.c.T))
+        risk.append(norm.sf(given.state_set.margin(state) / sigma).sum())
+    return np.array(risk)
+
+
+@pytest.mark.parametrize("name", ["paper", "room"])
+def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: str) -> None:
+    given, rng = problem(name), np.random.default_rng(8)
+    solver = ConditionedSolver(given, LINK, ALLOWED)
+    kept = 0
+    for seq in range(60):
+        x, target = somewhere(given, rng)
+        cov = np.diag(rng.uniform(0.0, 0.01, given.plant.n_x))
+        answer = solver.solve(seq, x, target, Outlook(cov=cov))
+        assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
+        if answer.slack == 0.0:
+            kept += 1
+            assert (spent(given, answer, cov) <= solver.risk.budgets + 1e-9).all()
+            assert not answer.gave_way
+        else:
+            assert sum(way.amount for way in answer.gave_way) == pytest.approx(answer.slack, abs=1e-3)
+    assert kept > 15
+
+
+def test_the_weights_are_those_of_the_age() -> None:
+    risk = age_risk(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
+    assert risk.weights == pytest.approx((1.0 - LOSS) * LOSS ** np.arange(12))
+    assert risk.beyond == pytest.approx(LOSS**12)
+    assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - LOSS**12)
+    assert (np.diff(risk.budgets) >= 0.0).all()
+    assert risk.budgets.max() <= 0.5
+    bursts = gilbert_elliott(enter=0.1, leave=0.4, good_loss=0.05, bad_loss=0.9)
+    weights = age_risk(bursts, np.ones(40), ALLOWED).weights
+    older = [bursts.outage(age) for age in range(41)]
+    assert weights == pytest.approx(-np.diff(older))
+
+
+@pytest.mark.parametrize("price", [0.0, 0.4, 0.9, 1.0])
+def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> None:
+    """No shift of risk from one age to another lowers Σ π_t^h β_t."""
+    sigma = np.array([0.4, 0.9, 1.5, 2.2, 3.0])
+    risk = age_risk(bernoulli(np.array([0.6])), sigma, 0.08, price)
+    priced = risk.weights**price
+
+    def paid(budgets: Array) -> float:
+        return float(priced @ (norm.isf(budgets) * sigma))
+
+    for i in range(5):
+        for j in range(5):
+            moved = risk.budgets.copy()
+            moved[i] += 1e-4 / risk.weights[i]
+            moved[j] -= 1e-4 / risk.weights[j]
+            if i != j and moved.max() < 0.5 and moved.min() > 0.0:
+                assert paid(moved) > paid(risk.budgets) - 1e-9
+    assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.beyond)
+
+
+@pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])
+def test_a_horizon_that_silence_outlasts_is_refused(loss: float, steps: int) -> None:
+    with pytest.raises(DesignError, match=rf"smpc.horizon: positions are {steps} steps old or more in"):
+        age_risk(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
+
+
+def test_a_state_that_no_input_reaches_is_refused() -> None:
+    given = problem("paper")
+    b = given.plant.b.copy()
+    b[2:] = 0.0
+    a = given.plant.a.copy()
+    a[2:, 2:] = 0.5 * np.eye(2)  # it comes to rest by itself
+    with pytest.raises(DesignError, match=r"plant.b: states \[2, 3\] are reached by no input"):
+        ConditionedSolver(replace(given, plant=replace(given.plant, a=a, b=b)), LINK, ALLOWED)
+
+
+def test_nothing_disturbed_needs_no_back_off() -> None:
+    given = problem("paper")
+    still = replace(given, plant=replace(given.plant, w=np.zeros((2, 2))))
+    answer = ConditionedSolver(still, LINK, ALLOWED).solve(0, PAPER_START, still.target)
+    assert not answer.backoff_x.any()
+    assert answer.slack == 0.0
+
+
+def test_without_limits_it_is_the_regulator() -> None:
+    given = unlimited(problem("paper"))
+    answer = ConditionedSolver(given, LINK, ALLOWED).solve(3, PAPER_START, given.target)
+    law = lqr(given.plant, given.q_x, given.q_u)
+    assert answer.inputs == pytest.approx((answer.states[:-1] - given.target) @ law.k.T + given.u_target)
+    assert answer.iterations == 0
+    assert answer.cost == pytest.approx((PAPER_START - given.target) @ law.p @ (PAPER_START - given.target))
+
+
+def test_the_reference_is_as_near_to_a_wall_as_it_may_rest() -> None:
+    given = problem("paper")
+    solver = ConditionedSolver(given, LINK, ALLOWED)
+    near, far = (solver.solve(0, PAPER_START, np.array([0.0, 0.0, y, 0.0])) for y in (15.0, 40.0))
+    assert near.reference == pytest.approx([0.0, 0.0, 15.0, 0.0])
+    assert near.offset == 0.0
+    assert 17.0 < far.reference[2] < 19.0
+    assert far.reference[[0, 1, 3]] == pytest.approx(0.0)
+    assert far.offset == pytest.approx(40.0 - far.reference[2])
+    both = solver.solve(0, PAPER_START, np.array([80.0, 0.0, 40.0, 0.0])).reference
+    assert both[2] < far.reference[2]  # two walls share the risk
+
+
+def test_numbers_that_are_none_get_no_plan() -> None:
+    given = problem("paper")
+    solver = ConditionedSolver(given, LINK, ALLOWED)
+    for x, outlook in (
+        (PAPER_START * np.nan, NOMINAL),
+        (PAPER_START, Outlook(cov=np.full((4, 4), np.nan))),
+    ):
+        answer = solver.solve(4, x, given.target, outlook)
+        assert (answer.seq, answer.status) == (4, SolveStatus.FAILED)
+
+
+def test_the_same_question_gives_the_same_bits_whatever_was_asked_before() -> None:
+    given, rng = problem("room"), np.random.default_rng(3)
+    questions = [somewhere(given, rng) for _ in range(8)]
+    first, second = (ConditionedSolver(given, LINK, ALLOWED) for _ in range(2))
+    forth = [first.solve(0, *question).inputs for question in questions]
+    back = [second.solve(0, *question).inputs for question in reversed(questions)]
+    for one, other in zip(forth, reversed(back), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+# The promise, against chance: the worst step of many runs
+
+
+def pilot(given: Problem, loss: float) -> BatchSmpc:
+    solver = ConditionedSolver(given, bernoulli(np.array([1.0 - loss])), ALLOWED)
+    return BatchSmpc(ConditionedDecider(solver, given.target), given.plant, given.horizon, given.horizon, 0.5)
+
+
+@pytest.mark.parametrize(("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0))])
+def test_no_step_is_outside_more_often_than_promised(loss: float, target: tuple[float, float]) -> None:
+    runs, steps = 300, 40
+    at = np.array([target[0], 0.0, target[1], 0.0])
+    given = replace(problem("paper"), target=at, horizon=24)
+    newest, disturbances = arrivals(runs, steps, loss, 11), noise(given, runs, steps, 12)
+    controller = pilot(given, loss)
+    end = flown(given, controller, PAPER_START, newest, disturbances)
+    assert not end.failed.any()
+    outside = end.state_violated.sum(axis=0)
+    assert binomtest(int(outside.max()), runs, ALLOWED, alternative="greater").pvalue > 0.05 / steps
+    tally = controller.tally
+    assert tally.infeasible.sum() == 0
+    assert tally.slack_used.sum() <= ALLOWED * tally.decisions.sum()
+    if target[1]:  # a wall binds at rest: the allowance is used
+        settled = end.state_violated[:, steps // 2 :].mean()
+        assert 0.3 * ALLOWED < settled < ALLOWED
+
+
+def test_it_costs_less_than_plans_with_the_margin_of_the_same_safety() -> None:
+    """On common draws, from the paper's start: what is paid for the same promise."""
+    given = problem("paper")
+    newest, disturbances = arrivals(200, 50, LOSS, 21), noise(given, 200, 50, 22)
+    mine = flown(given, pilot(given, LOSS), PAPER_START, newest, disturbances)
+    margin = flown(given, PacketisedPredictive(given, 3.4), PAPER_START, newest, disturbances)
+    saved = margin.cost.sum(axis=1) - mine.cost.sum(axis=1)
+    assert saved.mean() > 6.0 * saved.std() / np.sqrt(len(saved))

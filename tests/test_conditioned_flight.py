@@ -1,0 +1,143 @@
+"""Scheme `age-conditioned` in flights, campaigns and on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loopback_rig import Memory, lockstep, make_loop
+
+from logs.replay import replay
+from uavctl.build import build_conditioned, build_design, resting
+from uavctl.build_mission import build_rests
+from uavctl.campaign.cells import cells_of, told
+from uavctl.campaign.controllers import build
+from uavctl.campaign.read import read_campaign
+from uavctl.campaign.setting import met
+from uavctl.campaign.world import fly
+from uavctl.cli.app import run as main
+from uavctl.config import load_config
+from uavctl.data import ControlMode, Decision, Plan, SolveStatus, Truth
+from uavctl.smpc.conditioned import METHOD
+
+SCHEME = "smpc.scheme=age-conditioned"
+FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'
+
+
+@pytest.fixture(scope="module")
+def flight() -> Memory:
+    return lockstep("room", 16.0, SCHEME, "sim.seed=4")
+
+
+def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
+    plans = flight.of(Plan)
+    assert {plan.method for plan in plans} == {METHOD}
+    assert {plan.status for plan in plans} == {SolveStatus.OPTIMAL}
+    assert sum(bool(plan.gave_way) for plan in plans) <= 0.05 * len(plans)
+    assert {decision.mode for decision in flight.of(Decision)} <= {ControlMode.WAIT, ControlMode.TRACK}
+    target = np.array(load_config("room").target.position_m)
+    assert np.linalg.norm(np.array(flight.of(Truth)[-1].position_m) - target) < 0.2
+
+
+def test_the_setpoints_play_the_plans_out(flight: Memory) -> None:
+    """What is decided at a boundary is the plan's input of that step."""
+    plans = {plan.seq: plan for plan in flight.of(Plan)}
+    played = [one for one in flight.of(Decision) if one.boundary and one.plan_index]
+    assert len(played) > 10
+    for one in played:
+        assert one.plan_seq is not None and one.plan_index is not None
+        assert len(plans[one.plan_seq].inputs) > one.plan_index
+
+
+def test_a_flight_replays_bit_for_bit(flight: Memory) -> None:
+    config = load_config("room", ["duration_s=16.0", SCHEME, "sim.seed=4"])
+    assert replay(flight.entries, lambda sink: make_loop(config, sink)).identical
+
+
+def test_a_fence_that_closes_in_is_kept() -> None:
+    found = lockstep("room", 20.0, SCHEME, FENCE, "target.position_m=[1.5,1.0,-1.2]")
+    assert max(truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 14e9) < 1.2
+    last = found.of(Plan)[-1]
+    assert last.reference[0] < 1.18  # the target itself is outside
+    assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
+
+
+def test_a_design_may_rest_nearer_to_the_walls() -> None:
+    config = load_config("room", [SCHEME])
+    design = build_design(config)
+    ours, theirs = resting(config, design), build_rests(design)
+    assert resting(load_config("room"), design).tolist() == theirs.tolist()
+    rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
+    assert (ours[rows] > theirs[rows] + 0.1).all()
+    # What it says is where a plan rests, in the middle of the other walls.
+    solver = build_conditioned(config)
+    for row, axis in zip(rows, range(3), strict=True):
+        beyond = np.zeros(9)
+        beyond[3 * axis], beyond[6] = design.state_set.b[row], beyond[6] if axis == 2 else -1.2
+        answer = solver.solve(0, design.target, beyond)
+        assert answer.reference[3 * axis] >= ours[row] - 0.02
+
+
+CAMPAIGN = """
+name = "two schemes"
+config = "paper"
+runs = 40
+steps = 20
+
+[[controller]]
+name = "printed"
+kind = "smpc"
+
+[[controller]]
+name = "ours"
+kind = "smpc"
+set = ["smpc.scheme=age-conditioned", "smpc.horizon=18"]
+
+[[controller]]
+name = "mean QP"
+kind = "mean-qp"
+margin = 2.0
+
+[[controller]]
+name = "governor"
+kind = "governor"
+margin = 2.0
+
+[[link]]
+name = "60 %"
+set = ["link.loss=0.6"]
+"""
+
+
+def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "two.toml"
+    file.write_text(CAMPAIGN, encoding="utf-8")
+    printed, *others = cells_of(read_campaign(file)[0], lambda config, design: None)
+    assert printed.refused.startswith("smpc.delta_x")
+    costs = []
+    for cell in others:
+        assert cell.recipe is not None and cell.recipe.design is None
+        meets = met(cell.setting, 0, 40)
+        found = fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances)
+        assert not found.failed.any()
+        costs.append(found.cost.sum(axis=1).mean())
+    assert told(others[0])["promised_x"] == pytest.approx(0.05)
+    assert told(others[1])["promised_x"] is None
+    assert max(costs) < 1.03 * min(costs)
+
+
+def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scheme"] == METHOD
+    weights, budgets = np.array(found["weights"]), np.array(found["budgets"])
+    assert weights @ budgets + found["beyond"] == pytest.approx(0.05)
+    assert main(["design", "--config", "paper", "--set", SCHEME]) == 0
+    assert "upper limit of east position" in capsys.readouterr().out
+
+
+def test_a_horizon_that_silence_outlasts_is_refused_with_its_key(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["design", "--config", "paper", "--set", SCHEME, "--set", "link.loss=0.9"]) != 0
+    assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
