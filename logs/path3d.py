@@ -17,6 +17,7 @@ from uavctl.data import Plan
 
 OPEN_M = 1.0  # an open side of the room is drawn so far beyond what was flown
 _STAGES = (3, 6, 12)  # of a plan whose spread is shown
+_LINES = 20.0  # of the floor's grid, at most, in each direction
 _DROPS = 12  # lines from the path to the floor
 # Where a metre north, east and down goes on the page: north runs into the picture, to the upper right.
 _SHOWN = np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])
@@ -85,12 +86,12 @@ def _room(design: DesignView, path_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _draw_room(ax: Axes, lower: Floats, upper: Floats) -> None:
-    """Floor, grid of metres on it, edges and their lengths."""
+    """Floor, grid on it, edges and their lengths."""
     corners = np.array(list(product(*zip(lower, upper, strict=True))))
     floor = [corners[1], corners[5], corners[7], corners[3]]  # down is positive: the floor is the upper limit
     ax.fill(*shown(np.array(floor)).T, color=colour("grid"), alpha=0.45, lw=0, zorder=0)
     for axis, other in ((0, 1), (1, 0)):
-        for at in np.arange(np.ceil(lower[axis]), upper[axis] + 1e-9):
+        for at in grid_m(float(lower[axis]), float(upper[axis])):
             ends = np.tile(upper, (2, 1))
             ends[:, axis] = at
             ends[:, other] = lower[other], upper[other]
@@ -102,6 +103,12 @@ def _draw_room(ax: Axes, lower: Floats, upper: Floats) -> None:
     _label(ax, 0.5 * (south_west + south_east), (0, -7), f"east {_ends(lower[1], upper[1])}", "center", "top")
     _label(ax, 0.65 * south_east + 0.35 * north_east, (7, -3), f"north {_ends(lower[0], upper[0])}", "left", "top")
     _label(ax, 0.5 * (corners[0] + corners[1]), (-4, 0), f"height {_ends(-upper[2], -lower[2])}", "right", "center", 90)
+
+
+def grid_m(lower: float, upper: float) -> Floats:
+    """Places of grid lines [m]: each metre, or each 10, 100, … in a room of more than so many."""
+    step = 10.0 ** max(0.0, np.ceil(np.log10(max(upper - lower, 1.0) / _LINES)))
+    return np.asarray(step * np.arange(np.ceil(lower / step), np.floor(upper / step) + 1.0))
 
 
 def _ends(low: float, high: float) -> str:

@@ -10,7 +10,7 @@ from synthetic_flight import fly
 from synthetic_scene import paper, room
 
 from logs.flight_data import FlightData
-from logs.path3d import outline, path_3d, shown
+from logs.path3d import grid_m, outline, path_3d, shown
 from logs.timeline import lanes, timeline
 from uavctl.data import Command, Event, Order, Severity, StepInput, VehicleStatus
 
@@ -96,6 +96,24 @@ def test_up_is_up_on_the_page() -> None:
     low, high, east = shown(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
     assert high[1] > low[1] and high[0] == low[0]
     assert east[0] > low[0]
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "lines"),
+    [
+        (-3.0, 3.0, [-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]),
+        (-2.5, 2.5, [-2.0, -1.0, 0.0, 1.0, 2.0]),
+        (0.2, 0.8, []),
+        (-30.0, 50.0, [-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0]),
+    ],
+)
+def test_the_floor_has_a_line_each_metre_or_so(lower: float, upper: float, lines: list[float]) -> None:
+    assert grid_m(lower, upper).tolist() == lines
+
+
+@pytest.mark.parametrize("side", [10.5, 1e3, 1e7])
+def test_a_floor_of_any_size_has_few_lines(side: float) -> None:
+    assert 2 <= len(grid_m(-side, 0.3 * side)) <= 21
 
 
 def test_a_plant_of_two_axes_has_no_depth() -> None:
