@@ -227,8 +227,8 @@ class ConditionedSolver:
             offset=float(np.abs((reference - target)[self._rests.held]).sum()),
             terminal_miss=0.0,
             cost=float(cost),
-            cost_lower=float(cost),
-            gap=0.0,
+            cost_lower=-np.inf,  # the spread of the risk is no convex program, and each spread's is solved to rounding
+            gap=np.inf,
             iterations=found.programs,
             gave_way=gave_way,
         )
