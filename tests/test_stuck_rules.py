@@ -163,6 +163,7 @@ def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(move
 def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: Moved, rests: bool) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), 5e-5, first_ns=7)
     assert watch.may_rest(moved_ns) == rests
+    assert replace(watch, resolution_m=1e-3).may_rest(moved_ns) == rests
     assert not replace(watch, resolution_m=4.99e-5).may_rest(moved_ns)  # noise to the last digit does not say it twice
     assert not replace(watch, found=True).may_rest(moved_ns)
     assert not replace(watch, doubted=True).may_rest(moved_ns)
