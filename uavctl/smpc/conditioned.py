@@ -111,13 +111,14 @@ class ConditionedSolver:
     The reference is the equilibrium nearest to the target at which a plan may rest: limits less the back-offs there.
 
     Args:
-        problem: The problem; its target is the one that a question without limits of its own is asked for.
+        problem: The problem; every question brings a target of its own.
         link: Model of the link.
         allowed: 1 - δ_x, the share of time in which the state may be outside of its limits.
         price: See `age_risk`.
 
     Raises:
-        DesignError: The plant has no regulator, or information is older than the horizon too often.
+        DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
+            horizon too often.
     """
 
     def __init__(self, problem: Problem, link: LinkModel, allowed: float, price: float = PRICE) -> None:
