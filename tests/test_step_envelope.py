@@ -63,6 +63,24 @@ def test_whoever_waits_in_the_air_for_a_position_that_can_be_lands() -> None:
     assert set(seen[landed + 1 :]) == {ControlMode.STOPPED}
 
 
+@pytest.mark.fault(45)
+@pytest.mark.parametrize("wrong", [(5,), (5, 6)])
+def test_whoever_flies_brakes_at_the_second_position_in_a_row_that_cannot_be(wrong: tuple[int, ...]) -> None:
+    said = [
+        replace(one, position_m=MILLIMETRES) if step in wrong else one for step, one in enumerate(one_a_step(steps=14))
+    ]
+    outputs = run(controller(), inputs_of(range(14 * TICKS), said))
+    braked = [tick for tick, mode in enumerate(modes(outputs)) if mode is ControlMode.BRAKE]
+    if len(wrong) == 1:
+        assert not braked
+        return
+    assert braked[0] == 6 * TICKS
+    assert outputs[braked[0]].decision.reason.startswith("positions are further out than any can be")
+    assert modes(outputs)[-1] is ControlMode.TRACK  # they are believed again
+    plain = run(make_controller(), inputs_of(range(14 * TICKS), said))
+    assert ControlMode.BRAKE not in modes(plain)  # without an envelope both count as lost
+
+
 @pytest.mark.parametrize(
     "status",
     [

@@ -101,6 +101,9 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     if state.plan is not None and state.trust.suspect is not None and state.trust.suspect.likely:
         why = "positions jumped: braking until they are believed again, or not any more"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
+    if state.plan is not None and controller.envelope is not None and _nonsense(state):
+        why = "positions are further out than any can be: braking until they are believed again, or not any more"
+        return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
     if state.plan is not None and _misled(state, tick, inp, controller):
         why = "the vehicle moves otherwise than was predicted, and no position says why"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
@@ -221,6 +224,11 @@ def moving_mps(state: ControlState, tick: Tick, inp: StepInput, controller: Cont
         return predicted, False
     north, east, down = (v if axis in controller.plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
     return (north, east, down), True
+
+
+def _nonsense(state: ControlState) -> bool:
+    """Whether all that has come of late is further out than any position can be."""
+    return state.trust.absurd is not None and state.trust.absurd.likely
 
 
 def _misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
