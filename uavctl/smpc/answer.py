@@ -35,7 +35,7 @@ class Outlook:
             last τ + 1 stages holds for the reference.
         path: Trajectory to follow; None: stay at the target.
         late: Age of the position that the state was predicted from [steps].
-        cov: Covariance of the state estimate's error (n_x, n_x); None: the design's.
+        cov: Covariance of the state estimate's error (n_x, n_x); None: it is exact. A design with its own uses that.
     """
 
     limits: Array | None = None

@@ -31,7 +31,7 @@ from uavctl.errors import DesignError
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import KEPT, inside
 from uavctl.smpc.baselines.mpc import regulated
-from uavctl.smpc.baselines.problem import Part, Problem, parts
+from uavctl.smpc.baselines.problem import Part, Problem, parts, unseen
 from uavctl.smpc.batch_smpc import Decisions, gathered
 from uavctl.smpc.equilibria import Equilibria, equilibria
 from uavctl.smpc.layout import pairs_of
@@ -245,11 +245,7 @@ class ConditionedDecider:
 
     def __init__(self, solver: ConditionedSolver, target: Array) -> None:
         self._solver, self._target = solver, target
-        plant = solver.problem.plant
-        self._unseen = [np.zeros((plant.n_x, plant.n_x))]  # covariance of a prediction over 0, 1 … steps
-        for _ in range(solver.problem.horizon):
-            last = self._unseen[-1]
-            self._unseen.append(plant.a @ last @ plant.a.T + plant.e @ plant.w @ plant.e.T)
+        self._unseen = unseen(solver.problem.plant, solver.problem.horizon)
 
     def decide(self, x: Array, late: int) -> Decisions:
         """See `Decider`."""

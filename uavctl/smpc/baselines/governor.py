@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines.problem import Part, Problem, deviations, parts
+from uavctl.smpc.baselines.problem import Part, Problem, deviations, parts, unseen
 from uavctl.smpc.batch import News, predict
 from uavctl.smpc.lqg_bound import lqr
 from uavctl.smpc.qp import SOFT, QuadraticProgram
@@ -32,8 +32,7 @@ class Governor:
         self._law = lqr(problem.plant, problem.q_x, problem.q_u)
         self._parts = [_Step(problem, part) for part in parts(problem)]
         self._low, self._high = problem.input_set.bounds
-        self._backoffs = [np.zeros(problem.state_set.b.size)]
-        self._spread = np.zeros((problem.plant.n_x, problem.plant.n_x))
+        self._backoffs = np.zeros((1, problem.state_set.b.size))
 
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
@@ -53,12 +52,11 @@ class Governor:
         return asked
 
     def _upto(self, age: int) -> Array:
-        """Margins (age+1, m_x) of means that are 0, 1 … steps old."""
-        problem, plant = self._problem, self._problem.plant
-        while len(self._backoffs) <= age:
-            self._spread = plant.a @ self._spread @ plant.a.T + plant.e @ plant.w @ plant.e.T
-            self._backoffs.append(self._margin * deviations(problem.state_set, self._spread))
-        return np.array(self._backoffs)
+        """Margins (…, m_x) of means that are 0, 1 … `age` steps old, and older."""
+        if len(self._backoffs) <= age:
+            limits, spread = self._problem.state_set, unseen(self._problem.plant, 2 * age)
+            self._backoffs = self._margin * np.array([deviations(limits, cov) for cov in spread])
+        return self._backoffs
 
 
 class _Step:
@@ -69,11 +67,11 @@ class _Step:
         of_u = problem.state_set.c[np.ix_(part.rows_x, part.states)] @ problem.plant.b[np.ix_(part.states, part.inputs)]
         (used,) = np.nonzero(np.any(of_u != 0.0, axis=1))
         self._rows, hard = part.rows_x[used], problem.input_set.c[np.ix_(part.rows_u, part.inputs)]
-        self._a, self._sides = np.vstack([of_u[used], hard]), problem.input_set.b[part.rows_u]
-        soft = np.arange(len(self._a)) < used.size
+        rows, self._sides = np.vstack([of_u[used], hard]), problem.input_set.b[part.rows_u]
+        soft = np.arange(len(rows)) < used.size
         self._program = QuadraticProgram(
             2.0 * np.eye(part.inputs.size),
-            np.ascontiguousarray(self._a),
+            np.ascontiguousarray(rows),
             np.where(soft, SOFT, 0).astype(np.int32),
             np.where(soft, problem.slack_linear, 0.0),
             np.where(soft, problem.slack_quadratic, 0.0),

@@ -86,3 +86,12 @@ def deviations(limits: Polytope, covariance: Array) -> Array:
     variance = np.einsum("mi,ij,mj->m", limits.c, covariance, limits.c)
     along: Array = np.sqrt(np.maximum(variance, 0.0))
     return along
+
+
+def unseen(plant: Plant, steps: int) -> Array:
+    """Covariance (steps+1, n_x, n_x) of a prediction over 0, 1 … `steps` steps from a state that was exact."""
+    noise = plant.e @ plant.w @ plant.e.T
+    spread = [np.zeros_like(noise)]
+    for _ in range(steps):
+        spread.append(plant.a @ spread[-1] @ plant.a.T + noise)
+    return np.array(spread)

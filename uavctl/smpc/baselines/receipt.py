@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.smpc.baselines.mpc import BatchMpc
-from uavctl.smpc.baselines.problem import Problem, deviations
+from uavctl.smpc.baselines.problem import Problem, deviations, unseen
 from uavctl.smpc.batch import News, predict
 
 Array = NDArray[np.float64]
@@ -98,9 +98,6 @@ class MeanQp(PacketisedPredictive):
     """
 
     def _planner(self, margin: float) -> BatchMpc:
-        plant, backoffs = self._problem.plant, [np.zeros(self._problem.state_set.b.size)]
-        spread = np.zeros((plant.n_x, plant.n_x))
-        for _ in range(self._problem.horizon):
-            spread = plant.a @ spread @ plant.a.T + plant.e @ plant.w @ plant.e.T
-            backoffs.append(margin * deviations(self._problem.state_set, spread))
-        return BatchMpc(self._problem, np.array(backoffs))
+        problem = self._problem
+        spread = unseen(problem.plant, problem.horizon)
+        return BatchMpc(problem, margin * np.array([deviations(problem.state_set, cov) for cov in spread]))
