@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -18,7 +19,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from logs.replay import replay
 from uavctl.build import build_design, build_solver
 from uavctl.build_late import build_delayed_link, late_steps
-from uavctl.config import load_config
+from uavctl.config import Config, load_config
 from uavctl.data import Decision, Plan, SolveStatus
 from uavctl.errors import DesignError
 from uavctl.smpc.answer import Outlook
@@ -216,6 +217,58 @@ def test_delays_of_a_step_and_more_ask_for_late_designs(
         assert isinstance(link, LatePackets)
         np.testing.assert_allclose(link.tail, tail, atol=1e-12)
     assert len(build_design(config).late) == steps
+
+
+def silent(config: Config, phase: float, steps: int) -> Array:
+    """Shares (steps+1,) of 40,000 boundaries for which all positions there are were captured so many Δt before.
+
+    One was captured `phase` of the time between two before the boundary; each is lost, or late, by itself.
+    """
+    link, rng, gap_s = config.link, np.random.default_rng(11), 1.0 / config.source.rate_hz
+    before_s = gap_s * (phase + np.arange(math.ceil(steps * config.plant.dt_s / gap_s) + 1))
+    shape = (40_000, len(before_s))
+    under_way_s = link.delay_s + link.jitter_s * rng.uniform(size=shape)
+    there = (rng.uniform(size=shape) >= link.loss) & (under_way_s <= before_s + 1e-9)
+    newest_s = np.where(there, before_s, np.inf).min(axis=1)
+    return np.array([np.mean(newest_s >= step * config.plant.dt_s - 1e-9) for step in range(steps + 1)])
+
+
+CAMERAS = [
+    ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=40", "link.loss=0.6"],
+    ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=40", "link.delay_s=0.1", "link.jitter_s=0"],
+    ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=100", "link.loss=0.8", "link.jitter_s=0.13"],
+    ["source.rate_hz=50", "link.loss=0.9", "link.delay_s=0.2", "link.jitter_s=0.3"],
+]
+
+
+@pytest.mark.parametrize("overrides", CAMERAS)
+def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overrides: list[str]) -> None:
+    """With one captured at each boundary, the longest way, it is the age that comes about."""
+    config = load_config("room", ["smpc.scheme=age-conditioned", *overrides])
+    link, measured = build_delayed_link(config), silent(config, 0.0, 6)
+    promised = np.array([link.outage(step) for step in range(7)])
+    assert np.all(np.abs(measured - promised) <= 5.0 * np.sqrt(promised * (1.0 - promised) / 40_000) + 1e-12)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        *CAMERAS,
+        ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "link.loss=0.6"],
+        ["plant.dt_s=0.2", "source.rate_hz=50", "link.loss=0.8"],
+        ["plant.dt_s=0.2", "source.rate_hz=12", "link.loss=0.6"],
+        # None is sure to come within its step, and one or the other does.
+        ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "link.delay_s=0.04", "link.jitter_s=0"],
+    ],
+)
+def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: float) -> None:
+    config = load_config("room", ["smpc.scheme=age-conditioned", *overrides])
+    one_a_step = load_config("room", ["smpc.scheme=age-conditioned", *overrides, "source.rate_hz=0"])
+    link, measured = build_delayed_link(config), silent(config, phase, 6)
+    promised = np.array([link.outage(step) for step in range(7)])
+    assert np.all(measured <= promised + 5.0 * np.sqrt(promised * (1.0 - promised) / 40_000) + 1e-12)
+    assert promised[6] < 0.5 * build_delayed_link(one_a_step).outage(6)
 
 
 @pytest.mark.parametrize(
