@@ -11,6 +11,10 @@ from logs.page import Section
 _DESIGN = {
     "horizon": "Horizon H [steps]",
     "dt_s": "Step Δt [s]",
+    "scheme": "Scheme",
+    "weights": "Shares of the ages of information",
+    "budgets": "Risk of each age",
+    "beyond": "Share of information older than the horizon",
     "tau": "Delay τ of the terminal law [steps]",
     "delays": "Information delays d",
     "gamma_x": "Likelihoods γ of the states",

@@ -71,9 +71,9 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
     )
 
 
-def _risk(likelihood: float) -> float:
+def _risk(likelihood: float | None) -> float | None:
     """What is left to 1, in the decimals that people write a likelihood with: 0.05, not 0.050000000000000044."""
-    return round(1.0 - likelihood, 12)
+    return None if likelihood is None else round(1.0 - likelihood, 12)
 
 
 def _limit(name: str, promised: float | None, outside: Flags, trial: Flags, tests: int) -> LimitRisk:

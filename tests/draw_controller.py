@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
@@ -36,7 +36,7 @@ def draw_controller(rng: np.random.Generator, seed: int) -> Config:
     for _ in range(TRIES):
         try:
             config = load_config(*_controller(rng))
-            build_design(config)
+            design_of(config)
         except (ConfigError, DesignError):
             continue
         return config
@@ -108,7 +108,7 @@ def with_library(number: int) -> Prepared:
     """One of those that fly with a policy library."""
     name, *overrides = WITH_LIBRARY[number]
     config = load_config(name, overrides)
-    return prepare(config, build_design(config))
+    return prepare(config, design_of(config))
 
 
 def with_libraries() -> None:
@@ -120,7 +120,7 @@ def with_libraries() -> None:
 @lru_cache(maxsize=2)
 def prepared_of(config: Config) -> Prepared:
     """What flies with a drawn configuration."""
-    return prepare(config, build_design(config))
+    return prepare(config, design_of(config))
 
 
 def fits(config: Config) -> bool:

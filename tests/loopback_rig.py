@@ -9,14 +9,13 @@ import msgspec
 
 from logs.flight_data import FlightData
 from sim.world import World
-from uavctl.build import build_controller, build_design
+from uavctl.build import build_controller, design_of, record_of
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.data import Header, Record, Sink
 from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design import Design
-from uavctl.smpc.design_record import design_record
+from uavctl.smpc.conditioned_design import AnyDesign
 from uavctl.smpc.library import Library
 
 R = TypeVar("R", bound=Record)
@@ -35,11 +34,13 @@ class Memory:
         return [record for _, _, record in self.entries if isinstance(record, kind)]
 
 
-def make_loop(config: Config, sink: Sink, design: Design | None = None, library: Library | None = None) -> ControlLoop:
+def make_loop(
+    config: Config, sink: Sink, design: AnyDesign | None = None, library: Library | None = None
+) -> ControlLoop:
     return ControlLoop(config, build_controller(config, design, library), sink, lambda: 0)
 
 
-def shared(config: Config, library: Library | None = None) -> tuple[Design, Controller]:
+def shared(config: Config, library: Library | None = None) -> tuple[AnyDesign, Controller]:
     """Design and controller, made once for flights that differ in length and simulator alone.
 
     A flight leaves nothing in its controller; a replay, which makes one of its own, would find out.
@@ -48,8 +49,8 @@ def shared(config: Config, library: Library | None = None) -> tuple[Design, Cont
 
 
 @lru_cache(maxsize=8)
-def _made(config: Config, library: Library | None) -> tuple[Design, Controller]:
-    design = build_design(config)
+def _made(config: Config, library: Library | None) -> tuple[AnyDesign, Controller]:
+    design = design_of(config)
     return design, build_controller(config, design, library)
 
 
@@ -64,7 +65,7 @@ def lockstep(name: str, duration_s: float, *overrides: str, library: Library | N
     return memory
 
 
-def header(config: Config, design: Design) -> Header:
+def header(config: Config, design: AnyDesign) -> Header:
     return Header(
         started_ns=0,
         started_utc="2026-01-01T00:00:00",
@@ -72,7 +73,7 @@ def header(config: Config, design: Design) -> Header:
         command="test",
         config_toml=dump_config(config),
         design_id=design.design_id,
-        design=design_record(design),
+        design=record_of(design),
         versions={},
         cpu="",
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from logs.recorder import SyncRecorder
 from sim.world import World
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.flying import put_header, stop_limit_s
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
@@ -23,7 +23,7 @@ MOST_FINDINGS = 20  # of one flight: the first ones tell
 def prepared_for(*overrides: str) -> Prepared:
     """Design, library and controller of preset `room`."""
     config = load_config("room", overrides)
-    return prepare(config, build_design(config))
+    return prepare(config, design_of(config))
 
 
 @dataclass

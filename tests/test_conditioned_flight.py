@@ -11,7 +11,6 @@ from loopback_rig import Memory, lockstep, make_loop
 
 from logs.replay import replay
 from uavctl.build import build_conditioned, build_design, resting
-from uavctl.build_mission import build_rests
 from uavctl.campaign.cells import cells_of, told
 from uavctl.campaign.controllers import build
 from uavctl.campaign.read import read_campaign
@@ -66,17 +65,15 @@ def test_a_fence_that_closes_in_is_kept() -> None:
 
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
     config = load_config("room", [SCHEME])
-    design = build_design(config)
-    ours, theirs = resting(config, design), build_rests(design)
-    assert resting(load_config("room"), design).tolist() == theirs.tolist()
+    conditioned, design = build_conditioned(config), build_design(load_config("room"))
+    ours, theirs = resting(conditioned), resting(design)
     rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
     assert (ours[rows] > theirs[rows] + 0.1).all()
     # What it says is where a plan rests, in the middle of the other walls.
-    solver = build_conditioned(config)
     for row, axis in zip(rows, range(3), strict=True):
         beyond = np.zeros(9)
         beyond[3 * axis], beyond[6] = design.state_set.b[row], beyond[6] if axis == 2 else -1.2
-        answer = solver.solve(0, design.target, beyond)
+        answer = conditioned.solver.solve(0, design.target, beyond)
         assert answer.reference[3 * axis] >= ours[row] - 0.02
 
 

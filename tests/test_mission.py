@@ -328,7 +328,7 @@ def test_a_fence_becomes_a_row_of_the_state_set() -> None:
     ("fence", "key", "words"),
     [
         ('state=2,side="upper",times_s=[0],values=[1]', "fence[0].side", "has no limit that could close in"),
-        ('state=1,side="upper",times_s=[0],values=[0.1]', "fence[0].values", "the terminal law needs"),
+        ('state=1,side="upper",times_s=[0],values=[0.1]', "fence[0].values", "plans keep from it at rest"),
     ],
 )
 def test_a_fence_that_the_design_cannot_take_is_refused(fence: str, key: str, words: str) -> None:

@@ -278,6 +278,7 @@ def test_a_configured_flight_knows_where_it_may_rest(preset: str) -> None:
     assert room.stopped(tuple(x.tolist())) == pytest.approx(tuple(x.tolist()), abs=1e-9)
     x[plant.velocity_index[0]] = 1.0
     ahead = room.stopped(tuple(x.tolist()))[plant.position_index[0]] - x[plant.position_index[0]]
+    assert config.smpc.tau is not None
     assert 0.3 < ahead < (config.smpc.horizon - config.smpc.tau) * config.plant.dt_s
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,19 @@ from uavctl.library_store import library_for
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.baselines.problem import Problem
 from uavctl.smpc.conditioned import ConditionedSolver
+from uavctl.smpc.conditioned_design import (
+    AnyDesign,
+    ConditionedDesign,
+    conditioned_id,
+    conditioned_record,
+    longest_gap,
+)
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.design_record import design_record
 from uavctl.smpc.equilibria import equilibria
 from uavctl.smpc.feasibility import check_schedule, optimal_cost
-from uavctl.smpc.innovation import innovations
+from uavctl.smpc.innovation import Innovations, innovations
 from uavctl.smpc.late import with_late
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
@@ -37,6 +46,8 @@ from uavctl.smpc.plant import AXES, Plant, drag_lag
 from uavctl.smpc.sets import Polytope
 
 NANOSECONDS = 1e9
+
+Value = TypeVar("Value")
 
 # Where `[envelope]` says nothing; the figures of false alarms are in docs/soak.md.
 AT_REST_MPS = 0.1  # noise of a vehicle's own velocity at rest, and a little
@@ -83,22 +94,24 @@ def build_spec(config: Config) -> DesignSpec:
     """What the configuration asks of a design.
 
     Raises:
-        DesignError: See `build_plant` and `build_delayed_link`.
+        DesignError: A key of scheme `hahn-stursberg` is missing; see also `build_plant` and `build_delayed_link`.
     """
     smpc, schedule, sets = config.smpc, config.schedule, config.sets
-    plant, estimate_cov = _seen(config, build_plant(config))
+    tau, plant = needed(smpc.tau, "smpc.tau"), build_plant(config)
+    # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
+    form = None if config.risk.estimate == "exact" else _innovations(config, plant, tau + 1)
     return DesignSpec(
-        plant=plant,
+        plant=plant if form is None else form.plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
         input_set=_planned_inputs(config),
         q_x=np.diag(config.cost.state),
         q_u=np.diag(config.cost.input),
         horizon=smpc.horizon,
-        tau=smpc.tau,
+        tau=tau,
         delta_x=smpc.delta_x,
-        delta_u=smpc.delta_u,
-        delta_tau=smpc.delta_tau,
-        k_tau=np.array(smpc.k_tau, dtype=np.float64),
+        delta_u=needed(smpc.delta_u, "smpc.delta_u"),
+        delta_tau=needed(smpc.delta_tau, "smpc.delta_tau"),
+        k_tau=np.array(needed(smpc.k_tau, "smpc.k_tau"), dtype=np.float64),
         link=build_delayed_link(config),
         target_m=config.target.position_m,
         rule=schedule.rule,
@@ -108,12 +121,23 @@ def build_spec(config: Config) -> DesignSpec:
         allocation=config.risk.allocation,
         slack_linear=smpc.slack_linear,
         slack_quadratic=smpc.slack_quadratic,
-        offset_weight=smpc.offset_weight,
+        offset_weight=needed(smpc.offset_weight, "smpc.offset_weight"),
         terminal_weight=smpc.terminal_weight,
         max_iterations=config.solver.max_iterations,
         joint=schedule.joint,
-        estimate_cov=estimate_cov,
+        estimate_cov=None if form is None else form.estimate_cov,
     )
+
+
+def needed(value: Value | None, key: str) -> Value:
+    """The value of a key that scheme `age-conditioned` does without.
+
+    Raises:
+        DesignError: It is not there.
+    """
+    if value is None:
+        raise DesignError(key, "is missing, and what is asked for needs it", "add it, as the presets have it")
+    return value
 
 
 def build_problem(config: Config) -> Problem:
@@ -140,14 +164,19 @@ def build_problem(config: Config) -> Problem:
     )
 
 
-def build_conditioned(config: Config) -> ConditionedSolver:
-    """The solver of the scheme with risk conditioned on the age.
+def build_conditioned(config: Config) -> ConditionedDesign:
+    """What flights of the scheme with risk conditioned on the age are planned with.
 
     Raises:
-        DesignError: See `build_problem` and `ConditionedSolver`.
+        DesignError: See `build_problem`, `build_delayed_link`, `ConditionedSolver` and `innovations`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
-    return ConditionedSolver(problem, build_delayed_link(config), 1.0 - config.smpc.delta_x)
+    link, allowed = build_delayed_link(config), 1.0 - config.smpc.delta_x
+    solver = ConditionedSolver(problem, link, allowed)
+    cov = np.zeros((problem.plant.n_x,) * 2)
+    if config.risk.estimate != "exact":
+        cov = _innovations(config, problem.plant, longest_gap(link, allowed, problem.horizon)).estimate_cov
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed))
 
 
 def _planned_inputs(config: Config) -> Polytope:
@@ -157,22 +186,28 @@ def _planned_inputs(config: Config) -> Polytope:
     return Polytope.from_box((lower + free).tolist(), (upper - free).tolist())
 
 
-def _seen(config: Config, plant: Plant) -> tuple[Plant, NDArray[np.float64] | None]:
-    """The plant that is planned with, and the covariance of what the estimator does not see of it."""
-    if config.risk.estimate == "exact":
-        return plant, None
-    link, dt_s = config.link, config.plant.dt_s
+def _innovations(config: Config, plant: Plant, losses: int) -> Innovations:
+    """The plant as the configured filter sees it, and what that does not know after so many losses in a row."""
+    link, dt_s, estimator = config.link, config.plant.dt_s, config.estimator
     # A step's position may be from its very begin, unless others follow it.
     since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
     age_s = min(dt_s, since_s + link.delay_s + link.jitter_s)
-    # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
-    estimator = config.estimator
-    form = innovations(plant, estimator.position_std_m, age_s, config.smpc.tau + 1, estimator.bias_drift)
-    return form.plant, form.estimate_cov
+    return innovations(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
+
+
+def design_of(config: Config) -> AnyDesign:
+    """What a flight is planned with, by `smpc.scheme`.
+
+    Raises:
+        DesignError: There is none, naming key, reason and what to do.
+    """
+    return build_conditioned(config) if config.conditioned else build_design(config)
 
 
 def build_design(config: Config) -> Design:
-    """The design, and those for late positions, checked against Assumption 4 and for a schedule that is fast enough.
+    """The design of scheme `hahn-stursberg`, and those for late positions, checked against Assumption 4.
+
+    Its schedule is checked for being fast enough too.
 
     Raises:
         DesignError: There is none, naming key, reason and what to do.
@@ -183,8 +218,8 @@ def build_design(config: Config) -> Design:
     return with_late(design, spec, late_steps(config))
 
 
-def build_solver(design: Design, config: Config, library: Library | None = None) -> Solver:
-    """The solver of `smpc.scheme` and `solver.method`.
+def build_solver(design: AnyDesign, config: Config, library: Library | None = None) -> Solver:
+    """The solver of a design: that of scheme `age-conditioned`, or the one that `solver.method` asks for.
 
     Args:
         design: The design.
@@ -194,8 +229,8 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     Raises:
         DesignError: The design does not fit the solver, or the library does not fit the design.
     """
-    if config.conditioned:
-        return build_conditioned(config)
+    if isinstance(design, ConditionedDesign):
+        return design.solver
     if config.solver.method == "library":
         found = library_for(design).library if library is None else library
         solver = LibrarySolver(design, found, exact=config.solver.exact)
@@ -214,13 +249,14 @@ def build_solver(design: Design, config: Config, library: Library | None = None)
     return PrintedSolver(design)
 
 
-def resting(config: Config, design: Design) -> NDArray[np.float64]:
-    """Right sides (m_x,) of the state rows, less what a plan of the scheme keeps from them that rests.
+def resting(design: AnyDesign) -> NDArray[np.float64]:
+    """Right sides (m_x,) of the state rows, less what a plan of the scheme keeps from them that rests."""
+    return design.rests if isinstance(design, ConditionedDesign) else build_rests(design)
 
-    Raises:
-        DesignError: See `build_conditioned`.
-    """
-    return build_conditioned(config).rests(design.estimate_cov) if config.conditioned else build_rests(design)
+
+def record_of(design: AnyDesign) -> dict[str, object]:
+    """A design of either scheme as plain numbers."""
+    return conditioned_record(design) if isinstance(design, ConditionedDesign) else design_record(design)
 
 
 def build_estimator(config: Config) -> EstimatorParameters:
@@ -277,13 +313,13 @@ def _vec3(values: list[float]) -> Vec3:
     return north, east, down
 
 
-def build_controller(config: Config, design: Design | None = None, library: Library | None = None) -> Controller:
+def build_controller(config: Config, design: AnyDesign | None = None, library: Library | None = None) -> Controller:
     """Everything constant that a control tick needs; design and policy library are made if they are not given.
 
     Raises:
         DesignError: There is no design.
     """
-    design = build_design(config) if design is None else design
+    design = design_of(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
     plant = build_plant(config)
     return Controller(
@@ -291,10 +327,10 @@ def build_controller(config: Config, design: Design | None = None, library: Libr
         design_id=design.design_id,
         horizon=design.horizon,
         solver=build_solver(design, config, library),
-        mission=build_mission(config, design, resting(config, design)),
+        mission=build_mission(config, design, resting(design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
-        late_steps=design.horizon if config.conditioned else len(design.late),
+        late_steps=len(design.late) if isinstance(design, Design) else design.horizon,
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
         fallback=FallbackParameters(

@@ -14,7 +14,9 @@ from uavctl.flight.mission import Fence, Mission, Room, Trajectory, Waypoint, ho
 from uavctl.flight.trajectory import Motion, along, follow, room
 from uavctl.naming import Names, names_of
 from uavctl.smpc.components import decompose
+from uavctl.smpc.conditioned_design import AnyDesign
 from uavctl.smpc.design import Design
+from uavctl.smpc.equilibria import equilibria
 from uavctl.smpc.program import terminal_backoff_x
 
 Array = NDArray[np.float64]
@@ -23,12 +25,12 @@ NANOSECONDS = 1e9
 _ROUNDING = 1e-9
 
 
-def build_mission(config: Config, design: Design, rests: Array) -> Mission:
+def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
     """Waypoints or trajectory, and fences; without any, `target.position_m` is held.
 
     Args:
         config: The configuration.
-        design: Its design.
+        design: Its design, of either scheme.
         rests: Right sides (m_x,) of the state rows, less what a plan keeps from them that rests.
 
     Raises:
@@ -53,19 +55,19 @@ def build_mission(config: Config, design: Design, rests: Array) -> Mission:
     return replace(
         mission,
         trajectory=build_trajectory(given.trajectory, design, rests) if given.trajectory.times_s else None,
-        fences=tuple(_fence(number, one, design) for number, one in enumerate(config.fence)),
+        fences=tuple(_fence(number, one, design, rests) for number, one in enumerate(config.fence)),
         land=given.then == "land",
         lead_ns=round(config.envelope.lead_s * NANOSECONDS),
     )
 
 
-def build_names(design: Design) -> Names:
+def build_names(design: AnyDesign) -> Names:
     """What the design's rows and states are called."""
     plant = design.plant
     return names_of(design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index)
 
 
-def build_trajectory(given: TrajectoryConfig, design: Design, rests: Array) -> Trajectory:
+def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array) -> Trajectory:
     """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
 
     For `rests` see `build_mission`.
@@ -92,7 +94,7 @@ def build_trajectory(given: TrajectoryConfig, design: Design, rests: Array) -> T
         )
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
-    return along(plant, motion, design.horizon, design.horizon - design.terminal.tau, *_room(design, rests))
+    return along(plant, motion, design.horizon, design.settles, *_room(design, rests))
 
 
 def build_rests(design: Design) -> Array:
@@ -103,14 +105,14 @@ def build_rests(design: Design) -> Array:
     return rests
 
 
-def _resting(design: Design, rests: Array) -> Room | None:
+def _resting(design: AnyDesign, rests: Array) -> Room | None:
     try:
-        return room(design.plant, design.horizon - design.terminal.tau, *_room(design, rests))
+        return room(design.plant, design.settles, *_room(design, rests))
     except DesignError:
         return None
 
 
-def _room(design: Design, rests: Array) -> tuple[Array, Array]:
+def _room(design: AnyDesign, rests: Array) -> tuple[Array, Array]:
     """Least and largest place to rest at of each axis [m]."""
     index = design.plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
@@ -125,7 +127,7 @@ def _room(design: Design, rests: Array) -> tuple[Array, Array]:
     return lower, upper
 
 
-def _check_limits(motion: Motion, design: Design) -> None:
+def _check_limits(motion: Motion, design: AnyDesign) -> None:
     excess = motion.states @ design.state_set.c.T - design.state_set.b
     step, row = np.unravel_index(int(excess.argmax()), excess.shape)
     if excess[step, row] > _ROUNDING:
@@ -138,7 +140,7 @@ def _check_limits(motion: Motion, design: Design) -> None:
         )
 
 
-def _fence(number: int, given: FenceConfig, design: Design) -> Fence:
+def _fence(number: int, given: FenceConfig, design: AnyDesign, rests: Array) -> Fence:
     key, plant = f"fence[{number}]", design.plant
     axis = given.state
     state = plant.position_index[plant.axes.index(axis)] if isinstance(axis, str) else axis
@@ -153,19 +155,22 @@ def _fence(number: int, given: FenceConfig, design: Design) -> Fence:
         )
     row = rows[0]
     right = abs(design.state_set.c[row, state]) * sign * np.array(given.values)
-    _check_room(key, row, float(right.min()), design)
+    _check_room(key, row, float(right.min()), design, rests)
     return Fence(row=row, times_ns=np.array(given.times_s) * NANOSECONDS, values=right)
 
 
-def _check_room(key: str, row: int, least: float, design: Design) -> None:
-    """Where no place to rest changes a state, as with a velocity, its limit has to leave room for the terminal law."""
-    for part in decompose(design):
-        found = np.flatnonzero(part.rows_x == row)
-        if found.size and not np.any(part.c_x[found[0]] @ part.x_eq):
-            needed = float(terminal_backoff_x(design, part)[found[0]])
-            if least < needed:
-                raise DesignError(
-                    f"{key}.values",
-                    f"{least:.3g} is less than the {needed:.3g} that the terminal law needs at rest",
-                    "keep the limit further out",
-                )
+def _check_room(key: str, row: int, least: float, design: AnyDesign, rests: Array) -> None:
+    """Where no place to rest changes a state, as with a velocity, its limit has to leave room for plans that rest."""
+    plant = design.plant
+    # Weights choose among the inputs that hold a place, and not among the places.
+    weights = np.eye(plant.n_x), np.eye(plant.n_u)
+    places = equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
+    if np.any(design.state_set.c[row] @ places):
+        return
+    needed = float(design.state_set.b[row] - rests[row])
+    if least < needed:
+        raise DesignError(
+            f"{key}.values",
+            f"{least:.3g} is less than the {needed:.3g} that plans keep from it at rest",
+            "keep the limit further out",
+        )

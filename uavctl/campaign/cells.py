@@ -116,6 +116,7 @@ def told(cell: Cell) -> dict[str, object]:
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
     design = None if recipe is None else recipe.design
     smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
+    delta_u = None if smpc is None else smpc.delta_u
     return {
         "index": cell.index,
         "controller": controller,
@@ -126,7 +127,7 @@ def told(cell: Cell) -> dict[str, object]:
         "design_id": None if design is None else design.design_id,
         "library_id": None if recipe is None else recipe.library_id,
         "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
-        "promised_u": None if smpc is None else 1.0 - smpc.delta_u,
+        "promised_u": None if delta_u is None else 1.0 - delta_u,
         "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
         "link_loss": _plain_loss(cell.setting.link),
         "refused": cell.refused,

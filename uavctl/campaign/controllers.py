@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from uavctl.build import build_conditioned, build_design, build_plant, build_problem, build_solver
+from uavctl.build import build_conditioned, build_design, build_plant, build_problem, build_solver, needed
 from uavctl.campaign.setting import Setting, met, start_of
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
 from uavctl.config import Config
@@ -122,8 +122,8 @@ def build(recipe: Recipe) -> BatchController:
     if recipe.kind == "worst-case-delay":
         plant, allocation = problem.plant, config.risk.allocation
         kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)
-        kappa_u = kappa(config.smpc.delta_u, plant.n_u, len(problem.input_set.b), allocation)
-        return WorstCaseDelay(problem, config.smpc.tau, kappa_x, kappa_u)
+        kappa_u = kappa(needed(config.smpc.delta_u, "smpc.delta_u"), plant.n_u, len(problem.input_set.b), allocation)
+        return WorstCaseDelay(problem, needed(config.smpc.tau, "smpc.tau"), kappa_x, kappa_u)
     if recipe.gains is None:
         raise ValueError("a PID without gains")
     return CascadedPid(problem, recipe.gains)
@@ -146,7 +146,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.conditioned:
-        solver, steps = build_conditioned(config), config.smpc.horizon
+        solver, steps = build_conditioned(config).solver, config.smpc.horizon
         return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
     if design is None:
         raise ValueError("an SMPC without a design")

@@ -111,7 +111,8 @@ def _age(seen: Seen, config: Config) -> Item:
     note = "" if known else "; counted from the quickest one, as the source answers no TIMESYNC"
     value = f"median {ages_s[len(ages_s) // 2] * 1e3:.1f} ms, 95 % within {p95_s * 1e3:.1f} ms{note}"
     # Ages count in steps: one within Δt is 0, whatever the link was said to take.
-    step_s = (config.schedule.late + 1) * config.plant.dt_s
+    planned_for = config.smpc.horizon if config.conditioned else config.schedule.late + 1
+    step_s = planned_for * config.plant.dt_s
     worst_s = max(limit_s, step_s)
     want = (
         f"95 % within {(limit_s + _AGE_TOLERANCE_S) * 1e3:.1f} ms (link.delay_s + link.jitter_s, and "

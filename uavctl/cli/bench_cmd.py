@@ -53,6 +53,11 @@ def bench(
     if loop:
         return bench_loop(common, seconds, runs)
     loaded = common.load()
+    if loaded.config.conditioned:
+        raise UsageError(
+            "bench measures the methods of smpc.scheme `hahn-stursberg`; give --set smpc.scheme=hahn-stursberg, or "
+            "--loop for the whole control loop of either scheme"
+        )
     if plot is not None:
         _check_plot(plot)
     with located(loaded):

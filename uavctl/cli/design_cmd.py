@@ -6,26 +6,22 @@ import time
 from typing import Annotated
 
 import msgspec
-import numpy as np
 from cyclopts import Parameter, validators
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from uavctl.build import build_conditioned, build_design
+from uavctl.build_mission import build_names
 from uavctl.cli import compare_cmd
 from uavctl.cli.common import DEFAULTS, Common, located
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.library_bytes import StoredLibrary
-from uavctl.naming import names_of
-from uavctl.smpc.conditioned import METHOD, ConditionedSolver
+from uavctl.smpc.conditioned_design import ConditionedDesign, conditioned_record
 from uavctl.smpc.design import Design
 from uavctl.smpc.design_record import design_record
 from uavctl.smpc.terminal import stationary_cost
-
-Array = NDArray[np.float64]
 
 
 def design(
@@ -53,11 +49,10 @@ def design(
     start = time.perf_counter()
     if loaded.config.conditioned:
         with located(loaded):
-            solver = build_conditioned(loaded.config)
-        rests = solver.rests(np.zeros((solver.problem.plant.n_x,) * 2))
+            conditioned = build_conditioned(loaded.config)
         common.show(
-            conditioned_document(solver, rests, time.perf_counter() - start),
-            lambda: conditioned_picture(solver, rests, loaded.config.name),
+            conditioned_document(conditioned, time.perf_counter() - start),
+            lambda: conditioned_picture(conditioned, loaded.config.name),
         )
         return 0
     with located(loaded):
@@ -68,38 +63,27 @@ def design(
     return 0
 
 
-def conditioned_document(solver: ConditionedSolver, rests: Array, wall_s: float) -> dict[str, object]:
-    """The figures of scheme `age-conditioned`, for --json; `rests` are the limits (m_x,) of a plan that rests."""
-    risk = solver.risk
-    return {
-        "scheme": METHOD,
-        "horizon": solver.problem.horizon,
-        "beyond": risk.beyond,
-        "weights": risk.weights.tolist(),
-        "budgets": risk.budgets.tolist(),
-        "state_limits": solver.problem.state_set.b.tolist(),
-        "rests": rests.tolist(),
-        "wall_s": wall_s,
-    }
+def conditioned_document(made: ConditionedDesign, wall_s: float) -> dict[str, object]:
+    """The figures of scheme `age-conditioned`, for --json."""
+    return {**conditioned_record(made), "wall_s": wall_s}
 
 
-def conditioned_picture(solver: ConditionedSolver, rests: Array, name: str) -> RenderableType:
+def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
     """Ages and their risk, and where a plan may rest, as tables."""
-    ages = Table(title=f"Risk by the age of information, {name}", title_justify="left")
+    ages = Table(title=f"Risk by the age of information, design {made.design_id} of {name}", title_justify="left")
     for heading in ("age [steps]", "probability", "may be outside"):
         ages.add_column(heading, justify="right")
-    risk, problem = solver.risk, solver.problem
+    risk, problem = made.solver.risk, made.solver.problem
     for age, (weight, budget) in enumerate(zip(risk.weights, risk.budgets, strict=True), start=1):
         ages.add_row(str(age), f"{weight:.3g}", f"{budget:.2%}")
     ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full")
-    plant = problem.plant
-    names = names_of(problem.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index)
-    limits = Table(title="Where a plan may rest, positions being exact", title_justify="left")
+    names = build_names(made)
+    limits = Table(title="Where a plan may rest", title_justify="left")
     for heading in ("limit", "at", "rests up to", "unit"):
         limits.add_column(heading, justify="left" if heading in ("limit", "unit") else "right")
     # A row of one entry limits -x from below where the entry is negative.
     sizes = problem.state_set.c.sum(axis=1)
-    for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, rests, strict=True):
+    for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True):
         limits.add_row(row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
     return Group(ages, limits)
 

@@ -14,7 +14,7 @@ from uavctl.data import Command, ControlMode, Order, Vec3
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.mode import State
-from uavctl.smpc.design import Design
+from uavctl.smpc.conditioned_design import AnyDesign
 
 AXES = ("north", "east", "down")
 DOWN = 2
@@ -111,7 +111,7 @@ def stand_by(loop: ControlLoop, flown_ns: int) -> None:
     )
 
 
-def check_places(config: Config, design: Design, take_off_m: float | None, goal: Vec3 | None) -> None:
+def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
     """Refuse what the room has no place for, before anything is made for the flight, or sent.
 
     Raises:
@@ -122,7 +122,7 @@ def check_places(config: Config, design: Design, take_off_m: float | None, goal:
         raise UsageError("--takeoff: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
     if take_off_m is None and goal is None:
         return
-    room = build_mission(config, design, resting(config, design)).room
+    room = build_mission(config, design, resting(design)).room
     if room is None:
         raise UsageError("--takeoff, --goto: this plant cannot rest wherever it is sent; see plant")
     why = "" if goal is None else room.refusal(goal)

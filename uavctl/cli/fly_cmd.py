@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from logs.recorder import Recorder
 from logs.summary import render
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.before_arming import checked_before_arming, record_items
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
 from uavctl.cli.engagement import (
@@ -99,7 +99,7 @@ def fly(
         new_recording(out, config.name, config.log.free_bytes) as path,
     ):
         with located(loaded):
-            design = build_design(config)
+            design = design_of(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
         begun = time.perf_counter()

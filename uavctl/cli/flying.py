@@ -27,6 +27,7 @@ from logs.report import write_report
 from logs.summary import FlightSummary, summarise
 from logs.topics import HEADER, LIBRARY
 from logs.views import Views
+from uavctl.build import record_of
 from uavctl.cli.common import FREE_PORT, messages
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.provenance import cpu, versions
@@ -35,7 +36,6 @@ from uavctl.config.load import dump_config
 from uavctl.data import Header, PolicyLibrary, Record
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
-from uavctl.smpc.design_record import design_record
 
 LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
@@ -120,7 +120,7 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
         command=shlex.join(["uavctl", *sys.argv[1:]]),
         config_toml=dump_config(config),
         design_id=design.design_id,
-        design=design_record(design),
+        design=record_of(design),
         versions=versions(),
         cpu=cpu(),
         library_id=None if library is None else library.library_id,

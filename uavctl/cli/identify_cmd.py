@@ -18,7 +18,7 @@ from rich.table import Table
 from logs.outputs import spare_recording, write_whole
 from logs.reader import header, lacks_end, read
 from logs.tlog import read_tlog
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.common import DEFAULTS, Common, can_be_read, messages, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
@@ -80,7 +80,7 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
 def _design_doubts(config: Config) -> tuple[str, ...]:
     """Why the identified configuration makes no design as it stands, if it does not."""
     try:
-        build_design(config)
+        design_of(config)
     except DesignError as error:
         return (f"no design yet with this plant and link: {error}; for another gain: `uavctl design --synthesize`",)
     return ()

@@ -23,7 +23,7 @@ from logs.views import Views
 from sim.script import Script
 from sim.server import Ready, serve_in_child
 from sim.world import World
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
 from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_verdict
 from uavctl.cli.flying import (
@@ -88,7 +88,7 @@ def loopback(
     if config.duration_s < config.daemon.tick_s:
         raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
     with located(loaded):
-        design = build_design(config)
+        design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
     with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
         with located(loaded):

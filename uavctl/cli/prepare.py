@@ -15,6 +15,7 @@ from uavctl.config import Config
 from uavctl.flight.controller import Controller
 from uavctl.library_bytes import StoredLibrary
 from uavctl.library_store import library_for
+from uavctl.smpc.conditioned_design import AnyDesign
 from uavctl.smpc.design import Design
 
 
@@ -25,17 +26,17 @@ class Prepared:
     Attributes:
         config: The configuration.
         design: Its design.
-        library: The design's policy library; None if `solver.method` asks for none.
+        library: The design's policy library; None where scheme or `solver.method` ask for none.
         controller: The controller.
     """
 
     config: Config
-    design: Design
+    design: AnyDesign
     library: StoredLibrary | None
     controller: Controller
 
 
-def prepare(config: Config, design: Design) -> Prepared:
+def prepare(config: Config, design: AnyDesign) -> Prepared:
     """Make policy library and controller of a design.
 
     Raises:
@@ -46,9 +47,9 @@ def prepare(config: Config, design: Design) -> Prepared:
     return Prepared(config, design, library, controller)
 
 
-def ready_library(config: Config, design: Design) -> StoredLibrary | None:
-    """The policy library of a design, if `solver.method` asks for one: from the cache, or made under a progress bar."""
-    if not config.uses_library:
+def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
+    """The policy library of a design that asks for one: from the cache, or made under a progress bar."""
+    if not isinstance(design, Design) or not config.uses_library:
         return None
     with ExitStack() as stack:
         bar: list[Callable[[str], None]] = []  # from the first round on: there is none for what the cache holds

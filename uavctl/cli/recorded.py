@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from logs.replay import recorded_library
-from uavctl.build import build_controller, build_design
+from uavctl.build import build_controller, design_of
 from uavctl.cli.common import located
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, Loaded
@@ -25,8 +25,8 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
     Raises:
         RecordingError: It carries no policy library though it flew with one, or one that does not fit.
     """
-    design = build_design(config)
-    if not config.uses_library:
+    design = design_of(config)
+    if not isinstance(design, Design) or not config.uses_library:
         return prepare(config, design)
     try:
         return _with_library(flight, config, design)
@@ -45,8 +45,8 @@ def changed_flyer(flight: Path, before: Config, loaded: Loaded) -> Prepared:
     """
     config = loaded.config
     with located(loaded):
-        design = build_design(config)
-        if config.uses_library and before.uses_library:
+        design = design_of(config)
+        if isinstance(design, Design) and config.uses_library and before.uses_library:
             with suppress(LibraryError):
                 return _with_library(flight, config, design)
         return prepare(config, design)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from logs.reader import records
 from logs.summary import FlightSummary, count, render
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.campaign.again import again
 from uavctl.campaign.refly import Agreement, Reflight, agreement, reflight
 from uavctl.campaign.results import read_cells
@@ -54,7 +54,7 @@ def fly_again(flight: Reflight, out: Path | None) -> Reflown:
     config = flight.config
     as_flown = Engagement(config, take_off_m=None, goto=False)
     with new_recording(out, "refly", config.log.free_bytes) as path:
-        summary, _ = lockstep(prepare(config, build_design(config)), path, as_flown, flight.script)
+        summary, _ = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
         return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from logs.replay_tlog import ForeignReplay, replay_tlog
 from logs.summary import count
 from logs.tlog import TlogPacket
-from uavctl.build import build_design
+from uavctl.build import design_of
 from uavctl.cli.common import DEFAULTS, Common, Flight, located, two_columns, warn
 from uavctl.cli.prepare import prepare
 from uavctl.cli.replay_table import replay_table
@@ -79,7 +79,7 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
     loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
     config = loaded.config
     with located(loaded):
-        controller = prepare(config, build_design(config)).controller
+        controller = prepare(config, design_of(config)).controller
         # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
         make_loop = _loop_maker(config, replace(controller, envelope=None))
     packets = ((packet.at_ns, packet.data) for packet in recorded if not packet.outgoing)

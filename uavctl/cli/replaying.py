@@ -89,7 +89,8 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
         finished=not cut and not holes,
-        ignored=MAKERS if overrides else frozenset(),
+        # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
+        ignored=MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset(),
     )
     return Replayed(result, cut, holes, changed, tuple(other_versions(recorded)))
 

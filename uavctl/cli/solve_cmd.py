@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 
-from uavctl.build import build_design, build_solver
+from uavctl.build import build_solver, design_of
 from uavctl.build_mission import build_names
 from uavctl.cli.common import DEFAULTS, Common, located
 from uavctl.cli.prepare import ready_library
@@ -23,7 +23,7 @@ from uavctl.data import SolveStatus
 from uavctl.errors import UsageError
 from uavctl.naming import tell_all
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.design import Design
+from uavctl.smpc.conditioned_design import AnyDesign
 
 
 def solve(
@@ -42,7 +42,7 @@ def solve(
     """Solve one decision problem, towards the configured target."""
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
     with located(loaded):
-        design = build_design(loaded.config)
+        design = design_of(loaded.config)
         x = parse_state(state, design.plant.n_x)
         stored = ready_library(loaded.config, design)
         solver = build_solver(design, loaded.config, None if stored is None else stored.library)
@@ -90,7 +90,7 @@ def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
     }
 
 
-def solve_picture(answer: Answer, design: Design, config: Config, solve_us: float) -> RenderableType:
+def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: float) -> RenderableType:
     """The plan as a table, stage by stage, with its largest back-offs."""
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
@@ -112,7 +112,7 @@ def solve_picture(answer: Answer, design: Design, config: Config, solve_us: floa
     )
 
 
-def plan_table(answer: Answer, design: Design) -> WideTable:
+def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
     """The plan, stage by stage: the columns of an axis stay together, and so do the back-offs."""
     axes, count = design.plant.axes, len(answer.states)
     names = [*state_names(design.plant.n_x, axes), *(f"u_{axis[0]}" for axis in axes)]

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from sim.vehicle import LinearModel, linear_model
-from uavctl.build import build_design, build_problem
+from uavctl.build import build_problem, design_of
 from uavctl.campaign.controllers import build, recipe_for
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
 from uavctl.cli.common import located
@@ -111,7 +111,7 @@ def baseline_flyer(loaded: Loaded, kind: Kind, start: Array) -> Prepared:
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
     with located(loaded):
-        prepared = prepare(config, build_design(config))
+        prepared = prepare(config, design_of(config))
         recipe = recipe_for(spec, config, campaign, ready_library)
 
     def make(target: Array) -> tuple[Problem, BatchController]:

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_spec
+from uavctl.build import build_spec, needed
 from uavctl.campaign.intervals import clopper_pearson
 from uavctl.paper.claims import claims_of
 from uavctl.paper.flights import Setup
@@ -72,8 +72,8 @@ def assess(setup: Setup, note: str, flights: Flights, seed: int) -> VariantResul
         worst_case=worst_case(setup, seed, few, steps),
         claims=[],
     )
-    smpc = config.smpc
-    claims = claims_of(result, link.outage(1), design.horizon, smpc.delta_x, smpc.delta_u)
+    delta_u = needed(config.smpc.delta_u, "smpc.delta_u")
+    claims = claims_of(result, link.outage(1), design.horizon, config.smpc.delta_x, delta_u)
     return msgspec.structs.replace(result, claims=claims)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_problem
+from uavctl.build import build_problem, needed
 from uavctl.paper.flights import Setup, fly_runs, planes
 from uavctl.paper.result import WorstCase
 from uavctl.smpc.baselines.lqg import Lqg
@@ -22,17 +22,18 @@ Array = NDArray[np.float64]
 def worst_case(setup: Setup, seed: int, runs: int, steps: int) -> WorstCase:
     """MPC for a constant delay of τ, with the likelihoods of the constraints themselves."""
     design, smpc = setup.design, setup.config.smpc
+    tau, delta_u = design.terminal.tau, needed(smpc.delta_u, "smpc.delta_u")
     controller = WorstCaseDelay(
         build_problem(setup.config),
-        smpc.tau,
+        tau,
         kappa(smpc.delta_x, design.plant.n_x, design.state_set.b.size, "ellipsoid"),
-        kappa(smpc.delta_u, design.plant.n_u, design.input_set.b.size, "ellipsoid"),
+        kappa(delta_u, design.plant.n_u, design.input_set.b.size, "ellipsoid"),
     )
     flown = fly_runs(setup, controller, seed, range(runs), steps)
     settled = flown.states[:, steps // 2 :].reshape(-1, design.plant.n_x)
     return WorstCase(
         runs=runs,
-        delay=smpc.tau,
+        delay=tau,
         mean_cost=float(flown.cost.sum(axis=1).mean()),
         settled_cost=float(flown.cost[:, steps // 2 :].mean()) / len(design.plant.axes),
         settled_std=settled.std(axis=0).tolist(),

@@ -120,6 +120,11 @@ class Design:
     assumptions: tuple[AssumptionCheck, ...]
     design_id: str
 
+    @property
+    def settles(self) -> int:
+        """N, the stage from which a plan rests [steps]."""
+        return self.horizon - self.terminal.tau
+
 
 def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | None] | None = None) -> Design:
     """Choose a schedule, make the terminal ingredients, check Assumption 4.
