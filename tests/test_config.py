@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from uavctl.build import build_spec
 from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
 from uavctl.config.index import key_lines
 from uavctl.config.mission import FenceConfig
@@ -88,6 +89,35 @@ def test_overrides_take_toml_values_bare_strings_and_the_last_one_wins() -> None
     assert (config.fallback.brake_gain_1ps, config.fallback.recover_samples) == (2.0, 3)
 
 
+OF_THE_PAPER = ("tau = 4", "delta_u = 0.9", "delta_tau = 0.99", "k_tau = [[", "offset_weight", "[schedule]", "delays")
+
+
+def without_the_paper_s(text: str) -> str:
+    lines = [line for line in text.splitlines() if not line.startswith((*OF_THE_PAPER, 'rule = "fixed"'))]
+    return "\n".join(lines)
+
+
+def test_what_the_paper_s_scheme_alone_needs_need_not_be_given_for_the_other_one() -> None:
+    text = without_the_paper_s(PAPER)
+    told = problems(text)
+    keys = ("smpc.tau", "smpc.delta_u", "smpc.delta_tau", "smpc.k_tau", "smpc.offset_weight")
+    assert [one.partition(": ")[2].split(": ")[0] for one in told] == [*keys, "schedule"]
+    assert told[-1].endswith("schedule: missing table; add [schedule]; the presets are complete examples")
+    config = parse(text, "my.toml", ["smpc.scheme=age-conditioned", "smpc.horizon=48"]).config
+    assert config.smpc.tau is None and config.smpc.k_tau is None
+    assert parse(dump_config(config), "again.toml").config == config
+    with pytest.raises(DesignError, match="is missing") as caught:
+        build_spec(config)
+    assert caught.value.key == "smpc.tau"
+
+
+def test_what_the_paper_s_scheme_needs_is_passed_over_where_it_is_given_to_the_other_one() -> None:
+    odd = ["smpc.horizon=48", "smpc.tau=20", "smpc.k_tau=[[1.0]]", "schedule.delays=[0,1]", "schedule.rule=search"]
+    assert load_config("paper", ["smpc.scheme=age-conditioned", *odd]).smpc.tau == 20
+    with pytest.raises(ConfigError, match=r"smpc\.k_tau"):
+        load_config("paper", odd)
+
+
 @pytest.mark.fault(33)
 @pytest.mark.parametrize(
     ("old", "new", "key", "words"),
@@ -96,6 +126,15 @@ def test_overrides_take_toml_values_bare_strings_and_the_last_one_wins() -> None
         ("horizon = 12", "", "smpc.horizon", "missing key"),
         ("horizon = 12", 'horizon = "12"', "smpc.horizon", 'expected a whole number, got "12"'),
         ("horizon = 12", "horizon = 1", "smpc.horizon", "expected a whole number >= 2, got 1"),
+        ("horizon = 12", "horizon = 41", "smpc.horizon", "41 steps are more than planned feedback is solved for, 40"),
+        ("horizon = 12", "horizon = 101", "smpc.horizon", "expected a whole number <= 100, got 101"),
+        ("tau = 4", "", "smpc.tau", "missing key; add it: whole number (>= 1, <= 20), delay τ of the terminal control"),
+        ("tau = 4", 'tau = "4"', "smpc.tau", 'expected a whole number, got "4"'),
+        ("delta_u = 0.9", "", "smpc.delta_u", "missing key; add it: number (> 0, < 1), likelihood δ_u"),
+        ("delta_tau = 0.99", "", "smpc.delta_tau", "missing key"),
+        ("delta_tau = 0.99", "delta_tau = 1", "smpc.delta_tau", "expected a number < 1.0, got 1"),
+        ("k_tau = ", "# ", "smpc.k_tau", "missing key; add it: list of lists of numbers"),
+        ("offset_weight = ", "# ", "smpc.offset_weight", "missing key"),
         ("horizon = 12", "horizon = 4", "smpc.tau", "4 steps do not fit into the horizon of 4"),
         ("loss = 0.3", "loss = 1.0", "link.loss", "expected a number < 1.0, got 1.0"),
         ("loss = 0.3", "loss = nan", "link.loss", "nan is not a finite number"),

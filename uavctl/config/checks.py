@@ -17,6 +17,7 @@ from uavctl.config.problem import Problem as Problem
 from uavctl.config.section import LARGEST, Open
 from uavctl.config.types import (
     LIBRARY_HORIZON,
+    PLANNED_HORIZON,
     CostConfig,
     EstimatorConfig,
     LimitsConfig,
@@ -165,6 +166,14 @@ def _cost(plant: PlantConfig, cost: CostConfig) -> Iterator[Problem]:
 
 def _smpc(plant: PlantConfig, smpc: SmpcConfig) -> Iterator[Problem]:
     n_x, n_u = dimensions(plant)
+    if smpc.conditioned or smpc.tau is None or smpc.k_tau is None:
+        return
+    if smpc.horizon > PLANNED_HORIZON:
+        yield Problem(
+            "smpc.horizon",
+            f"{smpc.horizon} steps are more than planned feedback is solved for, {PLANNED_HORIZON}",
+            'shorten it, or set smpc.scheme = "age-conditioned"',
+        )
     yield from _shape("smpc.k_tau", smpc.k_tau, (n_u, n_x), "number of axes x n_x")
     if smpc.tau >= smpc.horizon:
         yield Problem(
@@ -176,6 +185,8 @@ def _smpc(plant: PlantConfig, smpc: SmpcConfig) -> Iterator[Problem]:
 
 def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) -> Iterator[Problem]:
     n_x, _ = dimensions(plant)
+    if smpc.conditioned:
+        return
     delays = schedule.delays
     if schedule.rule == "fixed":
         if isinstance(delays, tuple):
@@ -195,7 +206,7 @@ def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) ->
 
 
 def _library(smpc: SmpcConfig, solver: SolverConfig) -> Iterator[Problem]:
-    if solver.method == "library" and smpc.horizon > LIBRARY_HORIZON:
+    if not smpc.conditioned and solver.method == "library" and LIBRARY_HORIZON < smpc.horizon <= PLANNED_HORIZON:
         yield Problem(
             "smpc.horizon",
             f"{smpc.horizon} steps are more than a policy library is made for, {LIBRARY_HORIZON}",

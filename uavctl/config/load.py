@@ -27,7 +27,7 @@ from uavctl.config.reference import description, element, is_section, type_text
 from uavctl.config.samples import read_samples
 from uavctl.config.source import Source
 from uavctl.config.trace import read_trace
-from uavctl.config.types import Config, Section
+from uavctl.config.types import OF_HAHN_STURSBERG, Config, Section
 from uavctl.errors import ConfigError, DesignError
 
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
@@ -93,7 +93,7 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
     if found:
         raise ConfigError((*problems, *map(source.tell, found)))
     sections: dict[str, Decoded] = {}
-    config = decode(Config, table, "", found, sections)
+    config = decode(Config, table, "", found, sections, needed=_needed(table))
     mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
     if isinstance(mission, MissionConfig) and isinstance(link, LinkConfig):
         mission, of_mission = read_samples(mission, Path(file).parent, found)
@@ -189,10 +189,25 @@ def _override_value(text: str) -> object:
     return parsed["value"] if len(parsed) == 1 else text
 
 
+def _needed(table: Mapping[str, Any]) -> frozenset[str]:
+    """Keys that have to be given though the types have a default."""
+    smpc = table.get("smpc")
+    scheme = smpc.get("scheme") if isinstance(smpc, dict) else None
+    return frozenset() if scheme == "age-conditioned" else OF_HAHN_STURSBERG
+
+
 def decode(
-    section: type[Section], table: Mapping[str, Any], path: str, found: list[Problem], sections: dict[str, Decoded]
+    section: type[Section],
+    table: Mapping[str, Any],
+    path: str,
+    found: list[Problem],
+    sections: dict[str, Decoded],
+    needed: frozenset[str] = frozenset(),
 ) -> Section | None:
-    """Decode one table; its problems go to `found`, whole first-level sections to `sections`."""
+    """Decode one table; its problems go to `found`, whole first-level sections to `sections`.
+
+    Keys in `needed` have to be there though they have a default.
+    """
     fields = {field.encode_name: field for field in msgspec.structs.fields(section)}
     before = len(found)
     unknown = [key for key in table if key not in fields]
@@ -203,7 +218,7 @@ def decode(
     for name, field in fields.items():
         key, value = path + name, table.get(name)
         if name not in table:
-            if field.default is NODEFAULT:
+            if field.default is NODEFAULT or key in needed:
                 found.append(_missing(key, field))
         elif (one := element(field.type)) is not None and isinstance(value, list):
             if (problem := _too_many(key, value, field)) is not None:
@@ -220,7 +235,7 @@ def decode(
             else:
                 found.append(wrong)
         elif isinstance(value, dict):
-            inner = decode(field.type, value, f"{key}.", found, sections)
+            inner = decode(field.type, value, f"{key}.", found, sections, needed)
             if inner is not None:
                 values[name] = sections[key] = inner
         else:
@@ -282,6 +297,7 @@ def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
 def _reason(message: str, got: object, field: FieldInfo) -> str:
     if message.startswith("Invalid enum value"):
         return f"{_short(got)} is not a choice{find_nearest(str(got), _choices(field.type))}"
+    message = message.replace(" | null", "")  # which TOML knows not
     for word, text in _WORDS.items():
         message = message.replace(word, text)
     wanted = message.partition(", got ")[0]

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
-from uavctl.config.types import Config, Section
+from uavctl.config.types import OF_HAHN_STURSBERG, Config, Section
 
 _HEAD = """# Configuration
 
@@ -112,7 +112,9 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     yield "| key | type | meaning | default |\n|---|---|---|---|"
     for field in fields:
         if not is_section(field.type):
-            cells = (f"`{field.encode_name}`", type_text(field.type), description(field), _default(field))
+            needed = f"{path}.{field.encode_name}" in OF_HAHN_STURSBERG
+            default = "required with scheme `hahn-stursberg`" if needed else _default(field)
+            cells = (f"`{field.encode_name}`", type_text(field.type), description(field), default)
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:

@@ -26,6 +26,11 @@ from uavctl.config.security import SecurityConfig as SecurityConfig
 from uavctl.config.sim import SimConfig
 
 LIBRARY_HORIZON = 24  # making the library takes minutes beyond
+PLANNED_HORIZON = 40  # so does solving the whole program with planned feedback
+# Keys with a default that scheme `hahn-stursberg` cannot do without.
+OF_HAHN_STURSBERG = frozenset(
+    {"smpc.tau", "smpc.delta_u", "smpc.delta_tau", "smpc.k_tau", "smpc.offset_weight", "schedule"}
+)
 Delay = Annotated[int, Meta(le=60)]
 
 
@@ -102,10 +107,11 @@ class CostConfig(Section, frozen=True, kw_only=True):
 
 
 Scheme = Literal["hahn-stursberg", "age-conditioned"]
+Likelihood = Annotated[float, Meta(gt=0, lt=1)] | None
 
 
 class SmpcConfig(Section, frozen=True, kw_only=True):
-    """The predictive controller."""
+    """The predictive controller; scheme `age-conditioned` passes over what only the other one asks for."""
 
     scheme: Annotated[
         Scheme,
@@ -118,27 +124,28 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
         int,
         Meta(
             ge=2,
-            le=40,
-            description=f"prediction horizon H; with solver.method `library` at most {LIBRARY_HORIZON} [steps]",
+            le=100,
+            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {PLANNED_HORIZON}, and with "
+            f"solver.method `library` at most {LIBRARY_HORIZON} [steps]",
         ),
     ]
-    tau: Annotated[int, Meta(ge=1, le=20, description="delay τ of the terminal control law [steps]")]
+    tau: Annotated[
+        Annotated[int, Meta(ge=1, le=20)] | None, Meta(description="delay τ of the terminal control law [steps]")
+    ] = None
     delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")]
-    delta_u: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_u of the input constraints")]
-    delta_tau: Annotated[float, Meta(gt=0, lt=1, description="threshold δ_τ of Assumption 4.1")]
-    k_tau: Annotated[Rows, Meta(max_length=3, description="terminal gain K_τ (n_u, n_x)")]
+    delta_u: Annotated[Likelihood, Meta(description="likelihood δ_u of the input constraints")] = None
+    delta_tau: Annotated[Likelihood, Meta(description="threshold δ_τ of Assumption 4.1")] = None
+    k_tau: Annotated[Annotated[Rows, Meta(max_length=3)] | None, Meta(description="terminal gain K_τ (n_u, n_x)")] = (
+        None
+    )
     slack_linear: Annotated[
         float, Meta(ge=1e-6, le=1e12, description="exact penalty of a state-constraint slack, linear [cost per unit]")
     ]
     slack_quadratic: Annotated[float, Meta(ge=1e-6, le=1e12, description="the same, quadratic [cost per unit²]")]
     offset_weight: Annotated[
-        float,
-        Meta(
-            ge=1e-6,
-            le=1e12,
-            description="l1 weight T that pulls the artificial reference to the target [cost per unit]",
-        ),
-    ]
+        Annotated[float, Meta(ge=1e-6, le=1e12)] | None,
+        Meta(description="l1 weight T that pulls the artificial reference to the target [cost per unit]"),
+    ] = None
     terminal_weight: Annotated[
         float,
         Meta(
@@ -147,6 +154,11 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
             description="l1 weight of a missed terminal equality, when no equilibrium is in reach [cost per unit]",
         ),
     ] = 1e5
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether plans are made by the scheme with risk conditioned on the age."""
+        return self.scheme == "age-conditioned"
 
 
 class ScheduleConfig(Section, frozen=True, kw_only=True):
@@ -384,7 +396,7 @@ class Config(Section, frozen=True, kw_only=True):
     sets: SetsConfig
     cost: CostConfig
     smpc: SmpcConfig
-    schedule: ScheduleConfig
+    schedule: ScheduleConfig = ScheduleConfig()
     target: TargetConfig
     estimator: EstimatorConfig
     limits: LimitsConfig
@@ -409,7 +421,7 @@ class Config(Section, frozen=True, kw_only=True):
     @property
     def conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""
-        return self.smpc.scheme == "age-conditioned"
+        return self.smpc.conditioned
 
     @property
     def uses_library(self) -> bool:

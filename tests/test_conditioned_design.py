@@ -1,0 +1,165 @@
+"""Scheme `age-conditioned` without the other one's design: its own name, figures and start, from flight to replay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from loopback_rig import lockstep
+from msgspec.structs import replace
+
+from logs.design_view import design_view
+from logs.reader import header, read
+from logs.recorder import SyncRecorder
+from uavctl.build import build_conditioned, design_of, record_of, resting
+from uavctl.cli.app import run as main
+from uavctl.config import dump_config, load_config
+from uavctl.config.types import ScheduleConfig, SmpcConfig
+from uavctl.data import ControlMode, Decision, Header, Plan, SolveStatus, Truth
+from uavctl.smpc.age import at_most
+from uavctl.smpc.conditioned import METHOD
+from uavctl.smpc.conditioned_design import longest_gap
+from uavctl.smpc.link import bernoulli
+
+SCHEME = "smpc.scheme=age-conditioned"
+QUICK = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "sim.camera.rate_hz=50"]
+
+
+@pytest.fixture
+def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever makes a design of scheme `hahn-stursberg` fails."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("nothing of scheme `age-conditioned` asks for this")
+
+    for name in ("make_design", "check_schedule", "with_late", "build_rests", "design_record"):
+        monkeypatch.setattr(f"uavctl.build.{name}", refuse)
+    monkeypatch.setattr("uavctl.smpc.design.assembled", refuse)
+
+
+def quick(folder: Path) -> str:
+    """A file with 48 steps of 0.05 s, and none of the keys that the other scheme alone asks for."""
+    config = load_config("room", QUICK)
+    smpc = SmpcConfig(scheme="age-conditioned", horizon=48, delta_x=0.95, slack_linear=1e5, slack_quadratic=1e3)
+    file = folder / "quick.toml"
+    file.write_text(dump_config(replace(config, smpc=smpc, schedule=ScheduleConfig())), encoding="utf-8")
+    assert "k_tau" not in file.read_text(encoding="utf-8")
+    return str(file)
+
+
+@pytest.mark.usefixtures("_no_other_design", "no_page")
+def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, flight = quick(tmp_path), str(tmp_path / "flight.mcap")
+    assert main(["design", "--config", config, "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert main(["loopback", "--config", config, "--duration", "5", "--out", str(tmp_path), "--json"]) == 0
+    flown = json.loads(capsys.readouterr().out)
+    assert flown["steps"] > 80
+    told = header(Path(flight))
+    assert told.design_id == figures["design_id"] == told.design["design_id"]
+    assert {key: value for key, value in figures.items() if key != "wall_s"} == told.design
+    assert design_view(told).horizon == 48
+    assert main(["log", "replay", flight, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]
+    assert main(["log", "report", flight, "--json"]) == 0
+    assert main(["log", "whatif", flight, "--set", "link.loss=0.4", "--out", str(tmp_path / "whatif")]) == 0
+    assert main(["solve", "--config", config, "--state", "0,0,0,0,0,0,-1,0,0"]) == 0
+
+
+@pytest.mark.usefixtures("_no_other_design", "no_page")
+def test_places_that_the_scheme_cannot_rest_at_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["loopback", "--config", quick(tmp_path), "--duration", "1", "--out", str(tmp_path / "flight")]
+    assert main([*arguments, "--goto", "2.95,0,-1.2"]) != 0
+    assert "--goto: " in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("_no_other_design")
+@pytest.mark.parametrize("overrides", [["link.loss=0.6"], [*QUICK, "smpc.horizon=48", "link.loss=0.8"]])
+def test_losses_that_the_other_scheme_refuses_are_flown(overrides: list[str]) -> None:
+    flight = lockstep("room", 8.0, SCHEME, *overrides)
+    plans = flight.of(Plan)
+    assert {(plan.method, plan.status) for plan in plans} == {(METHOD, SolveStatus.OPTIMAL)}
+    assert {decision.mode for decision in flight.of(Decision)} == {ControlMode.WAIT, ControlMode.TRACK}
+    target = np.array(load_config("room").target.position_m)
+    assert np.linalg.norm(np.array(flight.of(Truth)[-1].position_m) - target) < 0.5
+
+
+def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["loopback", "--config", "room", "--set", SCHEME, "--set", "link.loss=0.9", "--out", str(tmp_path)]
+    assert main(arguments) == 2
+    assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
+
+
+def test_bench_says_that_it_is_of_the_other_scheme(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--config", "room", "--set", SCHEME]) == 2
+    assert "--set smpc.scheme=hahn-stursberg" in capsys.readouterr().err
+
+
+def test_the_name_is_of_what_the_answers_depend_on() -> None:
+    def name(*overrides: str) -> str:
+        return design_of(load_config("room", [SCHEME, *overrides])).design_id
+
+    same = [
+        "target.position_m=[0,0,-1]",
+        "smpc.tau=3",
+        "schedule.delays=[1]",
+        "smpc.k_tau=[[1.0]]",
+        "daemon.tick_s=0.1",
+    ]
+    assert {name(one) for one in same} == {name()}
+    others = [
+        "link.loss=0.2", "link.model=gilbert-elliott", "smpc.delta_x=0.9", "smpc.horizon=13", "cost.input=[1,1,1]",
+        "sets.input_upper=[2,2,2]", "plant.wind_std_mps2=[0.1,0.1,0.1]", "smpc.slack_linear=1e4", "source.rate_hz=20",
+        "estimator.bias_max=0.3",
+    ]  # fmt: skip
+    assert len({name(), *map(name, others)}) == len(others) + 1
+
+
+def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
+    config = load_config("room", [SCHEME])
+    design = build_conditioned(config)
+    assert resting(design) is design.rests
+    assert msgspec.json.decode(msgspec.json.encode(record_of(design)))["rests"] == design.rests.tolist()
+    exact = build_conditioned(load_config("room", [SCHEME, "risk.estimate=exact"]))
+    assert (exact.rests >= design.rests).all() and (exact.rests > design.rests).any()
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3, 0.6])
+def test_gaps_beyond_the_longest_are_rarer_than_what_is_allowed_outside(loss: float) -> None:
+    link = bernoulli(np.array([1.0 - loss]))
+    gap = longest_gap(link, 0.05, 12)
+    # A position is older than `gap` steps where more than so many were lost in a row.
+    assert 1.0 - at_most(link.age(40), 40, gap) <= 0.05
+    assert not gap or 1.0 - at_most(link.age(40), 40, gap - 1) > 0.05
+    assert longest_gap(bernoulli(np.array([0.01])), 0.05, 12) == 12
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_recording_under_the_name_of_the_other_design_replays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As they were made before the scheme had a design of its own."""
+    arguments = ["loopback", "--config", "room", "--set", SCHEME, "--duration", "3", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    old = tmp_path / "old.mcap"
+    recorder = SyncRecorder(old, load_config("room").log)
+    for topic, at_ns, record in read(tmp_path / "flight.mcap"):
+        if isinstance(record, Header):
+            design = {key: value for key, value in record.design.items() if key != "scheme"}
+            record = replace(record, design_id="3f1c9a", design=design)
+        elif isinstance(record, Plan):
+            record = replace(record, design_id="3f1c9a")
+        if not topic.startswith("/view/"):
+            recorder.put(topic, at_ns, record)
+    assert recorder.close().ok
+    capsys.readouterr()
+    assert main(["log", "replay", str(old), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]
+    assert main(["log", "report", str(old), "--json"]) == 0
