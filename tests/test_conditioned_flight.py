@@ -125,6 +125,21 @@ def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path)
     assert max(costs) < 1.03 * min(costs)
 
 
+def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
+    file = tmp_path / "fast.toml"
+    given = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "smpc.horizon=24"]
+    text = CAMPAIGN.partition("[[controller]]")[0].replace("paper", "room")
+    asked = f'{text}set = {given}\n[[controller]]\nname = "ours"\nkind = "smpc"\n'.replace("'", '"')
+    file.write_text(asked, encoding="utf-8")
+    (cell,) = cells_of(read_campaign(file)[0], lambda config, design: None)
+    assert cell.recipe is not None
+    # Where positions take longer than a step, none comes in its own, and each is lost with 30 %.
+    ages = met(cell.setting, 0, 400).newest[:, 12:]
+    older = np.mean(np.arange(12, 12 + ages.shape[1]) - ages >= 2)
+    risk = build_conditioned(cell.recipe.config).solver.risk
+    assert older == pytest.approx(1.0 - risk.weights[:2].sum(), abs=0.03)
+
+
 def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -126,7 +126,7 @@ def compose(spec: CampaignSpec, configuration: str, told: Told | None = None) ->
         base=base,
         flown_link=tuple(one for one in links if one),
         flown_plant=tuple(one for one in plants if one),
-        believed={key: one for key, one in believed.items() if one},
+        believed={key: _one_a_step(one) for key, one in believed.items() if one},
     )
 
 
@@ -142,6 +142,13 @@ def campaign_of(document: Mapping[str, object]) -> Campaign:
     except msgspec.ValidationError as error:
         raise ConfigError((f"campaign.json: {error}; use the version that flew the campaign",)) from error
     return compose(spec, configuration)
+
+
+def _one_a_step(believed: Config) -> Config:
+    """A campaign's links carry one position a step: a scheme that counts on all there are has to know."""
+    if not believed.conditioned:
+        return believed
+    return msgspec.structs.replace(believed, source=msgspec.structs.replace(believed.source, rate_hz=0.0))
 
 
 def _own(told: Told, table: str, index: int, overrides: Sequence[str]) -> Placed:
