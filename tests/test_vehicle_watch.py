@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from mavlink_rig import OFFBOARD, SECOND, Peer, events, make_link, statuses
+from mavlink_rig import OFFBOARD, SECOND, Peer, events, make_link, read, statuses
+from scipy.spatial.transform import Rotation
 
 from uavctl.config.peers import DaemonConfig
-from uavctl.data import VehicleStatus
+from uavctl.config.types import EstimatorConfig
+from uavctl.data import InertialSample, VehicleStatus
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS
+from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS
 
 NOW = 1000 * SECOND
 WRAP_MS = 2**32
@@ -127,3 +130,66 @@ def test_a_vehicle_that_is_gone_from_the_ground_gives_its_place_and_one_in_the_a
         assert link.vehicle == ((9, 1) if armed else (1, 1))
         if found:  # nothing is armed that was ordered for the first one
             assert not found[0].alone and found[0].boots == 1
+
+
+# Inertial data
+
+PX4, ARDUPILOT = 12, 3
+
+
+def felt(link: Link, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw: bool = False) -> list[InertialSample]:
+    name, rest = ("raw_imu", (0,) * 6) if raw else ("highres_imu", (*(0.0,) * 10, 0))
+    items = link.receive(vehicle.send(name, 0, *force, *rest), at_ns)
+    return [item for item in items if isinstance(item, InertialSample)]
+
+
+@pytest.mark.parametrize("quaternion", [False, True])
+def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(quaternion: bool) -> None:
+    link, vehicle = heard()
+    assert felt(link, vehicle, (1.0, 0.0, -9.0), NOW) == []  # no attitude yet
+    turn = Rotation.from_euler("ZYX", (2.0, -0.2, 0.1))
+    if quaternion:
+        w, x, y, z = turn.as_quat(scalar_first=True)
+        link.receive(vehicle.send("attitude_quaternion", 0, w, x, y, z, 0.0, 0.0, 0.0), NOW)
+    else:
+        link.receive(vehicle.send("attitude", 0, 0.1, -0.2, 2.0, 0.0, 0.0, 0.0), NOW)
+    force = (0.5, -0.25, -9.5)
+    (sample,) = felt(link, vehicle, force, NOW + TURNED_NS)
+    assert sample.at_ns == NOW + TURNED_NS
+    assert sample.accel_mps2 == pytest.approx(turn.apply(force) + np.array([0.0, 0.0, 9.80665]), abs=1e-6)
+    assert felt(link, vehicle, force, NOW + TURNED_NS + 1) == []  # the attitude is too old
+    assert felt(link, vehicle, (float("nan"), 0.0, 0.0), NOW) == []
+    assert felt(link, Peer(1, 100), force, NOW) == felt(link, Peer(9, 1), force, NOW) == []  # a camera, another one
+
+
+def test_raw_inertial_data_have_ardupilots_unit_and_are_taken_from_it_only() -> None:
+    for autopilot in (PX4, ARDUPILOT):
+        link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
+        link.receive(vehicle.heartbeat(autopilot=autopilot), NOW)
+        link.receive(vehicle.send("attitude", 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
+        told = felt(link, vehicle, (100, -200, -1000), NOW, raw=True)
+        accels = [sample.accel_mps2 for sample in told]
+        wanted = [pytest.approx((0.980665, -1.96133, 0.0), abs=1e-9)] if autopilot == ARDUPILOT else []
+        assert accels == wanted
+
+
+@pytest.mark.parametrize(("autopilot", "ids"), [(PX4, {31, 105}), (ARDUPILOT, {30, 27})])
+def test_inertial_data_are_asked_for_where_they_are_used_until_they_come(autopilot: int, ids: set[int]) -> None:
+    def asked(inertial_std_mps2: float, *, tells: bool) -> list[set[tuple[int, float]]]:
+        estimator = EstimatorConfig(position_std_m=0.005, inertial_std_mps2=inertial_std_mps2)
+        link, vehicle, out = make_link(estimator=estimator), Peer(1, 1), []
+        link.receive(vehicle.heartbeat(autopilot=autopilot), NOW)
+        for second in range(20):
+            at_ns = NOW + second * SECOND
+            link.receive(vehicle.heartbeat(autopilot=autopilot), at_ns)
+            if tells and second > 4:
+                link.receive(vehicle.send("highres_imu", 0, 0.0, 0.0, -9.8, *(0.0,) * 10, 0), at_ns)
+            told = [one for data in link.due(at_ns) for one in read(data) if one.get_type() == "COMMAND_LONG"]
+            out.append({(int(one.param1), one.param2) for one in told if one.command == 511})
+        return [one for one in out if one]
+
+    every = {(number, 20_000.0) for number in ids}
+    silent = asked(0.1, tells=False)
+    assert len(silent) == 5 and all(every <= one for one in silent)
+    assert [every <= one for one in asked(0.1, tells=True)][:3] == [True, True, False]
+    assert not any(every & one for one in asked(0.0, tells=False))

@@ -271,6 +271,9 @@ def build_estimator(config: Config) -> EstimatorParameters:
         max_velocity_mps=estimator.max_velocity_mps,
         bias_drift=estimator.bias_drift,
         bias_max=estimator.bias_max,
+        inertial_std_mps2=estimator.inertial_std_mps2,
+        inertial_bias_mps2=estimator.inertial_bias_mps2,
+        inertial_bias_s=estimator.inertial_bias_s,
     )
 
 
@@ -350,4 +353,5 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         ),
         dt_ns=round(config.plant.dt_s * NANOSECONDS),
         tick_ns=round(config.daemon.tick_s * NANOSECONDS),
+        dead_ns=round(config.plant.dead_time_s * NANOSECONDS),
     )

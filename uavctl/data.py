@@ -65,6 +65,13 @@ class PositionSample(Record, frozen=True, kw_only=True):
     seq: int
 
 
+class InertialSample(Record, frozen=True, kw_only=True):
+    """Acceleration that the vehicle's inertial sensors show, turned into local NED by its own attitude."""
+
+    at_ns: int  # time of arrival
+    accel_mps2: Vec3  # gravity is in it: zero at rest
+
+
 class Estimate(Record, frozen=True, kw_only=True):
     """State estimate at `at_ns`; `captured_ns` is the capture time of the newest sample in it."""
 
@@ -224,6 +231,7 @@ class StepInput(Record, frozen=True, kw_only=True):
     samples: tuple[PositionSample, ...] = ()
     vehicle: VehicleStatus | None = None
     motion: VehicleMotion | None = None
+    inertial: tuple[InertialSample, ...] = ()  # since the tick before
     missed_ticks: int = 0
     stop: bool = False  # the operator asks for the hand-over
     commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came

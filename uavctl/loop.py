@@ -19,6 +19,7 @@ from uavctl.data import (
     Decision,
     Estimate,
     Event,
+    InertialSample,
     LinkEstimate,
     Outgoing,
     PositionSample,
@@ -40,10 +41,13 @@ from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.sight import View
 from uavctl.smpc.plant import Plant
 
+Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | Text
+
 VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 MAX_ORDERS = 16  # that wait for one tick
+MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
@@ -87,7 +91,9 @@ class ControlLoop:
         self._config = config.hand_over
         self._heard: tuple[Ack | Text, ...] = ()
         self._state = initial_state()
-        self._inbox: deque[tuple[int, PositionSample | VehicleStatus | VehicleMotion | Ack | Text]] = deque()
+        self._inbox: deque[tuple[int, Heard]] = deque()
+        self._feels = config.estimator.inertial_std_mps2 > 0.0
+        self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
         self._unsure_since_ns: int | None = None  # what the vehicle said then was lost unread
@@ -145,7 +151,7 @@ class ControlLoop:
             self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._put("/uavctl/event", at_ns, item)
-            else:
+            elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
                 self.heard_source = source.settled
@@ -219,6 +225,7 @@ class ControlLoop:
             samples=samples,
             vehicle=self._hand_over.flown(at_ns, self.vehicle),
             motion=self._motion,
+            inertial=self._inertial,
             missed_ticks=missed_ticks,
             stop=stop,
             commands=tuple(self._orders),
@@ -240,19 +247,22 @@ class ControlLoop:
         samples: list[PositionSample] = []
         heard: list[VehicleStatus] = []
         words: list[Ack | Text] = []
-        waiting: deque[tuple[int, PositionSample | VehicleStatus | VehicleMotion | Ack | Text]] = deque()
+        felt: list[InertialSample] = []
+        waiting: deque[tuple[int, Heard]] = deque()
         for received_ns, item in self._inbox:
             if isinstance(item, VehicleStatus):
                 heard.append(item)
             elif isinstance(item, VehicleMotion):
                 self._motion = item
-            elif not isinstance(item, PositionSample):
+            elif not isinstance(item, PositionSample | InertialSample):
                 words.append(item)
-            elif received_ns <= at_ns:
+            elif received_ns <= at_ns and isinstance(item, InertialSample):
+                felt.append(item)
+            elif received_ns <= at_ns and isinstance(item, PositionSample):
                 samples.append(item)
             else:
                 waiting.append((received_ns, item))
-        self._inbox = waiting
+        self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
         flown = self._hand_over.state is State.ENGAGED
         left = [status for status in heard if flown and self._hand_over.has_left(status)]
         self.vehicle = next(iter(left or heard[::-1]), self.vehicle)

@@ -84,6 +84,10 @@ class PlantConfig(Section, frozen=True, kw_only=True):
             description="standard deviation of the acceleration noise, constant over Δt [m/s²], with model `drag-lag`",
         ),
     ] = ()
+    dead_time_s: Annotated[
+        float,
+        Meta(ge=0, le=1, description="time from sending an input until it begins to act, all axes [s]"),
+    ] = 0.0
 
 
 class SetsConfig(Section, frozen=True, kw_only=True):
@@ -301,6 +305,28 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
             "with bias_drift above 0 [input units]",
         ),
     ] = 0.0
+    inertial_std_mps2: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=100,
+            description="standard deviation of the acceleration that the vehicle's own inertial sensors and attitude "
+            "show in a tick, each axis; they are asked for, and move the estimate between positions; 0: they are not "
+            "used [m/s²]",
+        ),
+    ] = 0.0
+    inertial_bias_mps2: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=100,
+            description="standard deviation of what they are off for longer: a bias, an attitude that is not level "
+            "(1° is 0.17 m/s²); the filter estimates it [m/s²]",
+        ),
+    ] = 0.1
+    inertial_bias_s: Annotated[
+        float, Meta(ge=0.1, le=LONGEST_S, description="time in which that comes and goes [s]")
+    ] = 20.0
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ import msgspec
 
 from uavctl.data import Command, ControlMode, Plan, Vec3
 from uavctl.flight.envelope import NOT_WATCHING, OF_POSITIONS, Breach, EnvelopeParameters, Watching
-from uavctl.flight.estimator import History
+from uavctl.flight.estimator import Coming, History
 from uavctl.flight.fallback import Biases, End, Fallback, FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
@@ -40,6 +40,7 @@ class Controller:
         tick_ns: Time between ticks [ns]; divides Δt.
         link: What the estimate of the link goes by.
         envelope: What is possible; None: nothing is held against it.
+        dead_ns: From sending an input until it begins to act [ns].
         late_steps: Age up to which the solver counts what it has not seen since [steps].
         kalman: The filter, made from the others.
         reach: Where the vehicle can be, made from the others.
@@ -61,6 +62,7 @@ class Controller:
     dt_ns: int
     tick_ns: int
     link: LinkEstimateParameters
+    dead_ns: int = 0
     late_steps: int = 0
     envelope: EnvelopeParameters | None = None
     kalman: Kalman = field(init=False, repr=False)
@@ -102,6 +104,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
         biases: Estimated biases of late.
         taken_back: The step in which positions were last taken back; None for none.
+        coming: Inputs that were sent and do not act yet, oldest first.
     """
 
     history: History | None = None
@@ -120,6 +123,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     recalled: bool = False
     biases: Biases = ()
     taken_back: int | None = None
+    coming: Coming = ()
 
     @property
     def disbelieves(self) -> bool:

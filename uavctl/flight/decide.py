@@ -13,7 +13,7 @@ from uavctl.data import ControlMode, Estimate, Plan, PositionSample, SolveStatus
 from uavctl.flight import envelope
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.estimator import History, belief_at, estimate, estimated, newest_capture_ns
+from uavctl.flight.estimator import History, belief_ahead, belief_at, estimated, felt_ns, newest_capture_ns
 from uavctl.flight.fallback import End, Fallback
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
@@ -127,13 +127,12 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     if state.fallback is not None and state.fresh < controller.fallback.recover_samples:
         reason = f"{state.fresh} of {controller.fallback.recover_samples} fresh samples in a row"
         return _fall(state, state.fallback, tick, inp, controller, reason)
-    on_time = at_ns == tick.boundary_ns
-    base = tick.estimate if on_time else estimate(controller.kalman, tick.history, tick.boundary_ns)
+    base = _base(state, tick, inp, controller)
     if base is None:
         return Choice(state, "no estimate of this boundary")
-    mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
+    mission = advance(controller.mission, state.mission, base.mean, base.at_ns)
     state = replace(state, mission=mission)
-    if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
+    if controller.mission.land and state.order is None and over(controller.mission, mission, base.at_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
         return _fall(state, landing, tick, inp, controller, MISSION_OVER)
     choice = _replan(state, mission, base, tick, controller)
@@ -144,22 +143,42 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     return replace(choice, state=fallen.state, reason=fallen.reason)
 
 
+def _base(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Estimate | None:
+    """The estimate that a plan begins with: where the first input that is sent now begins to act."""
+    if inp.at_ns == tick.boundary_ns and not controller.dead_ns:
+        return tick.estimate
+    kalman = controller.kalman
+    belief = belief_ahead(kalman, tick.history, state.coming, tick.boundary_ns, controller.dead_ns)
+    return None if belief is None else estimated(kalman, belief)
+
+
 def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Tick, controller: Controller) -> Choice:
     """Ask for a plan if there is news, as ordered; else, or if that fails, the old one plays out."""
-    if state.plan is not None and base.captured_ns <= state.plan.captured_ns:
+    news = state.plan is None or base.captured_ns > state.plan.captured_ns
+    if not news and not _felt_since(state, tick, controller):
         return Choice(state, "no news: the plan plays out")
-    reason = "news: a new plan" if state.order is None else f"news: a new plan, as ordered: {told(state.order)}"
-    mission = obey(controller.mission, mission, state.order, base.mean, tick.boundary_ns)
-    mission = lead(controller.mission, mission, base.mean, tick.boundary_ns)
+    reason = "news: a new plan" if news else "inertial data: a new plan"
+    if state.order is not None:
+        reason = f"{reason}, as ordered: {told(state.order)}"
+    mission = obey(controller.mission, mission, state.order, base.mean, base.at_ns)
+    mission = lead(controller.mission, mission, base.mean, base.at_ns)
     state = replace(state, mission=mission, order=None)
-    target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
+    target, outlook = ask_for(controller.mission, mission, base.at_ns)
     late = min(tick.age_steps or 0, controller.late_steps)
     outlook = Outlook(limits=outlook.limits, path=outlook.path, late=late, cov=np.array(base.cov))
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:
-        return Choice(state, "no new plan: the old one plays out", True, asked.status, None, asked.text)
-    return Choice(replace(state, plan=asked.plan, fallback=None), reason, True, asked.status, asked.plan)
+        return Choice(state, "no new plan: the old one plays out", news, asked.status, None, asked.text)
+    return Choice(replace(state, plan=asked.plan, fallback=None), reason, news, asked.status, asked.plan)
+
+
+def _felt_since(state: ControlState, tick: Tick, controller: Controller) -> bool:
+    """Whether inertial data have come since the plan was made, and the solver counts the age of what it is made of."""
+    if state.plan is None or (tick.age_steps or 0) > controller.late_steps:
+        return False
+    newest_ns = felt_ns(tick.history)
+    return newest_ns is not None and newest_ns > state.plan.base_ns - controller.dead_ns
 
 
 def _fall(

@@ -7,15 +7,17 @@ late one a recomputation from its place on: the result is the same to the last b
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
-from uavctl.data import Estimate, PositionSample
-from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, first_belief, predicted, updated
+from uavctl.data import Estimate, InertialSample, PositionSample
+from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, felt, first_belief, predicted, updated
 
 DUPLICATE = "sample-duplicate"
 TOO_OLD = "sample-too-old"
@@ -25,8 +27,9 @@ TOO_OLD = "sample-too-old"
 LATEST_STAMP_NS = 20_000_000
 
 # Order of what happens at one instant; a sample sees the input before its change, which is the same state.
-_SAMPLE, _INPUT, _MARK = 0, 1, 2
+_SAMPLE, _FELT, _INPUT, _MARK = 0, 1, 2, 3
 
+Coming = tuple[tuple[int, Array | None], ...]  # (when it begins to act [ns], input), oldest first
 Key = tuple[int, int, str, int]  # time, kind, source, capture time as stamped
 _KEY = attrgetter("key")
 
@@ -42,12 +45,13 @@ class Node(msgspec.Struct, frozen=True, eq=False):
 
 
 class Entry(msgspec.Struct, frozen=True, eq=False):
-    """One happening: a sample, an input change, or neither (a boundary, where a belief is kept)."""
+    """One happening: a sample, inertial data, an input change, or none (a boundary, where a belief is kept)."""
 
     key: Key
     sample: PositionSample | None
     input: Array | None  # of an input change; None: others fly from here on
     after: Node
+    accel_mps2: Array | None = None  # of inertial data: what they show of each axis of the plant
 
 
 class History(msgspec.Struct, frozen=True, eq=False):
@@ -128,6 +132,36 @@ def absorb(
     return history, tuple(taken), tuple(refused)
 
 
+def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) -> History:
+    """Take the inertial data of a tick as what they are in the mean, at the mean of their times.
+
+    One that is no number, or that says to the last bit what the one before did, says nothing.
+    """
+    told = [one for one, before in zip(samples, (None, *samples), strict=False) if _says_something(one, before)]
+    if not told or not kalman.n_felt:
+        return history
+    at_ns = sum(one.at_ns for one in told) // len(told)
+    if at_ns <= history.horizon_ns:
+        return history
+    accel = np.array([one.accel_mps2 for one in told]).mean(axis=0)[list(kalman.axes)]
+    key = (at_ns, _FELT, "", at_ns)
+    new = Entry(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
+    return _inserted(kalman, history, new, None)
+
+
+def _says_something(sample: InertialSample, before: InertialSample | None) -> bool:
+    told = all(map(math.isfinite, sample.accel_mps2))
+    return told and (before is None or before.accel_mps2 != sample.accel_mps2)
+
+
+def felt_ns(history: History) -> int | None:
+    """Time of the newest inertial data of the window; None without any."""
+    for entry in reversed(history.entries):
+        if entry.accel_mps2 is not None:
+            return entry.key[0]
+    return None
+
+
 def _known_already(entries: Sequence[Entry], key: Key) -> bool:
     """Whether a source has said something of this capture time, as stamped; near it, as stamps lie near arrivals."""
     first = bisect_left(entries, key[3] - LATEST_STAMP_NS, key=lambda entry: entry.key[0])
@@ -170,6 +204,29 @@ def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, bel
     return replace(history, entries=(*history.entries[:place], entry, *marks))
 
 
+def act(kalman: Kalman, history: History, coming: Coming, at_ns: int) -> tuple[History, Coming]:
+    """Note the inputs that have begun to act by `at_ns`; those that have not are left."""
+    for due_ns, u in coming:
+        if due_ns > at_ns:
+            break
+        history = set_input(kalman, history, due_ns, u)
+        coming = coming[1:]
+    return history, coming
+
+
+def belief_ahead(kalman: Kalman, history: History, coming: Coming, at_ns: int, ahead_ns: int) -> Belief | None:
+    """The belief of `at_ns`, see `belief_at`, moved on by `ahead_ns` with the inputs that were sent."""
+    belief = belief_at(kalman, history, at_ns)
+    if belief is None or not ahead_ns:
+        return belief
+    u = _known(history, at_ns).input
+    acted = [(entry.key[0], entry.input) for entry in history.entries if entry.key[1] == _INPUT]
+    for due_ns, after in (*acted, *coming):
+        if at_ns < due_ns < at_ns + ahead_ns:
+            belief, u = predicted(kalman, history.origin_ns, belief, u, due_ns), after
+    return predicted(kalman, history.origin_ns, belief, u, at_ns + ahead_ns)
+
+
 def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
     """Estimate at `at_ns` from all that had happened by then; None before the first sample.
 
@@ -181,13 +238,13 @@ def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
 
 def estimated(kalman: Kalman, belief: Belief) -> Estimate:
     """What a belief says to others."""
-    n_x, largest = kalman.n_x - kalman.n_bias, kalman.parameters.bias_max
+    bias, largest = kalman.bias, kalman.parameters.bias_max
     return Estimate(
         at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,
-        mean=tuple(belief.mean[:n_x].tolist()),
-        cov=tuple(map(tuple, belief.cov[:n_x, :n_x].tolist())),
-        bias=tuple(belief.mean[n_x : kalman.n_x].clip(-largest, largest).tolist()),
+        mean=tuple(belief.mean[: bias.start].tolist()),
+        cov=tuple(map(tuple, belief.cov[: bias.start, : bias.start].tolist())),
+        bias=tuple(belief.mean[bias].clip(-largest, largest).tolist()),
     )
 
 
@@ -258,4 +315,6 @@ def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry, belief: Bel
         belief = predicted(kalman, origin_ns, node.belief, node.input, entry.key[0])
     if entry.sample is not None:
         belief = first_belief(kalman, entry.sample) if belief is None else updated(kalman, belief, entry.sample)
+    elif entry.accel_mps2 is not None and belief is not None:
+        belief = felt(kalman, belief, entry.accel_mps2, node.input)
     return Node(belief=belief, input=entry.input if entry.key[1] == _INPUT else node.input)

@@ -6,6 +6,9 @@ mean 0, covariance W, uncorrelated with x. With u piecewise constant this is exa
 
 Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.bias`). While others fly the
 vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
+
+Where the vehicle's inertial data are used, x is (x, d, b): they show the acceleration of each axis plus b, which comes
+and goes slowly: a bias of the sensors, and an attitude that is not quite level.
 """
 
 from __future__ import annotations
@@ -19,10 +22,13 @@ from numpy.typing import NDArray
 from uavctl.data import PositionSample, Vec3
 from uavctl.flight.limits import AXES
 from uavctl.flight.propagation import Propagation, make_propagation
-from uavctl.smpc.bias import with_bias
+from uavctl.smpc.bias import with_bias, with_wander
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
+
+# Inertial data further from the prediction than this many standard deviations, in any axis, are not believed.
+FELT_SIGMA = 6.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,9 @@ class EstimatorParameters:
         max_velocity_mps: Largest plausible velocity, each axis [m/s].
         bias_drift: Standard deviation of what an input's bias gains in a second [input units / √s]; 0: there is none.
         bias_max: Largest bias that is counted on, each input [input units]; it begins with a quarter as deviation.
+        inertial_std_mps2: Standard deviation of the inertial data of a tick, each axis [m/s²]; 0: they are not used.
+        inertial_bias_mps2: Standard deviation of what they are off for longer [m/s²].
+        inertial_bias_s: Time in which that comes and goes [s].
     """
 
     position_std_m: float
@@ -48,6 +57,9 @@ class EstimatorParameters:
     max_velocity_mps: float
     bias_drift: float = 0.0
     bias_max: float = 0.0
+    inertial_std_mps2: float = 0.0
+    inertial_bias_mps2: float = 0.1
+    inertial_bias_s: float = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +69,15 @@ class Kalman:
     Attributes:
         propagation: F and G of z = (x, w).
         w: Covariance W (n_w, n_w).
-        n_x: Number of states, with the biases.
+        n_x: Number of states: the plant's, the biases, and what inertial data are off.
         n_u: Number of inputs.
-        n_bias: Number of biases, the last of the states: n_u, or 0 where none is estimated.
+        n_bias: Number of biases, behind the plant's states: n_u, or 0 where none is estimated.
+        n_felt: Number of axes of inertial data, the last of the states: 0 where they are not used.
         axes: Index (0 north, 1 east, 2 down) of each axis that the plant has.
         shown: State index of each axis' position, then of each axis' velocity.
         parameters: Noise and window.
+        felt_z: What inertial data show of z (n_felt, n_x + n_w).
+        felt_u: What they show of the input (n_felt, n_u).
     """
 
     propagation: Propagation
@@ -70,9 +85,17 @@ class Kalman:
     n_x: int
     n_u: int
     n_bias: int
+    n_felt: int
     axes: tuple[int, ...]
     shown: NDArray[np.intp]
     parameters: EstimatorParameters
+    felt_z: Array
+    felt_u: Array
+
+    @property
+    def bias(self) -> slice:
+        """Where the biases are among the states."""
+        return slice(self.n_x - self.n_felt - self.n_bias, self.n_x - self.n_felt)
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
@@ -86,17 +109,27 @@ class Belief(msgspec.Struct, frozen=True, eq=False):
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
     """The filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
-    n_bias = plant.n_u if parameters.bias_drift else 0
-    seen = with_bias(plant, parameters.bias_drift) if n_bias else plant
+    n_bias, feels = plant.n_u if parameters.bias_drift else 0, parameters.inertial_std_mps2 > 0.0
+    seen = with_bias(plant, parameters.bias_drift, force=feels) if n_bias else plant
+    n_felt = len(plant.axes) if feels else 0
+    if n_felt:
+        seen = with_wander(seen, np.full(n_felt, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
+    # An acceleration is the slope of a velocity: z is (x, w), and w is held between boundaries.
+    slopes = seen.generator[list(plant.velocity_index)] if feels else np.zeros((0, seen.n_x + seen.n_u + seen.n_w))
+    felt_z = np.delete(slopes, slice(seen.n_x, seen.n_x + seen.n_u), axis=1)
+    felt_z[:, seen.n_x - n_felt : seen.n_x] += np.eye(n_felt)
     return Kalman(
         propagation=make_propagation(seen, dt_ns),
         w=seen.w,
         n_x=seen.n_x,
         n_u=plant.n_u,
         n_bias=n_bias,
+        n_felt=n_felt,
         axes=tuple(AXES.index(axis) for axis in plant.axes),
         shown=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
         parameters=parameters,
+        felt_z=felt_z,
+        felt_u=slopes[:, seen.n_x : seen.n_x + seen.n_u],
     )
 
 
@@ -139,7 +172,7 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
 
 def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
     """Put the biases of a belief back to what they begin with, in place."""
-    bias = slice(kalman.n_x - kalman.n_bias, kalman.n_x)
+    bias = kalman.bias
     mean[bias] = 0.0
     cov[bias] = 0.0
     cov[:, bias] = 0.0
@@ -160,6 +193,9 @@ def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     cov[n_x:, n_x:] = kalman.w
     if kalman.n_bias:
         _forget_bias(kalman, mean, cov)
+    if kalman.n_felt:
+        felt = slice(n_x - kalman.n_felt, n_x)
+        cov[felt, felt] = np.eye(kalman.n_felt) * kalman.parameters.inertial_bias_mps2**2
     at_ns = captured_ns(sample)
     return Belief(at_ns=at_ns, captured_ns=at_ns, mean=mean, cov=cov)
 
@@ -177,6 +213,32 @@ def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
         at_ns=belief.at_ns,
         captured_ns=captured_ns(sample),
         mean=belief.mean + gain @ (values - belief.mean[index]),
+        cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+    )
+
+
+def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> Belief:
+    """Kalman update with an acceleration (n_felt,) under an input (n_u,); the belief itself where it cannot be so.
+
+    Raises:
+        ValueError: The filter uses no inertial data.
+    """
+    if not kalman.n_felt:
+        raise ValueError("this filter uses no inertial data")
+    of_z, noise = kalman.felt_z, np.eye(kalman.n_felt) * kalman.parameters.inertial_std_mps2**2
+    off = accel_mps2 - of_z @ belief.mean
+    if u is not None:
+        off -= kalman.felt_u @ u
+    ph = belief.cov @ of_z.T
+    shown = of_z @ ph + noise
+    if not bool((np.square(off) <= FELT_SIGMA**2 * np.diagonal(shown)).all()):
+        return belief
+    gain = np.linalg.solve(shown, ph.T).T
+    keep = np.eye(len(belief.mean)) - gain @ of_z
+    return Belief(
+        at_ns=belief.at_ns,
+        captured_ns=belief.captured_ns,
+        mean=belief.mean + gain @ off,
         cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
     )
 

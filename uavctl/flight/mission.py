@@ -260,12 +260,17 @@ def over(mission: Mission, state: MissionState, at_ns: int) -> bool:
 
 
 def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
-    """State (n_x,) that the mission, or the operator, wants the vehicle to be in at a boundary."""
+    """State (n_x,) that the mission, or the operator, wants the vehicle to be in at a time."""
     if state.stay is not None:
         return state.stay
     if mission.trajectory is None:
         return tuple(mission.waypoints[state.waypoint].target.tolist())
-    return tuple(mission.trajectory.states[_row(mission, state, at_ns, mission.trajectory)].tolist())
+    states, since_ns = mission.trajectory.states, max(at_ns - state.start_ns - state.paused_ns, 0)
+    row, into_ns = divmod(since_ns, mission.dt_ns)
+    if row + 1 >= len(states):
+        return tuple(states[-1].tolist())
+    part = into_ns / mission.dt_ns
+    return tuple(((1.0 - part) * states[row] + part * states[row + 1]).tolist() if part else states[row].tolist())
 
 
 def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Outlook]:

@@ -30,7 +30,7 @@ from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, is_outside, watch
-from uavctl.flight.estimator import begin, set_input, without
+from uavctl.flight.estimator import act, begin, feel, set_input, without
 from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
@@ -97,11 +97,14 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     """
     origin_ns = inp.at_ns - inp.tick * controller.tick_ns
     history = state.history or begin(controller.kalman, origin_ns, inp.at_ns)
+    history, coming = act(controller.kalman, history, state.coming, inp.at_ns)
     intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
     before = state.mode
     lost = intake.moved and before in _NOT_FLOWN
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
+    if inp.inertial:
+        intake = replace(intake, history=feel(controller.kalman, intake.history, inp.inertial))
     tick = place(state, inp, intake.history, controller)
     recalled = _recalled(state, tick, inp, controller)
     watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
@@ -124,6 +127,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     begun = replace(
         ordered,
         history=intake.history,
+        coming=coming,
         trust=intake.trust,
         decided_step=tick.number,
         fresh=0 if stale else intake.fresh,
@@ -139,11 +143,16 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     acting = None if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
     alarms = state.link_alarms if link is None else _alarms(link, state.link_alarms)
+    if controller.dead_ns:
+        history, coming = intake.history, (*coming, (inp.at_ns + controller.dead_ns, acting))
+    else:
+        history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
     after = replace(
         choice.state,
         link=belief,
         link_alarms=alarms,
-        history=set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief),
+        history=history,
+        coming=coming,
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
     plan, mission = choice.state.plan, choice.state.mission

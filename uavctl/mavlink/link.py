@@ -10,7 +10,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Event, LinkStats, PositionSample, Setpoint, Severity, Vec3, VehicleMotion, VehicleStatus
+from uavctl.data import (
+    Event,
+    InertialSample,
+    LinkStats,
+    PositionSample,
+    Setpoint,
+    Severity,
+    Vec3,
+    VehicleMotion,
+    VehicleStatus,
+)
 from uavctl.frames import Quaternion
 from uavctl.mavlink.clocksync import RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
@@ -41,7 +51,7 @@ UNANSWERED = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
 
-Item = PositionSample | VehicleStatus | VehicleMotion | Event | Ack | Text
+Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
 
 class Link:
@@ -78,7 +88,7 @@ class Link:
         self._encoder = Encoder(*self._own)
         self._intake = PositionIntake(frame, clock, source, estimator, self._count)
         self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id)
-        self._streams, self._globe = Streams(), Globe()
+        self._streams, self._globe = Streams(inertial=estimator.inertial_std_mps2 > 0.0), Globe()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
@@ -160,7 +170,8 @@ class Link:
             self._open.append(at_ns)
             out.append(self._encoder.timesync(0, at_ns))
         if VEHICLE in self._roles and self._vehicle.address is not None:
-            out += [self.request_stream(number, rate_hz) for number, rate_hz in self._streams.due(at_ns)]
+            wanted = self._streams.due(at_ns, self._vehicle.autopilot)
+            out += [self.request_stream(number, rate_hz) for number, rate_hz in wanted]
         return tuple(out)
 
     def setpoint(self, setpoint: Setpoint) -> bytes:

@@ -94,9 +94,21 @@ class Origin(Message, frozen=True, kw_only=True):
 
 
 class Attitude(Message, frozen=True, kw_only=True):
-    """ATTITUDE: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
+    """ATTITUDE or ATTITUDE_QUATERNION: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
 
     angles_rad: Vec3
+
+
+class Inertial(Message, frozen=True, kw_only=True):
+    """HIGHRES_IMU or RAW_IMU: specific force, body axes forward, right, down [m/s²].
+
+    Attributes:
+        specific_force_mps2: that; (0, 0, -g) at rest.
+        raw: it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g.
+    """
+
+    specific_force_mps2: Vec3
+    raw: bool = False
 
 
 class ParamValue(Message, frozen=True, kw_only=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uavctl.mavlink.messages import Attitude, Battery, Landed, Message, Origin, ParamValue, Position
+from uavctl.mavlink.messages import Attitude, Battery, Inertial, Landed, Message, Origin, ParamValue, Position
 
 SECOND_NS = 1_000_000_000
 SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
@@ -11,17 +11,28 @@ TRIES = 5
 ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
 
 LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
+ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
 GPS_GLOBAL_ORIGIN = 49
 RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0}
+
+# What turns and what shows the acceleration, as each autopilot has it.
+INERTIAL_HZ = 50.0
+INERTIAL = {"px4": (ATTITUDE_QUATERNION, HIGHRES_IMU), "ardupilot": (ATTITUDE, RAW_IMU)}
 
 SOURCE_PARAMETER = "EK3_SRC1_POSXY"
 EXTERNAL = 6.0  # of the source: external positions
 
 
 class Streams:
-    """Asks for the messages that do not come by themselves, a few times."""
+    """Asks for the messages that do not come by themselves, a few times.
 
-    def __init__(self) -> None:
+    Args:
+        inertial: ask for the vehicle's inertial data, too.
+    """
+
+    def __init__(self, *, inertial: bool = False) -> None:
+        self._inertial = inertial
+        self._feels = False  # inertial data have come since they were asked for
         self._seen: set[int] = set()
         self._next_ns: int | None = None
         self._tries = 0
@@ -37,13 +48,16 @@ class Streams:
                 self._seen.add(EXTENDED_SYS_STATE)
             case Battery():
                 self._seen.add(SYS_STATUS)
+            case Inertial():
+                self._feels = self._tries > 0
 
     def restart(self) -> None:
         """The vehicle has started anew and may have forgotten them."""
         self._seen.clear()
+        self._feels = False
         self._next_ns, self._tries = None, 0
 
-    def due(self, at_ns: int) -> tuple[tuple[int, float], ...]:
+    def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
         """(message id, rate [1/s]) of what is to be asked for now; to be called once a vehicle is heard."""
         if self._next_ns is None:
             self._next_ns = at_ns + SETTLE_NS
@@ -51,7 +65,10 @@ class Streams:
             return ()
         self._next_ns = at_ns + AGAIN_NS
         self._tries += 1
-        return tuple((number, rate) for number, rate in RATES_HZ.items() if number not in self._seen)
+        wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
+        if self._inertial and not self._feels:
+            wanted.update(dict.fromkeys(INERTIAL.get(autopilot, ()), INERTIAL_HZ))
+        return tuple(wanted.items())
 
 
 class Globe:

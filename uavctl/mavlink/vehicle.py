@@ -7,8 +7,9 @@ from collections.abc import Callable
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Event, Severity, Vec3, VehicleMotion, VehicleStatus
-from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Landed, Message, Position, Text
+from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
+from uavctl.frames import from_euler, rotate
+from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
 
 SECOND_VEHICLE = "second-vehicle"
@@ -16,6 +17,8 @@ ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BACK_MS = 1000  # its clock goes back by more than this: it has started anew
 _WRAP_MS = 2**32
+TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
+GRAVITY_MPS2 = 9.80665
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 _STARTING = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
@@ -59,7 +62,9 @@ class VehicleWatch:
         """Which autopilot it is; empty before its first heartbeat."""
         return "" if self._status is None else self._status.autopilot
 
-    def take(self, message: Message, at_ns: int) -> tuple[VehicleStatus | VehicleMotion | Event | Ack | Text, ...]:
+    def take(
+        self, message: Message, at_ns: int
+    ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text, ...]:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._heartbeat(message, at_ns)
@@ -74,6 +79,8 @@ class VehicleWatch:
                 return (*self._clock(stamp_us // 1000, at_ns), *self._moves(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
                 return self._moves(at_ns, attitude=angles_rad)
+            case Inertial(specific_force_mps2=force, raw=raw) if message.component == self.address[1]:
+                return self._accelerates(force, at_ns) if not raw or self.autopilot == "ardupilot" else ()
             case Text(severity=severity, text=text):
                 return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
             case Ack() if self._is_ours(message):
@@ -114,6 +121,18 @@ class VehicleWatch:
         if attitude is not None:
             self._motion = msgspec.structs.replace(self._motion, attitude_rad=attitude, attitude_ns=at_ns)
         return (self._motion,)
+
+    def _accelerates(self, force_mps2: Vec3, at_ns: int) -> tuple[InertialSample, ...]:
+        """Its acceleration by a specific force and its newest attitude; nothing where that is old or unknown."""
+        angles, told_ns = self._motion.attitude_rad, self._motion.attitude_ns
+        if angles is None or told_ns is None or at_ns - told_ns > TURNED_NS:
+            return ()
+        attitude = from_euler(angles)
+        turned = None if attitude is None else rotate(attitude, force_mps2)
+        if turned is None:
+            return ()
+        north, east, down = turned
+        return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1

@@ -96,6 +96,19 @@ class Plant:
         return a, b, e
 
     @property
+    def slope(self) -> tuple[Array, Array]:
+        """Continuous-time slopes of the state: of the states (n_x, n_x) and of the inputs (n_x, n_u) [per s]."""
+        generator = self.generator
+        return generator[:, : self.n_x], generator[:, self.n_x : self.n_x + self.n_u]
+
+    @property
+    def generator(self) -> Array:
+        """x' = G [x; u; w] in continuous time: G (n_x, n_x + n_u + n_w) [per s]; what is only rounding is zero."""
+        slopes = self._generator[: self.n_x]
+        kept = np.where(np.abs(slopes) < _DRIFT * np.abs(slopes).max(), 0.0, slopes)
+        return np.asarray(kept * (self._units[: self.n_x, None] / self._units))
+
+    @property
     def accel_map(self) -> Array:
         """Acceleration setpoint per unit of each input (n_axes, n_u) [m/s² per unit]."""
         return self._accel_map

@@ -1,0 +1,330 @@
+"""The vehicle's own inertial data in the filter and in the tick, and inputs that begin to act after a dead time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flight_rig import (
+    DT_NS,
+    HORIZON,
+    MS,
+    START_NS,
+    TICK_NS,
+    TICKS,
+    StubSolver,
+    drag_lag_generator,
+    estimator_parameters,
+    make_controller,
+    one_a_step,
+    sample,
+    small_plant,
+    stub_inputs,
+    vehicle,
+)
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from uavctl.data import Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
+from uavctl.flight.controller import Controller
+from uavctl.flight.estimator import (
+    Coming,
+    History,
+    absorb,
+    act,
+    begin,
+    belief_ahead,
+    belief_at,
+    estimate,
+    feel,
+    set_input,
+)
+from uavctl.flight.kalman import Kalman, felt, make_kalman
+from uavctl.flight.step import StepOutput, initial_state, step
+
+Array = NDArray[np.float64]
+
+DRAG, LAG = 0.3, 0.25
+WIND, DRIFT, MOST = 0.15, 0.2, 0.4
+FELT, OFF, OFF_S = 0.05, 0.1, 20.0
+INERTIAL = {
+    "bias_drift": DRIFT,
+    "bias_max": MOST,
+    "inertial_std_mps2": FELT,
+    "inertial_bias_mps2": OFF,
+    "inertial_bias_s": OFF_S,
+}
+DT_S = DT_NS * 1e-9
+
+
+def make(**changes: float) -> Kalman:
+    return make_kalman(small_plant(wind_std=WIND), estimator_parameters(**{**INERTIAL, **changes}), DT_NS)
+
+
+def generator() -> Array:
+    """Of (p, v, a, d, b; w, n, m; u): n carries the force d on a line through a step, m is what b goes to."""
+    g = np.zeros((9, 9))
+    g[0, 1] = 1.0
+    g[1, [1, 2, 5]] = -DRAG, 1.0, 1.0
+    g[2, [2, 3, 8, 6]] = -1.0 / LAG, 1.0 / LAG, 1.0 / LAG, 1.0 / DT_S
+    g[3, 6] = 1.0 / DT_S
+    g[4, [4, 7]] = -1.0 / OFF_S, 1.0 / OFF_S
+    return g
+
+
+def felt_at(at_ns: int, *accels_mps2: float) -> tuple[InertialSample, ...]:
+    """Samples of one tick whose mean time is `at_ns`."""
+    first_ns = at_ns - (len(accels_mps2) - 1) * MS // 2
+    return tuple(
+        InertialSample(at_ns=first_ns + i * MS, accel_mps2=(accel, 9.0, 9.0)) for i, accel in enumerate(accels_mps2)
+    )
+
+
+def conditioned(
+    places: dict[int, float], accels: dict[int, float], inputs: dict[int, float], at_ns: int
+) -> tuple[Array, Array]:
+    """Mean and covariance of (p, v, a, d, b): the joint Gaussian of start and draws, conditioned on all at once."""
+    g, first_ns = generator(), min(places)
+    first = (first_ns - START_NS) // DT_NS
+    draws = (at_ns - START_NS) // DT_NS - first + 1
+    keep = math.exp(-DT_S / OFF_S)
+    of_draw = [WIND**2, DRIFT**2 * DT_S, OFF**2 * (1.0 + keep) / (1.0 - keep)]
+    prior = np.diag([0.005**2, 0.3**2, 0.3**2, (0.25 * MOST) ** 2, OFF**2, *of_draw * draws])
+    offset, linear = np.array([places[first_ns], 0.0, 0.0, 0.0, 0.0]), np.eye(5, len(prior))
+    grid = {START_NS + (first + n) * DT_NS for n in range(draws + 1)}
+    times = sorted(t for t in {at_ns, *places, *accels, *inputs, *grid} if first_ns <= t <= at_ns)
+    rows, off, variances = [], [], []
+    for earlier, later in itertools.pairwise([*times, at_ns]):
+        u = next((value for when, value in sorted(inputs.items(), reverse=True) if when <= earlier), 0.0)
+        place = 5 + 3 * ((earlier - START_NS) // DT_NS - first)
+        drawn = np.zeros((3, len(prior)))
+        drawn[:, place : place + 3] = np.eye(3)
+        if earlier in places and earlier != first_ns:
+            rows.append(linear[0])
+            off.append(places[earlier] - offset[0])
+            variances.append(0.005**2)
+        if earlier in accels:
+            before = next((value for when, value in sorted(inputs.items(), reverse=True) if when < earlier), 0.0)
+            rows.append(g[1, :5] @ linear + g[1, 5:8] @ drawn + linear[4])
+            off.append(accels[earlier] - g[1, :5] @ offset - g[1, 8] * before - offset[4])
+            variances.append(FELT**2)
+        moved = expm(g * (later - earlier) * 1e-9)
+        linear = moved[:5, :5] @ linear + moved[:5, 5:8] @ drawn
+        offset = moved[:5, :5] @ offset + moved[:5, 8] * u
+    h = np.array(rows)
+    gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + np.diag(variances))
+    return offset + linear @ gain @ np.array(off), linear @ (prior - gain @ h @ prior) @ linear.T
+
+
+def known(kalman: Kalman, history: History, at_ns: int) -> tuple[Array, Array]:
+    belief = belief_at(kalman, history, at_ns)
+    assert belief is not None
+    return belief.mean[: kalman.n_x], belief.cov[: kalman.n_x, : kalman.n_x]
+
+
+def test_equals_conditioning_positions_and_accelerations_at_once() -> None:
+    kalman = make()
+    places = {START_NS + t * MS: p for t, p in ((30, 0.10), (200, 0.14), (415, 0.13), (700, 0.2))}
+    accels = {START_NS + t * MS: a for t, a in ((75, 0.1), (130, 0.12), (260, -0.1), (350, 0.3), (610, 0.2))}
+    inputs = {START_NS + t * MS: u for t, u in ((0, 0.2), (150, -0.4), (500, 0.3))}
+    history = begin(kalman, START_NS, START_NS)
+    for tick in range(16):
+        at_ns = START_NS + tick * TICK_NS
+        samples = [sample(t, at_ns, (p, 0.0, 0.0)) for t, p in places.items() if at_ns - TICK_NS < t <= at_ns]
+        history, taken, _ = absorb(kalman, history, at_ns, samples)
+        assert len(taken) == len(samples)
+        for t, accel in accels.items():
+            if at_ns - TICK_NS < t <= at_ns:
+                history = feel(kalman, history, felt_at(t, accel - 0.01, accel, accel + 0.01))
+        if at_ns in inputs:
+            history = set_input(kalman, history, at_ns, np.array([inputs[at_ns]]))
+    mean, cov = known(kalman, history, at_ns)
+    want_mean, want_cov = conditioned(places, accels, inputs, at_ns)
+    np.testing.assert_allclose(mean, want_mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(cov, want_cov, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_late_positions_among_inertial_data_give_the_same_bits_as_positions_in_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kalman = make()
+    captured = [START_NS + int(t) * MS for t in np.sort(rng.choice(np.arange(1, 900), size=12, replace=False))]
+    places, late_ns = rng.normal(0.0, 0.02, size=12), rng.integers(0, 900, size=12) * MS
+    accels, inputs = rng.normal(0.0, 0.1, size=40), rng.normal(0.0, 0.3, size=40)
+
+    def flown(late: bool) -> Estimate | None:
+        history = begin(kalman, START_NS, START_NS)
+        samples = [
+            sample(t, t + int(by) * late, (float(p), 0.0, 0.0))
+            for t, by, p in zip(captured, late_ns, places, strict=True)
+        ]
+        for tick in range(40):
+            at_ns = START_NS + tick * TICK_NS
+            due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
+            history, _, _ = absorb(kalman, history, at_ns, due)
+            history = feel(kalman, history, felt_at(at_ns - 20 * MS, accels[tick]))
+            history = set_input(kalman, history, at_ns, inputs[tick : tick + 1])
+        return estimate(kalman, history, at_ns)
+
+    assert flown(late=False) is not None
+    # What comes before the first position says nothing, and that one may come late: so the first is in time.
+    late_ns[0] = 0
+    assert repr(flown(late=True)) == repr(flown(late=False))
+
+
+def blind(history: History, kalman: Kalman, push_mps2: float, seconds: float, *, feels: bool) -> tuple[float, float]:
+    """Error of position and its deviation [m] after a time without positions under a force that began with it."""
+    begin_ns = START_NS + 4 * 1_000_000_000
+    v, p, at_ns = 0.0, 0.0, begin_ns
+    for _ in range(round(seconds * 1e9) // TICK_NS):
+        h = TICK_NS * 1e-9
+        accel = push_mps2 - DRAG * v
+        p, v, at_ns = p + h * v + 0.5 * h * h * accel, v + h * accel, at_ns + TICK_NS
+        history, _, _ = absorb(kalman, history, at_ns, ())
+        if feels:
+            history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, accel))
+    mean, cov = known(kalman, history, at_ns)
+    return mean[0] - p, math.sqrt(cov[0, 0])
+
+
+def test_a_force_that_begins_in_silence_is_felt_and_unfelt_is_not_known() -> None:
+    kalman = make()
+    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    for tick in range(81):
+        at_ns = START_NS + tick * TICK_NS
+        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
+        history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.0))
+    error_m, std_m = blind(history, kalman, 0.8, 2.0, feels=True)
+    unfelt_m, unfelt_std_m = blind(history, kalman, 0.8, 2.0, feels=False)
+    assert abs(unfelt_m) == pytest.approx(0.5 * 0.8 * 2.0**2, rel=0.2)  # it knows nothing of the force
+    assert abs(error_m) < 0.1 * abs(unfelt_m) and abs(error_m) < 3.0 * std_m
+    assert std_m < 0.5 * unfelt_std_m
+
+
+def test_what_the_sensors_are_off_for_long_is_learnt_from_positions() -> None:
+    kalman = make()
+    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    for tick in range(20 * 40):
+        at_ns = START_NS + tick * TICK_NS
+        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
+        history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.12))
+    mean, cov = known(kalman, history, at_ns)
+    assert mean[4] == pytest.approx(0.12, abs=0.02)
+    assert abs(mean[3]) < 0.02 and math.sqrt(cov[4, 4]) < 0.05
+    now = estimate(kalman, history, at_ns)
+    assert now is not None and len(now.mean) == 3 and now.bias == (mean[3],)  # of the plant, and against what it flies
+
+
+def test_what_cannot_be_or_says_nothing_is_not_believed() -> None:
+    kalman = make()
+    history, _, _ = absorb(kalman, begin(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
+    at_ns = START_NS + TICK_NS
+    fine = feel(kalman, history, felt_at(at_ns, 0.1))
+    assert repr(known(kalman, fine, at_ns)) != repr(known(kalman, history, at_ns))
+    for told in ((40.0,), (math.nan,), (math.inf, -math.inf), ()):
+        unmoved = feel(kalman, history, felt_at(at_ns, *told))
+        assert repr(known(kalman, unmoved, at_ns)) == repr(known(kalman, history, at_ns))
+    stuck = felt_at(at_ns, 0.1, 0.1, 0.1)
+    assert repr(known(kalman, feel(kalman, history, stuck), at_ns)) == repr(
+        known(kalman, feel(kalman, history, stuck[:1]), at_ns)
+    )
+    old_ns = START_NS - 3_000_000_000
+    assert feel(kalman, history, felt_at(old_ns, 0.1)) is history
+    deaf = make_kalman(small_plant(), estimator_parameters(), DT_NS)
+    assert feel(deaf, history, felt_at(at_ns, 0.1)) is history
+    belief = belief_at(deaf, absorb(deaf, begin(deaf, START_NS, START_NS), START_NS, [sample(START_NS)])[0], START_NS)
+    assert belief is not None
+    with pytest.raises(ValueError, match="inertial"):
+        felt(deaf, belief, np.zeros(1), None)
+
+
+def no_inputs() -> Coming:
+    return ()
+
+
+def test_an_input_acts_when_its_dead_time_is_over_and_counts_ahead_before() -> None:
+    kalman = make_kalman(small_plant(wind_std=WIND), estimator_parameters(), DT_NS)
+    rng = np.random.default_rng(1)
+    dead_ns, inputs = 130 * MS, rng.normal(size=12)
+    history, coming = begin(kalman, START_NS, START_NS), no_inputs()
+    for tick, u in enumerate(inputs):
+        at_ns = START_NS + tick * TICK_NS
+        history, coming = act(kalman, history, coming, at_ns)
+        history, _, _ = absorb(kalman, history, at_ns, [sample(START_NS)] if tick == 0 else [])
+        ahead = belief_ahead(kalman, history, coming, at_ns, dead_ns)
+        mean, cuts = np.zeros(3), [START_NS, *(START_NS + n * TICK_NS + dead_ns for n in range(tick)), at_ns + dead_ns]
+        for n, (earlier, later) in enumerate(itertools.pairwise(cuts)):
+            moved = expm(drag_lag_generator(DRAG, LAG) * (later - earlier) * 1e-9)
+            mean = moved[:3, :3] @ mean + moved[:3, 4] * (inputs[n - 1] if n else 0.0)
+        assert ahead is not None and ahead.at_ns == at_ns + dead_ns
+        np.testing.assert_allclose(ahead.mean[:3], mean, rtol=0, atol=1e-11)
+        coming = (*coming, (at_ns + dead_ns, np.array([u])))
+    past = belief_ahead(kalman, history, coming, at_ns - 3 * TICK_NS, dead_ns)  # of a boundary that was missed
+    then = belief_at(kalman, history, at_ns - 20 * MS)
+    assert past is not None and then is not None
+    np.testing.assert_allclose(past.mean, then.mean, rtol=0, atol=1e-12)
+
+
+# The tick
+
+
+def controller_that_feels(dead_ns: int = 0, **changes: float) -> Controller:
+    plant = small_plant()
+    parameters = estimator_parameters(**{**INERTIAL, **changes})
+    controller = make_controller(StubSolver(plant, HORIZON))
+    return replace(controller, estimator=parameters, late_steps=HORIZON, dead_ns=dead_ns)
+
+
+def ticks_of(controller: Controller, samples: list[PositionSample], *, feels: bool, count: int) -> list[StepOutput]:
+    state, out = initial_state(), []
+    for tick in range(count):
+        at_ns = START_NS + tick * TICK_NS
+        due = tuple(one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns)
+        inertial = felt_at(at_ns - TICK_NS // 2, 0.001 * (tick % 7)) if feels else ()
+        given = StepInput(tick=tick, at_ns=at_ns, samples=due, vehicle=vehicle(), inertial=inertial)
+        state, told = step(state, given, controller)
+        out.append(told)
+    return out
+
+
+def boundaries(told: list[StepOutput]) -> list[Decision]:
+    return [one.decision for one in told if one.decision.boundary]
+
+
+def test_inertial_data_are_news_between_positions_and_the_age_goes_on() -> None:
+    samples = one_a_step(lost=(3, 4, 6, 7), steps=10)
+    felt_ones = boundaries(ticks_of(controller_that_feels(), samples, feels=True, count=10 * TICKS))
+    unfelt = boundaries(ticks_of(controller_that_feels(), samples, feels=False, count=10 * TICKS))
+    assert [one.age_steps for one in felt_ones] == [one.age_steps for one in unfelt]
+    assert [one.news for one in felt_ones] == [one.news for one in unfelt]
+    silent = [one for one in unfelt if one.age_steps]
+    assert len(silent) == 4 and all(one.plan_index for one in silent)
+    assert all(one.plan_index == 0 for one in felt_ones if one.plan_seq is not None)
+
+
+def test_a_solver_that_does_not_count_the_age_gets_no_plan_without_a_position() -> None:
+    samples = one_a_step(lost=(3, 4), steps=6)
+    controller = replace(controller_that_feels(), late_steps=0)
+    for one in boundaries(ticks_of(controller, samples, feels=True, count=6 * TICKS)):
+        assert one.plan_index in (None, one.age_steps)
+
+
+def test_a_plan_begins_where_its_first_input_acts() -> None:
+    dead_ns = 80 * MS
+    controller = controller_that_feels(dead_ns, bias_drift=0.0, bias_max=0.0)
+    told = ticks_of(controller, one_a_step(steps=6), feels=True, count=6 * TICKS)
+    plans = [one.plan for one in told if one.plan is not None]
+    assert [plan.seq for plan in plans] == list(range(6))
+    for plan in plans:
+        assert plan.base_ns == START_NS + plan.seq * DT_NS + dead_ns
+        np.testing.assert_array_equal(plan.inputs, stub_inputs(plan.seq, HORIZON, 1))
+    sent: Vec3 = (0.0, 0.0, 0.0)
+    for tick, one in enumerate(told):
+        if one.setpoint is not None:
+            sent = one.setpoint.accel_mps2
+        seq = one.decision.plan_seq
+        if seq is not None:
+            assert sent[0] == stub_inputs(seq, HORIZON, 1)[tick // TICKS - seq, 0]
