@@ -15,6 +15,7 @@ from uavctl.flight.fallback import (
     FallbackParameters,
     acceleration,
     advance,
+    back,
     enter,
     learnt,
     remember,
@@ -112,6 +113,20 @@ def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
         assert acceleration(enter(5 * S), over_ns, velocity, PARAMETERS) == (0.0, 0.0, 0.0)  # on the way to holding
     for mode in (HOLD, LAND, STOPPED):
         assert acceleration(Fallback(mode=mode, since_ns=0), 0, velocity, PARAMETERS) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("off_m", "velocity_mps", "wanted"),
+    [
+        ((0.2, -0.1, 0.0), (0.1, 0.2, -0.3), (-0.35, -0.2, 0.45)),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((3.0, -3.0, 0.9), (0.0, 0.0, 0.0), (-1.0, 1.0, -0.9)),
+        ((0.0, 0.0, 0.0), (4.0, -4.0, 0.6), (-1.0, 1.0, -0.9)),
+        ((math.nan, 0.1, math.inf), (0.0, math.nan, 0.0), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Vec3, wanted: Vec3) -> None:
+    assert back(off_m, velocity_mps) == pytest.approx(wanted, abs=1e-12)
 
 
 @pytest.mark.parametrize(

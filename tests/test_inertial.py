@@ -6,6 +6,7 @@ import itertools
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from flight_rig import (
@@ -28,8 +29,9 @@ from flight_rig import (
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uavctl.data import Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
-from uavctl.flight.controller import Controller
+from uavctl.data import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
+from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.decide import back_mps2, place, reckons
 from uavctl.flight.estimator import (
     Coming,
     History,
@@ -42,6 +44,7 @@ from uavctl.flight.estimator import (
     feel,
     set_input,
 )
+from uavctl.flight.fallback import End, Fallback
 from uavctl.flight.kalman import Kalman, felt, make_kalman
 from uavctl.flight.step import StepOutput, initial_state, step
 
@@ -328,3 +331,58 @@ def test_a_plan_begins_where_its_first_input_acts() -> None:
         seq = one.decision.plan_seq
         if seq is not None:
             assert sent[0] == stub_inputs(seq, HORIZON, 1)[tick // TICKS - seq, 0]
+
+
+# Without positions
+
+
+def drifting(*, feels: bool, push_mps2: float = 0.4, seconds: float = 8.0) -> tuple[float, list[Decision]]:
+    """How far a force carries the vehicle that held still when positions ended [m], and what was decided."""
+    controller = controller_that_feels(bias_max=1.0)
+    plant, state, at_rest = small_plant(), initial_state(), np.zeros(3)
+    a, b, _ = plant.transition(TICK_NS * 1e-9)
+    x, furthest, decided = at_rest, 0.0, []
+    silent = 5 * TICKS
+    for tick in range(silent + round(seconds * 1e9) // TICK_NS):
+        at_ns = START_NS + tick * TICK_NS
+        samples = (sample(at_ns, position_m=(0.0, 0.0, 0.0)),) if tick < silent else ()
+        # The velocity's own slope is what the vehicle feels; the force acts through no lag.
+        push = push_mps2 if tick >= silent else 0.0
+        slope = float(x[2] - DRAG * x[1] + push)
+        inertial = felt_at(at_ns - MS, slope) if feels else ()
+        given = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle(), inertial=inertial)
+        state, told = step(state, given, controller)
+        decided.append(told.decision)
+        u = 0.0 if told.setpoint is None or tick < silent else told.setpoint.accel_mps2[0]
+        h = TICK_NS * 1e-9
+        x = a @ x + b @ np.array([u]) + np.array([0.5 * h * h, h, 0.0]) * push
+        if told.setpoint is not None:  # until it lands
+            furthest = max(furthest, abs(float(x[0])))
+    return furthest, decided
+
+
+def test_a_fallback_holds_by_inertial_data_against_a_force_that_it_would_not_know_of() -> None:
+    carried_m, blindly = drifting(feels=False)
+    held_m, felt_ones = drifting(feels=True)
+    assert held_m < 0.25 * carried_m
+    # With them it is not blind: it holds for as long as it may, and then it lands all the same.
+    for decided in (blindly, felt_ones):
+        assert decided[-1].mode in ("land", "stopped")
+    landed = [next(i for i, one in enumerate(d) if one.mode == "land") for d in (blindly, felt_ones)]
+    assert landed[0] <= landed[1]
+
+
+def test_a_fallback_that_ends_holds_by_nothing() -> None:
+    state = ControlState(fallback=Fallback(ControlMode.HOLD, START_NS, End.LET_GO), held_m=(0.0, 0.0, 0.0))
+    controller = controller_that_feels()
+    kalman = controller.kalman
+    history, _, _ = absorb(kalman, begin(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
+    history = feel(kalman, history, felt_at(START_NS + MS, 0.3))
+    given = StepInput(tick=1, at_ns=START_NS + TICK_NS, vehicle=vehicle())
+    tick = place(state, given, history, controller)
+    assert tick.estimate is not None and state.fallback is not None and not reckons(state.fallback, tick)
+    assert back_mps2(state, tick, controller) == (0.0, 0.0, 0.0)
+    recover = msgspec.structs.replace(state, fallback=Fallback(ControlMode.HOLD, START_NS), held_m=(1.0, 0.0, 0.0))
+    assert back_mps2(recover, tick, controller)[0] > 0.5
+    later = msgspec.structs.replace(tick, belief=belief_at(kalman, history, START_NS + 300 * MS))
+    assert back_mps2(recover, later, controller) == (0.0, 0.0, 0.0)  # the data are too old

@@ -105,6 +105,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         biases: Estimated biases of late.
         taken_back: The step in which positions were last taken back; None for none.
         coming: Inputs that were sent and do not act yet, oldest first.
+        held_m: Where HOLD began, as it was estimated [m]; None in other modes.
     """
 
     history: History | None = None
@@ -124,6 +125,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     biases: Biases = ()
     taken_back: int | None = None
     coming: Coming = ()
+    held_m: Vec3 | None = None
 
     @property
     def disbelieves(self) -> bool:

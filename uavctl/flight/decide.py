@@ -190,7 +190,10 @@ def _fall(
         held_s = (inp.at_ns - (before.held_ns or inp.at_ns)) * 1e-9
         reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
     fresh = 0 if state.fallback is None else state.fresh
-    return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh), reason)
+    held_m = None
+    if fallback.mode is ControlMode.HOLD:
+        held_m = position(tick.estimate, controller.plant) if state.held_m is None else state.held_m
+    return Choice(replace(state, plan=None, fallback=fallback, fresh=fresh, held_m=held_m), reason)
 
 
 def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
@@ -216,15 +219,27 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
         math.hypot(*moving),
         state.accel_mps2,
         controller.fallback,
-        held_mps2(state, fallback, controller),
+        held_mps2(state, fallback, tick, controller),
         measured=measured,
-        blind=not measured and (tick.age_steps is None or tick.age_steps >= controller.horizon),
+        blind=not (measured or reckons(fallback, tick))
+        and (tick.age_steps is None or tick.age_steps >= controller.horizon),
     )
 
 
-def held_mps2(state: ControlState, fallback: Fallback, controller: Controller) -> Vec3:
+RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estimate on
+
+
+def reckons(fallback: Fallback, tick: Tick) -> bool:
+    """Whether the vehicle's own inertial data carry an estimate on that nothing speaks against."""
+    newest_ns = felt_ns(tick.history)
+    fresh = newest_ns is not None and tick.belief is not None and tick.belief.at_ns - newest_ns <= RECKONS_NS
+    return fresh and not fallback.final
+
+
+def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, controller: Controller) -> Vec3:
     """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
-    bias = fb.learnt(state.biases)
+    felt = tick.estimate is not None and reckons(fallback, tick)
+    bias = tick.estimate.bias if tick.estimate is not None and felt else fb.learnt(state.biases)
     # What the vehicle keeps when nothing more is sent is zero itself.
     if not bias or (fallback.final and fallback.mode is ControlMode.HOLD) or fallback.end is End.LET_GO:
         return ZERO
@@ -281,6 +296,23 @@ def seen_of(
         motion=inp.motion,
         braking=braking,
     )
+
+
+def back_mps2(state: ControlState, tick: Tick, controller: Controller) -> Vec3:
+    """What brings a vehicle that holds by its inertial data back to where it began to; else zero."""
+    fallback, estimate = state.fallback, tick.estimate
+    if fallback is None or fallback.mode is not ControlMode.HOLD or state.held_m is None or estimate is None:
+        return ZERO
+    if not reckons(fallback, tick):
+        return ZERO
+    here = position(estimate, controller.plant)
+    off = (here[0] - state.held_m[0], here[1] - state.held_m[1], here[2] - state.held_m[2])
+    return fb.back(off, velocity(estimate, controller.plant))
+
+
+def position(estimated: Estimate | None, plant: Plant) -> Vec3:
+    """Predicted position, zero in the axes that the plant has not."""
+    return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.position_index, 0.0)
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:

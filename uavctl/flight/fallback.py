@@ -13,7 +13,8 @@ A state machine of four modes, each with a time limit:
 
 Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.envelope`), else by the predicted
 one. By its own velocity it brakes again if it drifts while it holds; the time to hold runs on meanwhile. HOLD begins
-only when the setpoint has come down to what is held: it never accelerates.
+only when the setpoint has come down to what is held: it never accelerates. Where the vehicle's own inertial data carry
+the estimate on, HOLD brings it back to where it began to hold, gently.
 
 The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at Δt boundaries
 (`uavctl.flight.decide`).
@@ -21,6 +22,7 @@ The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntEnum, auto
 
@@ -31,6 +33,8 @@ SETTLE_S = 1.0  # longest time that the last gate may take to let a zero through
 STILL_MPS = 0.02  # below this speed there is nothing left to brake
 DRIFT_MPS = 0.15  # above this speed, by the vehicle's own word, it drifts
 CALM_MPS2 = 0.04  # HOLD begins within this of what it sends
+BACK_1PS2, BACK_1PS = 1.0, 1.5  # of way and speed while it holds by inertial data: back within two seconds
+BACK_MPS2 = 1.0  # and no more than this in any axis: the estimate may be poisoned
 LEARNT_NS = 2_000_000_000  # a bias counts that has been there for so long,
 LATELY_NS = 3_000_000_000  # as far as it has been there for all of this time
 
@@ -166,6 +170,16 @@ def acceleration(fallback: Fallback, at_ns: int, velocity_mps: Vec3, parameters:
         return ZERO
     north, east, down = (-parameters.brake_gain_1ps * v for v in velocity_mps)
     return north, east, down
+
+
+def back(off_m: Vec3, velocity_mps: Vec3) -> Vec3:
+    """Acceleration [m/s²] that brings a vehicle gently to rest where it is to hold; zero of what is NaN."""
+    north, east, down = (_gently(-BACK_1PS2 * p - BACK_1PS * v) for p, v in zip(off_m, velocity_mps, strict=True))
+    return north, east, down
+
+
+def _gently(accel_mps2: float) -> float:
+    return min(max(accel_mps2, -BACK_MPS2), BACK_MPS2) if math.isfinite(accel_mps2) else 0.0
 
 
 def _after_hold(end: End, land: bool) -> ControlMode:

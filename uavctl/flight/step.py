@@ -28,7 +28,7 @@ from uavctl.data import (
 )
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decide import Choice, Tick, choose, held_mps2, moving_mps, place, seen_of
+from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, moving_mps, place, seen_of
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, is_outside, watch
 from uavctl.flight.estimator import act, begin, feel, set_input, without
 from uavctl.flight.fallback import End
@@ -311,8 +311,9 @@ def _setpoint(
     if state.fallback is not None:
         moving, _ = moving_mps(state, tick, inp, controller)
         brake = fb.acceleration(state.fallback, inp.at_ns, moving, controller.fallback)
-        held = held_mps2(state, state.fallback, controller)
-        want = (brake[0] + held[0], brake[1] + held[1], brake[2] + held[2])
+        held = held_mps2(state, state.fallback, tick, controller)
+        back = back_mps2(state, tick, controller)
+        want = (brake[0] + held[0] + back[0], brake[1] + held[1] + back[1], brake[2] + held[2] + back[2])
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
     # Level at once where what is seen cannot be: each tick of slewing would be flown on nobody knows what.
