@@ -12,7 +12,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from sim.airframe import GRAVITY_MPS2
 from sim.attitude import Lean, lean
@@ -25,6 +25,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
 REFERENCE_GAIN_1PS = 2.0
 REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
+CARRIED_S = 3.0  # ArduPilot moves a position on with its velocity for so long (GUID_TIMEOUT), then it stays
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Tuning:
 
     Attributes:
         open_loop: whether an acceleration setpoint is flown as it comes.
-        dead_time_s: from taking an acceleration setpoint to acting on it.
+        dead_time_s: from taking an acceleration setpoint, or one of a position that moves, to acting on it.
         tilt_limit_rad: largest lean.
         jerk_mps3: limit of the change of an acceleration setpoint; infinite is none.
         attitude_gain_1ps: of the attitude loop.
@@ -100,6 +101,17 @@ class Demand(Enum):
     ACCELERATION = auto()
     VELOCITY = auto()
     POSITION = auto()
+    MOTION = auto()
+
+
+class _Asked(NamedTuple):
+    """A setpoint that waits out the dead time; a motion has a position, a velocity and an acceleration."""
+
+    due: int  # step in which it acts
+    demand: Demand
+    wanted: Vec3
+    velocity: Vec3 = ZERO
+    accel: Vec3 = ZERO
 
 
 class Cascade:
@@ -115,7 +127,8 @@ class Cascade:
         self._step_s = step_s
         self._dead_steps = round(self.tuning.dead_time_s / step_s)
         self._steps = 0
-        self._coming: deque[tuple[int, Vec3]] = deque()  # accelerations taken, with the step in which they act
+        self._coming: deque[_Asked] = deque()  # taken, and not acting yet
+        self._carried_steps = 0  # for which a position has moved on by itself
         self._demand = Demand.ACCELERATION
         self._wanted: Vec3 = ZERO
         self._position: Vec3 = ZERO
@@ -132,10 +145,20 @@ class Cascade:
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Fly this acceleration (NED), after the autopilot's dead time."""
+        self._take(_Asked(self._steps + self._dead_steps, Demand.ACCELERATION, accel_mps2))
+
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position (NED), which moves with this velocity and acceleration, after the dead time.
+
+        PX4 takes each for what it is, until the next comes; ArduPilot moves it on in between.
+        """
         due = self._steps + self._dead_steps
-        if self._coming and self._coming[-1][0] == due:
+        self._take(_Asked(due, Demand.MOTION, position_m, velocity_mps, accel_mps2))
+
+    def _take(self, asked: _Asked) -> None:
+        if self._coming and self._coming[-1].due == asked.due:
             self._coming.pop()
-        self._coming.append((due, accel_mps2))
+        self._coming.append(asked)
 
     def fly(self, velocity_mps: Vec3) -> None:
         """Fly this velocity (NED); zero stops, and stays where that ends."""
@@ -157,8 +180,11 @@ class Cascade:
 
     def listen(self) -> None:
         """Begin a step: what has waited out the dead time is asked from now on."""
-        if self._coming and self._coming[0][0] <= self._steps:
-            self._demand, self._wanted = Demand.ACCELERATION, self._coming.popleft()[1]
+        if self._coming and self._coming[0].due <= self._steps:
+            _, self._demand, self._wanted, velocity, accel = self._coming.popleft()
+            if self._demand is Demand.MOTION:
+                self._position, self._velocity, self._accel = self._wanted, velocity, accel
+                self._carried_steps = 0
         self._steps += 1
 
     @property
@@ -186,8 +212,11 @@ class Cascade:
                 return self._lean((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
         elif self._demand is Demand.VELOCITY:
             self._follow_velocity(self._wanted)
-        else:
+        elif self._demand is Demand.POSITION:
             self._follow_position()
+        else:
+            self._carry_on()
+            return self._track(motion, thrust_limited)
         self._move_reference()
         return self._track(motion, thrust_limited)
 
@@ -229,6 +258,15 @@ class Cascade:
         speed = _approach(far, CRUISE_MPS) / far if far > 0.0 else 0.0
         down = math.copysign(_approach(abs(dd), CLIMB_MPS), dd)
         self._follow_velocity((speed * dn, speed * de, down))
+
+    def _carry_on(self) -> None:
+        """Move a position on with its velocity, where the autopilot does so."""
+        if self.tuning.open_loop:
+            return
+        if self._carried_steps * self._step_s >= CARRIED_S:
+            self._velocity = self._accel = ZERO
+        self._move_reference()
+        self._carried_steps += 1
 
     def _move_reference(self) -> None:
         h = self._step_s

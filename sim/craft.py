@@ -94,6 +94,9 @@ class Craft(Protocol):
     def go_to(self, position_m: Vec3) -> None:
         """Fly to this position and stay."""
 
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position, which moves with this velocity and acceleration."""
+
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the floor, over the present place."""
 
@@ -143,6 +146,7 @@ class SteeredPlant:
         self._plant = plant
         self._goal = _Goal.NOTHING
         self._wanted: Vec3 = ZERO
+        self._ahead: Vec3 = ZERO  # velocity of a position that moves
         self._errors: tuple[Vec3, Vec3] = (ZERO, ZERO)
         self._steer_ns = plant.now_ns
 
@@ -202,6 +206,11 @@ class SteeredPlant:
         """Fly to this position."""
         self._ask(_Goal.POSITION, position_m)
 
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position, which moves with this velocity; its acceleration is not used."""
+        del accel_mps2
+        self._ask(_Goal.POSITION, position_m, velocity_mps)
+
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the floor."""
         self._ask(_Goal.CLIMB, (0.0, 0.0, -height_m))
@@ -231,15 +240,16 @@ class SteeredPlant:
         motion = (speed[0] + off_mps[0], speed[1] + off_mps[1], speed[2] + off_mps[2])
         self._plant.accelerate(self._law(place, motion))
 
-    def _ask(self, goal: _Goal, wanted: Vec3) -> None:
-        self._goal, self._wanted = goal, wanted
+    def _ask(self, goal: _Goal, wanted: Vec3, ahead: Vec3 = ZERO) -> None:
+        self._goal, self._wanted, self._ahead = goal, wanted, ahead
         if not self.grounded:
             self.steer()
 
     def _law(self, place: Vec3, motion: Vec3) -> Vec3:
         wanted = self._wanted
         if self._goal is _Goal.POSITION:
-            wanted = approach(place, self._wanted)
+            near, ahead = approach(place, self._wanted), self._ahead
+            wanted = (near[0] + ahead[0], near[1] + ahead[1], near[2] + ahead[2])
         elif self._goal in (_Goal.CLIMB, _Goal.LAND):
             wanted = ZERO
         north, east, down = brake(tuple_minus(motion, wanted), BRAKE_MPS2)

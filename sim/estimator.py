@@ -104,6 +104,12 @@ class Estimator:
         source = p["EK3_SRC1_POSZ"]
         return source == 1 or (source == 3 and p["GPS1_TYPE"] != 0) or (source == 6 and self._fusing)
 
+    def begin_in_flight(self) -> None:
+        """Count as begun on the ground, with good external positions, an origin and no error."""
+        self.origin = True
+        self._last_ns = self._updated_ns = self._craft.now_ns
+        self._first_ns = self._last_ns - START_NS
+
     # What it believes
 
     @property

@@ -37,6 +37,8 @@ class Helm:
                 self._craft.accelerate(setpoint.vector)
             case Ask.VELOCITY:
                 self._craft.fly(setpoint.vector)
+            case Ask.POSITION if setpoint.velocity_mps is not None:
+                self._craft.follow(setpoint.vector, setpoint.velocity_mps, setpoint.accel_mps2)
             case Ask.POSITION:
                 self._craft.go_to(setpoint.vector)
             case _:

@@ -187,6 +187,11 @@ class Quadrotor:
         self._accel = ZERO
         self.cascade.go_to(position_m)
 
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position (NED), which moves with this velocity and acceleration."""
+        self._accel = ZERO
+        self.cascade.follow(position_m, velocity_mps, accel_mps2)
+
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the floor, over the present place."""
         self._accel = ZERO

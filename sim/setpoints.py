@@ -39,6 +39,8 @@ class Setpoint:
     Attributes:
         ask: what about.
         vector: acceleration, velocity or position in local NED.
+        velocity_mps: with a position, the velocity that it moves with; None is a place to go to.
+        accel_mps2: with that velocity, its acceleration.
         yaw_rad: heading to take; None is not asked.
         text: why it was refused.
     """
@@ -47,9 +49,12 @@ class Setpoint:
     vector: Vec3 = ZERO
     yaw_rad: float | None = None
     text: str = ""
+    velocity_mps: Vec3 | None = None
+    accel_mps2: Vec3 = ZERO
 
 
 STOP = Setpoint(Ask.STOP)
+FATAL = Setpoint(Ask.FATAL)
 
 
 def interpret(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion) -> Setpoint:
@@ -103,7 +108,7 @@ def _px4(kind: Personality, msg: Any, attitude: Quaternion) -> Setpoint:
         return Setpoint(Ask.REFUSED, text="force setpoint not supported")
     yaw = _yaw(msg, 0.0)
     if position and not body:  # there are no positions in body axes
-        return Setpoint(Ask.POSITION, position, yaw) if _finite(position) else STOP
+        return _moving(position, velocity, accel, yaw) if _finite(position) else STOP
     if velocity:
         turned = _turned(velocity, heading_rad(attitude) if body else 0.0)
         return Setpoint(Ask.VELOCITY, turned, yaw) if _finite(velocity) else STOP
@@ -111,6 +116,15 @@ def _px4(kind: Personality, msg: Any, attitude: Quaternion) -> Setpoint:
         turned = rotated(attitude, accel) if body else accel
         return Setpoint(Ask.ACCELERATION, turned, yaw) if _finite(accel) else STOP
     return Setpoint(Ask.REFUSED, text="SET_POSITION_TARGET_LOCAL_NED invalid")
+
+
+def _moving(position: Vec3, velocity: Vec3 | None, accel: Vec3 | None, yaw: float | None) -> Setpoint:
+    """A position, with what of its motion is told in full."""
+    ahead = velocity if velocity and _finite(velocity) else None
+    change = accel if accel and _finite(accel) else None
+    if ahead is None and change is None:
+        return Setpoint(Ask.POSITION, position, yaw)
+    return Setpoint(Ask.POSITION, position, yaw, velocity_mps=ahead or ZERO, accel_mps2=change or ZERO)
 
 
 def _set(vector: Vec3, ignored: int, *, whole: bool) -> Vec3 | None:
@@ -143,8 +157,12 @@ def _ardupilot(kind: Personality, msg: Any, place_m: Vec3, attitude: Quaternion)
     else:
         return STOP
     if not _finite(vector):
-        return Setpoint(Ask.FATAL)
+        return FATAL
     north, east, down = _turned(vector, heading)
     if ask is Ask.POSITION and msg.coordinate_frame in OFFSET_FRAMES:
         north, east, down = north + place_m[0], east + place_m[1], down + place_m[2]
+    if ask is Ask.POSITION and not msg.type_mask & IGNORE_VELOCITY:
+        ahead = _turned(velocity, heading)
+        change = ZERO if msg.type_mask & IGNORE_ACCEL else _turned(accel, heading)
+        return _moving((north, east, down), ahead, change, _yaw(msg, heading)) if _finite(velocity) else FATAL
     return Setpoint(ask, (north, east, down), _yaw(msg, heading))

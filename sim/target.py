@@ -50,7 +50,7 @@ def _px4(pilot: Pilot, estimator: Estimator) -> Told:
     if obeyed is not None and obeyed.ask is Ask.VELOCITY:
         return IGNORE_POSITION, UNSET, obeyed.vector, ZERO
     if obeyed is not None:
-        return 0, obeyed.vector, ZERO, ZERO
+        return 0, obeyed.vector, obeyed.velocity_mps or ZERO, obeyed.accel_mps2
     if pilot.phase is Phase.GROUND:
         return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, DOWN
     return 0, estimator.position_m, estimator.velocity_mps, ZERO
@@ -64,6 +64,8 @@ def _ardupilot(pilot: Pilot) -> Told | None:
     obeyed = pilot.helm.obeyed
     if obeyed is not None and obeyed.ask is Ask.ACCELERATION:
         return IGNORE_POSITION | IGNORE_VELOCITY | no_yaw, ZERO, ZERO, obeyed.vector
+    if obeyed is not None and obeyed.ask is Ask.POSITION and obeyed.velocity_mps is not None:
+        return no_yaw, obeyed.vector, obeyed.velocity_mps, obeyed.accel_mps2
     if obeyed is not None and obeyed.ask is Ask.POSITION:
         return IGNORE_VELOCITY | IGNORE_ACCEL | no_yaw, obeyed.vector, ZERO, ZERO
     if obeyed is None and pilot.armed and pilot.phase is not Phase.AIR:
