@@ -1,0 +1,132 @@
+"""What is flown in a trial: who flies, what, with whom, in which air and over which link. Plain and picklable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from uavctl.config import Config, load_config
+from uavctl.data import Vec3
+from uavctl.trial.eight import CENTRE_M, eight
+from uavctl.trial.own_loop import OwnTuning
+
+Scenario = Literal["hold", "eight", "blackout"]
+AutopilotName = Literal["px4", "ardupilot"]
+Air = Literal["calm", "gusts"]
+
+SCENARIOS: tuple[Scenario, ...] = ("hold", "eight", "blackout")
+AUTOPILOTS: tuple[AutopilotName, ...] = ("px4", "ardupilot")
+WIND_MPS: Vec3 = (0.6, -0.36, 0.0)  # 0.7 m/s
+GUST_WIND_MPS = 3.0
+BLACKOUT_S = 4.0
+BLACKOUT_BEGINS_S = (1.0, 6.0)  # the way of preset `room` takes about as long
+_MOMENT = 1  # child of a flight's seed that draws when a blackout begins
+EIGHT_MORE_S = 2.0  # after the end of the figure of eight
+
+
+@dataclass(frozen=True)
+class TrialPilot:
+    """Who flies: a controller of ours, or the vehicle by itself.
+
+    Attributes:
+        name: What it is called.
+        config: Preset or file that it is made from.
+        overrides: Of it.
+        own: How the vehicle is set up that flies by its own position loop; None where ours flies.
+        knows_link: Whether it is designed for the losses that it meets; else for those of its configuration.
+    """
+
+    name: str
+    config: str = "room"
+    overrides: tuple[str, ...] = ()
+    own: OwnTuning | None = None
+    knows_link: bool = False
+
+
+@dataclass(frozen=True)
+class TrialCell:
+    """Flights that differ in their seed alone.
+
+    Attributes:
+        pilot: Who flies.
+        scenario: What.
+        autopilot: Whose behaviour the vehicle shows.
+        rate_hz: Of the cameras.
+        loss: Share of positions that are lost.
+        air: Calm, or wind and gusts.
+    """
+
+    pilot: TrialPilot
+    scenario: Scenario
+    autopilot: AutopilotName
+    rate_hz: float
+    loss: float
+    air: Air
+
+
+def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
+    """The configuration that a flight meets: simulator, link and mission.
+
+    Raises:
+        ConfigError: An override is none.
+    """
+    wind, gusts = (WIND_MPS, GUST_WIND_MPS) if cell.air == "gusts" else ((0.0, 0.0, 0.0), 0.0)
+    more = [
+        f"duration_s={seconds}",
+        "sim.plant=quadrotor",
+        f"sim.autopilot={cell.autopilot}",
+        f"sim.seed={seed}",
+        f"sim.camera.rate_hz={cell.rate_hz}",
+        f"sim.wind.velocity_mps={list(wind)}",
+        f"sim.wind.gust_wind_mps={gusts}",
+        f"link.loss={cell.loss}",
+    ]
+    if cell.scenario == "blackout":
+        begin = blackout_s(seed)
+        more.append(f"link.blackout=[[{begin}, {begin + BLACKOUT_S}]]")
+    return _with_mission(load_config(cell.pilot.config, (*cell.pilot.overrides, *more)), cell.scenario)
+
+
+def believed(cell: TrialCell) -> tuple[Config, Config]:
+    """The configurations that a controller of ours and its design are made from.
+
+    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for the losses that it meets:
+    of the design, which is then that of the configured losses, it has names and places alone.
+
+    Raises:
+        ConfigError: An override is none.
+    """
+    overrides = (*cell.pilot.overrides, f"sim.autopilot={cell.autopilot}")
+    configured = _with_mission(load_config(cell.pilot.config, overrides), cell.scenario)
+    if not cell.pilot.knows_link:
+        return configured, configured
+    link = msgspec.structs.replace(configured.link, loss=cell.loss)
+    knowing = msgspec.structs.replace(configured, link=link)
+    return knowing, configured if knowing.conditioned else knowing
+
+
+def blackout_s(seed: int) -> float:
+    """When a flight's blackout begins [s]: a random moment under way, the same for all who fly."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(_MOMENT + 1)[_MOMENT])
+    return round(float(rng.uniform(*BLACKOUT_BEGINS_S)), 3)
+
+
+def length_s(scenario: Scenario, seconds: float) -> float:
+    """How long a flight lasts [s]: a figure of eight is flown to its end."""
+    return eight().times_s[-1] + EIGHT_MORE_S if scenario == "eight" else seconds
+
+
+def _with_mission(config: Config, scenario: Scenario) -> Config:
+    """The configuration with the figure of eight from its centre, if that is flown."""
+    if scenario != "eight":
+        return config
+    replace = msgspec.structs.replace
+    return replace(
+        config,
+        mission=replace(config.mission, waypoints=(), trajectory=eight(), then="hold"),
+        sim=replace(config.sim, start_position_m=CENTRE_M, start_velocity_mps=(0.0, 0.0, 0.0)),
+        target=replace(config.target, position_m=CENTRE_M),
+    )
