@@ -21,7 +21,8 @@ from uavctl.trial.eight import eight
 from uavctl.trial.fly import FlightTally, fly, room_of
 from uavctl.trial.own_loop import OwnTuning
 
-OWN = TrialCell(TrialPilot("own", own=OwnTuning()), "hold", "ardupilot", 20.0, 0.3, "gusts")
+OWN = TrialCell(TrialPilot("own", own=OwnTuning()), "hold", "ardupilot", 20.0, "30 %", ("link.loss=0.3",), "gusts")
+LOSES = ("link.loss=0.6",)
 OURS = replace(OWN, pilot=TrialPilot("ours", overrides=("smpc.scheme=age-conditioned",), knows_link=True))
 
 
@@ -90,11 +91,11 @@ def test_the_room_is_that_of_the_state_limits_in_any_order_of_axes() -> None:
 
 
 def test_who_knows_the_link_is_made_for_it_and_its_design_for_the_configured_one() -> None:
-    knows, designed = believed(replace(OURS, loss=0.6))
+    knows, designed = believed(replace(OURS, link=LOSES))
     assert (knows.link.loss, designed.link.loss) == (0.6, 0.3)
     printed = TrialPilot("printed", knows_link=True)
-    assert [one.link.loss for one in believed(replace(OURS, pilot=printed, loss=0.2))] == [0.2, 0.2]
-    knows, designed = believed(replace(OURS, pilot=replace(OURS.pilot, knows_link=False), loss=0.6))
+    assert [one.link.loss for one in believed(replace(OURS, pilot=printed, link=("link.loss=0.2",)))] == [0.2, 0.2]
+    knows, designed = believed(replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES))
     assert knows is designed and knows.link.loss == 0.3
 
 

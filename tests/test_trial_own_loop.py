@@ -26,7 +26,7 @@ AS_DELIVERED, TUNED = OwnTuning(), OwnTuning(at_once=True, delay_s=0.05)
 
 
 def cell(pilot: TrialPilot, autopilot: AutopilotName, scenario: Scenario = "hold", loss: float = 0.6) -> TrialCell:
-    return TrialCell(pilot, scenario, autopilot, 20.0, loss, "gusts")
+    return TrialCell(pilot, scenario, autopilot, 20.0, "", (f"link.loss={loss}",), "gusts")
 
 
 class Overheard:
@@ -121,14 +121,22 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
 
 @BOTH
 def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) -> None:
-    one = TrialCell(TrialPilot("own", own=AS_DELIVERED), "hold", autopilot, 50.0, 0.0, "calm")
+    one = TrialCell(TrialPilot("own", own=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm")
     found = fly(one, 0, seconds=16.0, from_s=12.0)
     assert found.hold_rms_m < 0.03 and found.nearer_s < 12.0 and found.beyond_m < 0.0
 
 
 @BOTH
 def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: AutopilotName) -> None:
-    one = TrialCell(TrialPilot("own", own=OwnTuning(at_once=True, delay_s=0.05)), "eight", autopilot, 50.0, 0.0, "calm")
+    one = TrialCell(
+        TrialPilot("own", own=OwnTuning(at_once=True, delay_s=0.05)),
+        "eight",
+        autopilot,
+        50.0,
+        "",
+        ("link.loss=0.0",),
+        "calm",
+    )
     config = flown(one, 0, 12.0)
     errors = []
     for whole in (True, False):

@@ -34,14 +34,9 @@ from rich.table import Table
 from uavctl.errors import UavctlError
 from uavctl.trial.case import AUTOPILOTS, SCENARIOS, TrialCell, TrialPilot
 from uavctl.trial.fly import TrialFlight, fly
-from uavctl.trial.own_loop import OwnTuning
+from uavctl.trial.own_loop import TUNED, OwnTuning
 
 SCHEMES = ("hahn-stursberg", "age-conditioned")
-# Found by tuning on seeds 100 to 109, see docs/flights.md.
-TUNED = {
-    "px4": OwnTuning(at_once=True, delay_s=0.05, lead_s=0.1),
-    "ardupilot": OwnTuning(at_once=True, delay_s=0.03, lead_s=0.1),
-}
 PILOTS = ("configured", *SCHEMES, "own", "own-tuned")
 WIDTH = 170
 # Heading, figure, factor and digits, by scenario.
@@ -77,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # of the processes to come; the last bits would depend on it
     cells = [
-        TrialCell(pilot, scenario, autopilot, rate_hz, loss, air)
+        TrialCell(pilot, scenario, autopilot, rate_hz, f"{100 * loss:g} %", (f"link.loss={loss}",), air)
         for scenario in given.scenario
         for autopilot in given.autopilots
         for rate_hz in given.rates
@@ -214,11 +209,11 @@ def _table(
     before: tuple[object, ...] = ()
     for cell in cells:
         flown = found[cell]
-        place = (cell.autopilot, cell.rate_hz, cell.loss, cell.air)
+        place = (cell.autopilot, cell.rate_hz, cell.link_name, cell.air)
         if before and place != before:
             table.add_section()
         before = place
-        names = (cell.autopilot, f"{cell.rate_hz:g}", f"{100 * cell.loss:g} %", cell.air, cell.pilot.name)
+        names = (cell.autopilot, f"{cell.rate_hz:g}", cell.link_name, cell.air, cell.pilot.name)
         if not flown:
             table.add_row(*names, "refused")
             continue
@@ -235,7 +230,7 @@ def _told(values: list[float], digits: int) -> str:
 
 
 def _name(cell: TrialCell) -> str:
-    return f"{cell.pilot.name}, {cell.scenario}, {cell.autopilot}, {cell.rate_hz:g} Hz, {100 * cell.loss:g} %"
+    return f"{cell.pilot.name}, {cell.scenario}, {cell.autopilot}, {cell.rate_hz:g} Hz, {cell.link_name}"
 
 
 def _document(

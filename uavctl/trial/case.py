@@ -36,7 +36,7 @@ class TrialPilot:
         config: Preset or file that it is made from.
         overrides: Of it.
         own: How the vehicle is set up that flies by its own position loop; None where ours flies.
-        knows_link: Whether it is designed for the losses that it meets; else for those of its configuration.
+        knows_link: Whether it is designed for the link that it meets; else for that of its configuration.
     """
 
     name: str
@@ -55,7 +55,8 @@ class TrialCell:
         scenario: What.
         autopilot: Whose behaviour the vehicle shows.
         rate_hz: Of the cameras.
-        loss: Share of positions that are lost.
+        link_name: What the link is called.
+        link: Overrides that make it.
         air: Calm, or wind and gusts.
     """
 
@@ -63,7 +64,8 @@ class TrialCell:
     scenario: Scenario
     autopilot: AutopilotName
     rate_hz: float
-    loss: float
+    link_name: str
+    link: tuple[str, ...]
     air: Air
 
 
@@ -82,7 +84,7 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
         f"sim.camera.rate_hz={cell.rate_hz}",
         f"sim.wind.velocity_mps={list(wind)}",
         f"sim.wind.gust_wind_mps={gusts}",
-        f"link.loss={cell.loss}",
+        *cell.link,
     ]
     if cell.scenario == "blackout":
         begin = blackout_s(seed)
@@ -93,8 +95,8 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
 def believed(cell: TrialCell) -> tuple[Config, Config]:
     """The configurations that a controller of ours and its design are made from.
 
-    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for the losses that it meets:
-    of the design, which is then that of the configured losses, it has names and places alone.
+    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for the link that it meets:
+    of the design, which is then that of the configured link, it has names and places alone.
 
     Raises:
         ConfigError: An override is none.
@@ -103,8 +105,7 @@ def believed(cell: TrialCell) -> tuple[Config, Config]:
     configured = _with_mission(load_config(cell.pilot.config, overrides), cell.scenario)
     if not cell.pilot.knows_link:
         return configured, configured
-    link = msgspec.structs.replace(configured.link, loss=cell.loss)
-    knowing = msgspec.structs.replace(configured, link=link)
+    knowing = _with_mission(load_config(cell.pilot.config, (*overrides, *cell.link)), cell.scenario)
     return knowing, configured if knowing.conditioned else knowing
 
 
