@@ -18,7 +18,7 @@ from uavctl.campaign.setting import met
 from uavctl.campaign.world import fly
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Decision, Plan, SolveStatus, Truth
+from uavctl.data import ControlMode, Decision, Plan, Setpoint, SolveStatus, Truth
 from uavctl.smpc.conditioned import METHOD
 
 SCHEME = "smpc.scheme=age-conditioned"
@@ -48,6 +48,21 @@ def test_the_setpoints_play_the_plans_out(flight: Memory) -> None:
     for one in played:
         assert one.plan_seq is not None and one.plan_index is not None
         assert len(plans[one.plan_seq].inputs) > one.plan_index
+
+
+def test_what_is_planned_has_arrived_by_the_end_of_its_step(flight: Memory) -> None:
+    """The gate limits setpoints within a step; none is left behind the plan at its last tick."""
+    config = load_config("room")
+    ticks = round(config.plant.dt_s / config.daemon.tick_s)
+    plans, setpoints = {plan.seq: plan for plan in flight.of(Plan)}, {one.at_ns: one for one in flight.of(Setpoint)}
+    moving = 0
+    for one in flight.of(Decision):
+        if one.tick % ticks != ticks - 1 or one.plan_seq is None or one.plan_index is None:
+            continue
+        moving += bool(setpoints[one.at_ns - round(config.daemon.tick_s * 1e9)].limited)
+        planned = plans[one.plan_seq].inputs[one.plan_index]
+        assert setpoints[one.at_ns].accel_mps2 == pytest.approx(planned, abs=1e-6)
+    assert moving > 5
 
 
 def test_a_flight_replays_bit_for_bit(flight: Memory) -> None:

@@ -164,19 +164,24 @@ def build_problem(config: Config) -> Problem:
     )
 
 
-def build_conditioned(config: Config) -> ConditionedDesign:
+def build_conditioned(config: Config, *, gated: bool = True) -> ConditionedDesign:
     """What flights of the scheme with risk conditioned on the age are planned with.
+
+    Args:
+        config: The configuration.
+        gated: Whether the last gate limits how fast what is planned may change; in a campaign nothing does.
 
     Raises:
         DesignError: See `build_problem`, `build_delayed_link`, `ConditionedSolver` and `innovations`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
     link, allowed = build_delayed_link(config), 1.0 - config.smpc.delta_x
-    solver = ConditionedSolver(problem, link, allowed)
+    slew_mps3 = config.limits.slew_mps3 if gated else math.inf
+    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3)
     cov = np.zeros((problem.plant.n_x,) * 2)
     if config.risk.estimate != "exact":
         cov = _innovations(config, problem.plant, longest_gap(link, allowed, problem.horizon)).estimate_cov
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed))
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3))
 
 
 def _planned_inputs(config: Config) -> Polytope:

@@ -90,10 +90,12 @@ class Estimate(Record, frozen=True, kw_only=True):
 class GaveWay(Record, frozen=True, kw_only=True):
     """A constraint that a plan could not keep, and by how much."""
 
-    constraint: str  # "state": a tightened row; "terminal": a row of the terminal set; "equilibrium": x̄_N = x_s
+    # "state": a tightened row; "terminal": a row of the terminal set; "equilibrium": x̄_N = x_s; "slew": how far the
+    # first setpoint may be from the one sent last
+    constraint: str
     stage: int  # t of the plan; that of the reference for "terminal"
-    index: int  # row of the state set; state for "equilibrium"
-    amount: float  # in the row's, or the state's, unit
+    index: int  # row of the state set; state for "equilibrium"; axis for "slew"
+    amount: float  # in the row's, or the state's, unit; m/s² for "slew"
 
 
 class Plan(Record, frozen=True, kw_only=True):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from uavctl.data import GaveWay
 
+_OF_NO_ROW = ("equilibrium", "slew")  # constraints that are no rows of the state set
+
 
 @dataclass(frozen=True)
 class Names:
@@ -15,10 +17,12 @@ class Names:
     Attributes:
         states: (name, unit) of each state; the unit is empty where it is not known.
         rows: (name, unit, size) of each row of the state set; a row's excess divided by its size is in the unit.
+        axes: Name of each axis.
     """
 
     states: tuple[tuple[str, str], ...]
     rows: tuple[tuple[str, str, float], ...]
+    axes: tuple[str, ...] = ()
 
 
 def names_of(
@@ -40,7 +44,7 @@ def names_of(
     states = [(f"state {index}", "") for index in range(n_x)]
     for axis, position, velocity in zip(axes, position_index, velocity_index, strict=True):
         states[position], states[velocity] = (f"{axis} position", "m"), (f"{axis} velocity", "m/s")
-    return Names(tuple(states), tuple(_row(number, row, states) for number, row in enumerate(c_x)))
+    return Names(tuple(states), tuple(_row(number, row, states) for number, row in enumerate(c_x)), tuple(axes))
 
 
 def _row(number: int, row: Sequence[float], states: Sequence[tuple[str, str]]) -> tuple[str, str, float]:
@@ -56,24 +60,26 @@ def tell(names: Names, one: GaveWay) -> str:
     if one.constraint == "equilibrium":
         name, unit = names.states[one.index]
         return f"rest was missed by {_amount(one.amount, unit)} of {name} in stage {one.stage}"
+    if one.constraint == "slew":
+        return f"the limit of how fast the {names.axes[one.index]} setpoint changes gave way by {one.amount:.2g} m/s²"
     name, unit, _ = names.rows[one.index]
     where = f"in stage {one.stage}" if one.constraint == "state" else f"where the plan rests, from stage {one.stage} on"
     return f"{name} gave way by {_amount(excess(names, one), unit)} {where}"
 
 
 def worst(names: Names, given: Iterable[GaveWay]) -> GaveWay:
-    """The one that gave way the most, each in its own unit; a limit before a missed rest, the first of equals."""
+    """The one that gave way the most, each in its own unit; a limit of a state first, the first of equals."""
     return max(given, key=lambda one: severity(names, one))
 
 
 def severity(names: Names, one: GaveWay) -> tuple[bool, float]:
-    """Order of constraints that gave way: limits above the rest at the end of a plan, then by the amount."""
-    return one.constraint != "equilibrium", excess(names, one)
+    """Order of constraints that gave way: limits of states above all else, then by the amount."""
+    return one.constraint not in _OF_NO_ROW, excess(names, one)
 
 
 def excess(names: Names, one: GaveWay) -> float:
     """By how much a constraint gave way, in the unit of its state."""
-    return one.amount / (1.0 if one.constraint == "equilibrium" else names.rows[one.index][2])
+    return one.amount / (1.0 if one.constraint in _OF_NO_ROW else names.rows[one.index][2])
 
 
 def tell_all(names: Names, given: Sequence[GaveWay]) -> str:

@@ -165,7 +165,15 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
     state = replace(state, mission=mission, order=None)
     target, outlook = ask_for(controller.mission, mission, base.at_ns)
     late = min(tick.age_steps or 0, controller.late_steps)
-    outlook = Outlook(limits=outlook.limits, path=outlook.path, late=late, cov=np.array(base.cov))
+    # The solver counts what acts on the plant in all; `ask` takes the bias off again.
+    sent = controller.plant.to_input(state.accel_mps2)
+    outlook = Outlook(
+        limits=outlook.limits,
+        path=outlook.path,
+        late=late,
+        cov=np.array(base.cov),
+        sent=sent + np.array(base.bias) if base.bias else sent,
+    )
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -36,12 +37,14 @@ class Outlook:
         path: Trajectory to follow; None: stay at the target.
         late: Age of the position that the state was predicted from [steps].
         cov: Covariance of the state estimate's error (n_x, n_x); None: it is exact. A design with its own uses that.
+        sent: Input (n_u,) that acts until the plan begins, in the plan's own count; None: nothing is known of it.
     """
 
     limits: Array | None = None
     path: Path | None = None
     late: int = 0
     cov: Array | None = None
+    sent: Array | None = None
 
     @property
     def nominal(self) -> bool:
@@ -54,11 +57,12 @@ NOMINAL = Outlook()
 
 def finite(x: Array, target: Array, outlook: Outlook) -> bool:
     """Whether a question is made of finite numbers."""
-    given = [x, target] if outlook.cov is None else [x, target, outlook.cov]
-    if outlook.limits is not None:
-        given.append(outlook.limits)
+    given = [x, target, *(one for one in (outlook.cov, outlook.limits, outlook.sent) if one is not None)]
     if outlook.path is not None:
         given += [outlook.path.states, outlook.path.inputs]
+    # A sum of squares is finite where all of them are, unless it overflows: then each is looked at.
+    if math.isfinite(sum(float(np.vdot(values, values)) for values in given)):
+        return True
     return all(bool(np.isfinite(values).all()) for values in given)
 
 
@@ -83,7 +87,7 @@ class Answer:
         cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method
             knows none.
         gap: (cost - cost_lower) / |cost|, see `relative_gap`; inf if no lower bound is known.
-        iterations: Interior-point iterations, summed over all programs that were run.
+        iterations: Iterations of the solver, summed over all programs that were run.
     """
 
     seq: int

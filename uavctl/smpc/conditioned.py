@@ -13,129 +13,135 @@ proof.
 
 The cost is that of the regulator: with u_t = u_s + K(x_t - x_s) + c_t and its Riccati solution behind stage H it is
 |z|² in z = L'c, L L' = R + B'PB. Where z = 0 keeps all limits within the budgets it is the answer; elsewhere a
-strictly convex program is solved for each independent part.
+strictly convex program is solved for each independent part that has to leave it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
 
 from uavctl.data import GaveWay, SolveStatus
 from uavctl.errors import DesignError
+from uavctl.smpc.age_risk import PRICE, age_risk
+from uavctl.smpc.allocation import binding, quantile, shifted, spent
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
-from uavctl.smpc.assemble import KEPT, inside
-from uavctl.smpc.baselines.mpc import regulated
-from uavctl.smpc.baselines.problem import Part, Problem, parts, unseen
+from uavctl.smpc.assemble import INPUT_TOLERANCE, KEPT, inside
+from uavctl.smpc.baselines.problem import Problem, parts, unseen
 from uavctl.smpc.batch_smpc import Decisions, gathered
-from uavctl.smpc.equilibria import Equilibria, equilibria
-from uavctl.smpc.layout import pairs_of
+from uavctl.smpc.deviations import Deviations
+from uavctl.smpc.equilibria import equilibria
 from uavctl.smpc.link import LinkModel
-from uavctl.smpc.lqg_bound import Lqr, lqr
-from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
+from uavctl.smpc.lqg_bound import lqr
+from uavctl.smpc.part_program import PartProgram
+from uavctl.smpc.places import Places
+from uavctl.smpc.qp import OPEN
+from uavctl.smpc.regulated_rows import RegulatedRows
+from uavctl.smpc.slew import SlewRows
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 METHOD = "age-conditioned"
-PRICE = 0.9  # h of π_t^h, what an age's back-off costs: 1 is best in transit, 0 at rest beside a limit
 ROUNDS = 3  # programs of an allocation that has to be shifted
-LARGEST_RISK = 0.5  # of a row: a mean outside of its limit is no plan
-LEAST_RISK = 1e-9  # of an age's budget: what rounding may leave
-_KEEPS = 0.5  # of the room between a row that does not bind and its back-off: what it keeps
-_AWAY = 1e-6  # risk below which a row that does not bind keeps no more
-_BINDS = 1e-9  # of a row's standard deviation: nearer than this to its back-off, it binds
+MOST_SHIFTING = 300  # iterations of all programs so far, above which no more risk is shifted
+_OPEN = np.array([OPEN])
 
 
 @dataclass(frozen=True, eq=False)
-class AgeRisk:
-    """How the risk of a time is spread over the ages of the information that its plan may be based on.
+class _Margins:
+    """What a covariance and an age ask of the rows, in each stage.
 
     Attributes:
-        weights: π_t (H,), of information t = 1 … H steps old.
-        beyond: Probability that it is older than H: no plan is left then, and all of it counts as outside.
-        budgets: ε̄_t (H,) with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK bounds them.
+        sigma: Standard deviations (H, m).
+        budgets: ε̄ of the stages (H,).
+        backoff: Back-offs (H, m) of rows that share the budgets equally.
+        rest: What a plan that rests keeps (m,) from rows that have each budget to themselves.
     """
 
-    weights: Array
-    beyond: float
+    sigma: Array
     budgets: Array
+    backoff: Array
+    rest: Array
 
 
-def age_risk(link: LinkModel, deviations: Array, allowed: float, price: float = PRICE) -> AgeRisk:
-    """Spread the allowed risk so that Σ_t π_t^h β_t is least for a row with the back-offs β_t = Φ⁻¹(1 - ε̄_t) σ_t.
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A plan beside the regulator's: what leaves it, the back-offs (H, m), the room (H, m) and the iterations."""
 
-    Args:
-        link: Model of the link.
-        deviations: σ_t (H,) of the row.
-        allowed: 1 - δ_x.
-        price: h.
-
-    Raises:
-        DesignError: Information is older than the horizon more often than is allowed.
-    """
-    steps = len(deviations)
-    older = np.array([link.outage(age) for age in range(steps + 1)])
-    weights, beyond = older[:-1] - older[1:], float(older[-1])
-    left = allowed - beyond
-    if left <= LEAST_RISK * allowed:
-        raise DesignError(
-            "smpc.horizon",
-            f"positions are {steps} steps old or more in {beyond:.3g} of all steps, and no more than {allowed:.3g} "
-            "may be outside of the limits",
-            "take a longer smpc.horizon or a lower smpc.delta_x",
-        )
-    if not deviations.all():
-        return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), LARGEST_RISK)))
-    # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
-    scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
-
-    def budgets(level: float) -> Array:
-        return np.asarray(ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))))
-
-    def excess(level: float) -> float:
-        return float(weights @ budgets(level)) - left
-
-    low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
-    return AgeRisk(weights, beyond, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
+    left: Sequence[tuple[PartProgram, Array]]
+    backoff: Array
+    room: Array
+    iterations: int
 
 
 class ConditionedSolver:
     """Answers from one strictly convex program for each independent part; never raises on numbers.
 
     The reference is the equilibrium nearest to the target at which a plan may rest: limits less the back-offs there.
+    An answer depends on its question alone, bit for bit.
 
     Args:
         problem: The problem; every question brings a target of its own.
         link: Model of the link.
         allowed: 1 - δ_x, the share of time in which the state may be outside of its limits.
         price: See `age_risk`.
+        slew_mps3: How far the acceleration setpoint may go in a second [m/s³], see `SlewRows`; infinite: anywhere.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
             horizon too often.
     """
 
-    def __init__(self, problem: Problem, link: LinkModel, allowed: float, price: float = PRICE) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        link: LinkModel,
+        allowed: float,
+        price: float = PRICE,
+        slew_mps3: float = math.inf,
+    ) -> None:
         self.problem = problem
-        plant, law = problem.plant, lqr(problem.plant, problem.q_x, problem.q_u)
-        noise = plant.e @ plant.w @ plant.e.T
-        self._tail, self._limits = law.p, np.tile(problem.state_set.b, (problem.horizon, 1))
-        self._parts = [_PartProgram(problem, law, part, noise) for part in parts(problem)]
-        moved = {int(state) for one in self._parts for state in one.part.states}
+        plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
+        self._tail = law.p
+        self._slew = SlewRows(plant, problem.input_set, slew_mps3)
+        found = parts(problem, self._slew.d)
+        moved = {int(state) for part in found for state in part.states}
         if len(moved) < plant.n_x:
             adrift = sorted(set(range(plant.n_x)) - moved)
             raise DesignError("plant.b", f"states {adrift} are reached by no input", "give each state an input")
+        self._regulated = RegulatedRows(problem, law, found, self._slew)
+        self._deviations = Deviations(problem, found)
+        self._rows = self._regulated.rows
+        width, hard = self._rows.size, self._regulated.hard[-1].stop
+        self._parts = [
+            PartProgram(problem, law, part, self._slew, columns, own, width, width * steps + hard)
+            for part, columns, own in zip(found, self._regulated.columns, self._regulated.hard, strict=True)
+        ]
+        self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
+        self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
         self._rests = equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
-        self._places = [_Places(problem, self._rests, one.part) for one in self._parts]
+        self._holds = bool(self._rests.u_eq.any())
+        self._places = [Places(problem, self._rests, part) for part in found]
+        placed = np.vstack([one.rows for one in self._places])
+        self._resting = np.flatnonzero(np.any(placed != 0.0, axis=1))
+        self._placed = placed[self._resting]
+        self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
+        self._low, self._high = problem.input_set.bounds
+        self._no_backoff = np.zeros((steps, problem.input_set.b.size))
+        self._no_backoff.setflags(write=False)
         self.risk = age_risk(link, self._pacing(), allowed, price)
+        # By how late the position was: budgets, and quantiles of rows that share them and of one that need not.
+        ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
+        self._budgets = self.risk.budgets[ages]
+        self._shared = quantile(self._budgets / max(1, width))[:, :, None]
+        self._whole = quantile(self._budgets)[:, :, None]
+        self._last: tuple[tuple[int, bytes], _Margins] | None = None
 
     def rests(self, cov: Array) -> Array:
         """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do.
@@ -144,77 +150,46 @@ class ConditionedSolver:
             cov: Covariance of the estimate's error (n_x, n_x).
         """
         sides = self.problem.state_set.b.copy()
-        for one in self._parts:
-            sides[one.part.rows_x] -= _rest(self.risk.budgets / len(self._parts), one.deviations(cov))
+        share = quantile(self.risk.budgets / len(self._parts))
+        sides[self._rows] -= (share[:, None] * self._deviations.of(cov)).max(axis=0)
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards `target` (n_x,), an equilibrium; see `Solver`."""
         if not finite(x, target, outlook):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        steps = self.problem.horizon
-        limits = self._limits if outlook.limits is None else outlook.limits[1:]
-        budgets = self.risk.budgets[np.minimum(np.arange(steps) + outlook.late, steps - 1)]
-        deviations = [one.deviations(outlook.cov) for one in self._parts]
-        reference = self._reference(target, limits, deviations, budgets)
-        hold = self._rests.u_eq @ reference[self._rests.held]
-        asked = [one.question(x, reference, hold, limits, outlook) for one in self._parts]
-        found = _spread(self._parts, asked, deviations, budgets)
+        margins, limits = self._margins(outlook), self._b
+        if outlook.limits is not None:
+            limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
+        reference = self._reference(target, limits, margins)
+        hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
+        first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
+        dx = x - reference
+        room, hard = self._regulated.room(dx, limits - self._c @ reference, hold, first)
+        along: list[tuple[PartProgram, Array]] = []
+        if outlook.path is not None:
+            along = [(one, one.along(outlook.path.states, outlook.path.inputs)) for one in self._parts]
+            for one, z in along:
+                one.take(z, room, hard)
+        found = self._spread(room, hard, margins)
         if found is None:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        return self._answer(seq, x, target, reference, hold, found, outlook)
-
-    def _reference(self, target: Array, limits: Array, deviations: Sequence[Array], budgets: Array) -> Array:
-        """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets (H,)."""
-        reference = np.array(target)
-        sides = [limits[:, one.part.rows_x].min(axis=0) for one in self._parts]
-        pairs = tuple(zip(self._places, sides, deviations, strict=True))
-        binding = sum(places.short(target, side - _rest(budgets, sigma)) for places, side, sigma in pairs)
-        if binding:
-            for places, side, sigma in pairs:
-                places.nearest(reference, side - _rest(budgets / binding, sigma))
-        return reference
-
-    def _pacing(self) -> Array:
-        """Deviations (H,) by which the risk is spread over the ages: those of the position that wanders most."""
-        c, index = self.problem.state_set.c, list(self.problem.plant.position_index)
-        sigma = np.zeros((self.problem.horizon, len(c)))
-        for one in self._parts:
-            sigma[:, one.part.rows_x] = one.deviations(None)
-        rows = np.any(c[:, index] != 0.0, axis=1)
-        limited = sigma[:, rows] if rows.any() else sigma
-        return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))
-
-    def _answer(
-        self, seq: int, x: Array, target: Array, reference: Array, hold: Array, found: _Found, outlook: Outlook
-    ) -> Answer:
-        problem, steps = self.problem, self.problem.horizon
-        inputs, states = np.tile(hold, (steps, 1)), np.tile(reference, (steps + 1, 1))
+        inputs, states = self._regulated.plan(dx)
+        for one, z in (*along, *found.left):
+            one.add(z, inputs, states)
+        cost, slack, gave_way = self._price(inputs, states, found, outlook)
+        if first is not None and (first[1] > self._slew.side + KEPT).any():
+            gave_way += self._slew_gave_way(first[1])
+        states += reference
         states[0] = x
-        backoff_x = np.zeros((steps + 1, problem.state_set.b.size))
-        for one, z, start, backoff in zip(self._parts, found.z, found.starts, found.backoffs, strict=True):
-            inputs[:, one.part.inputs] += one.inputs(start, z)
-            states[1:, one.part.states] += one.states(start, z)
-            backoff_x[1:, one.part.rows_x] = backoff
-        inputs, kept = inside(inputs, problem.input_set.c, problem.input_set.b)
-        limits = self._limits if outlook.limits is None else outlook.limits[1:]
-        left = states[1:] @ problem.state_set.c.T + backoff_x[1:] - limits
-        over = np.maximum(left, 0.0)
-        dx, du = states - reference, inputs - hold
-        if outlook.path is not None:
-            dx[:steps] -= outlook.path.states
-            du -= outlook.path.inputs
-        cost = (
-            np.einsum("ti,ij,tj->", dx[:steps], problem.q_x, dx[:steps])
-            + np.einsum("ti,ij,tj->", du, problem.q_u, du)
-            + dx[steps] @ self._tail @ dx[steps]
-            + problem.slack_linear * over.sum()
-            + problem.slack_quadratic * np.square(over).sum()
-        )
-        gave_way = tuple(
-            GaveWay(constraint="state", stage=int(t) + 1, index=int(i), amount=float(over[t, i]))
-            for t, i in np.argwhere(over > KEPT)
-        )
+        if hold is not None:
+            inputs += hold
+        inputs, kept = self._inside(inputs, bool(found.left))
+        backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
+        backoff_x[1:, slice(None) if self._in_order else self._rows] = found.backoff
+        offset = 0.0
+        if reference is not target:
+            offset = float(np.abs((reference - target)[self._rests.held]).sum())
         return Answer(
             seq=seq,
             status=SolveStatus.OPTIMAL if kept else SolveStatus.INACCURATE,
@@ -222,17 +197,126 @@ class ConditionedSolver:
             inputs=inputs,
             states=states,
             backoff_x=backoff_x,
-            backoff_u=np.zeros((steps, problem.input_set.b.size)),
-            reference=reference,
-            slack=float(over.sum()),
-            offset=float(np.abs((reference - target)[self._rests.held]).sum()),
+            backoff_u=self._no_backoff,
+            reference=np.array(reference),
+            slack=slack,
+            offset=offset,
             terminal_miss=0.0,
-            cost=float(cost),
+            cost=cost,
             cost_lower=-np.inf,  # the spread of the risk is no convex program, and each spread's is solved to rounding
             gap=np.inf,
-            iterations=found.programs,
+            iterations=found.iterations,
             gave_way=gave_way,
         )
+
+    def _margins(self, outlook: Outlook) -> _Margins:
+        """Those of an outlook; the last ones are kept, by the very bits that they are made of."""
+        key = outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
+        if self._last is None or self._last[0] != key:
+            sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
+            rest = (self._whole[late] * sigma).max(axis=0)
+            self._last = key, _Margins(sigma, self._budgets[late], self._shared[late] * sigma, rest)
+        return self._last[1]
+
+    def _reference(self, target: Array, limits: Array, margins: _Margins) -> Array:
+        """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        short = self._placed @ target[self._rests.held] > (sides - margins.rest)[self._resting]
+        if not short.any():
+            return target
+        reference = np.array(target)
+        rest = (quantile(margins.budgets / int(short.sum()))[:, None] * margins.sigma).max(axis=0)
+        for one, places in zip(self._parts, self._places, strict=True):
+            places.nearest(reference, (sides - rest)[one.columns])
+        return reference
+
+    def _pacing(self) -> Array:
+        """Deviations (H,) by which the risk is spread over the ages: those of the position that wanders most."""
+        sigma, index = self._deviations.of(None), list(self.problem.plant.position_index)
+        rows = np.any(self._c[:, index] != 0.0, axis=1)
+        limited = sigma[:, rows] if rows.any() else sigma
+        return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))
+
+    def _spread(self, room: Array, hard: Array, margins: _Margins) -> _Found | None:
+        """Plans of all parts, the budgets spread over the rows of all of them in a few rounds.
+
+        Each row begins with an equal share. Rows that do not bind keep a share that still leaves half of their room,
+        and those that bind get the rest. The plan of one round keeps the limits of the next, so that no round costs
+        more, and a part of which no state row binds keeps its plan.
+
+        Args:
+            room: Room of the state rows where z = 0 (H, m).
+            hard: The same of the hard rows.
+            margins: What is asked of the rows.
+        """
+        backoff, sigma, budgets = margins.backoff, margins.sigma, margins.budgets
+        over, tight = room < backoff, hard < 0.0
+        if not tight.any():
+            stages = np.flatnonzero(over.any(axis=1))
+            if not stages.size:
+                return _Found((), backoff, room, 0)
+            if (spent(room[stages], sigma[stages]).sum(axis=1) <= budgets[stages]).all():
+                return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
+        todo = [one for one in self._parts if tight[one.hard].any() or over[:, one.columns].any()]
+        left: dict[PartProgram, Array] = {}
+        found, now = None, room
+        iterations = 0
+        for number in range(ROUNDS):
+            if number:
+                binds = binding(backoff, now, sigma)
+                stages = np.flatnonzero(binds.any(axis=1))
+                todo = [one for one in todo if binds[:, one.columns].any()]
+                if not todo or iterations > MOST_SHIFTING:
+                    break
+                backoff = backoff.copy()
+                backoff[stages] = shifted(backoff[stages], now[stages], sigma[stages], budgets[stages], binds[stages])
+            rooms = np.concatenate([(room - backoff).ravel(), hard, _OPEN])
+            left, now = dict(left), now.copy()
+            for one in todo:
+                z = one.solve(rooms, again=number > 0)
+                iterations += one.iterations
+                if z is None:
+                    return found
+                left[one] = z
+                now[:, one.columns] = room[:, one.columns]
+                one.take_states(z, now)
+            found = _Found(tuple(left.items()), backoff, now, iterations)
+        return found
+
+    def _price(self, du: Array, dx: Array, found: _Found, outlook: Outlook) -> tuple[float, float, tuple[GaveWay, ...]]:
+        """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
+        problem, last = self.problem, dx[-1]
+        dx = dx[:-1]
+        if outlook.path is not None:
+            dx, du = dx - outlook.path.states, du - outlook.path.inputs
+        cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
+        if not found.left:
+            return float(cost), 0.0, ()
+        over = np.maximum(found.backoff - found.room, 0.0)
+        slack = float(over.sum())
+        if slack == 0.0:
+            return float(cost), 0.0, ()
+        cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
+        gave_way = tuple(
+            GaveWay(constraint="state", stage=int(t) + 1, index=int(self._rows[i]), amount=float(over[t, i]))
+            for t, i in np.argwhere(over > KEPT)
+        )
+        return float(cost), slack, gave_way
+
+    def _slew_gave_way(self, side: Array) -> tuple[GaveWay, ...]:
+        """The rows of the first step that leave more than the gate lets through, by `side` (m,)."""
+        over = side - self._slew.side
+        return tuple(
+            GaveWay(constraint="slew", stage=0, index=int(self._slew.axes[i]), amount=float(over[i]))
+            for i in np.flatnonzero(over > KEPT)
+        )
+
+    def _inside(self, inputs: Array, solved: bool) -> tuple[Array, bool]:
+        """Inputs (H, n_u) within their limits to the last bit, and whether they were but for rounding."""
+        if not self._box:
+            return inside(inputs, self.problem.input_set.c, self.problem.input_set.b)
+        cut = np.minimum(np.maximum(inputs, self._low), self._high)
+        return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
 
 
 class ConditionedDecider:
@@ -253,221 +337,3 @@ class ConditionedDecider:
         problem = self._solver.problem
         answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(x)]
         return gathered(answers, (problem.horizon, problem.plant.n_u))
-
-
-@dataclass(frozen=True, eq=False)
-class _Question:
-    """One question to a part: its state, as a deviation, and the room (m,) of all rows where z = 0."""
-
-    start: Array
-    room_x: Array
-    room_u: Array
-    linear: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """What the parts answered: z and start (n_x,) of each, back-offs (H, m) of its state rows, programs solved."""
-
-    z: list[Array]
-    starts: list[Array]
-    backoffs: list[Array]
-    programs: int
-
-
-class _PartProgram:
-    """Program of one independent part, in deviations from the reference.
-
-    Attributes:
-        part: Its states, inputs and rows.
-    """
-
-    def __init__(self, problem: Problem, law: Lqr, part: Part, noise: Array) -> None:
-        self.part, self._steps = part, problem.horizon
-        own, n_x, n = part.states, part.states.size, problem.horizon * part.inputs.size
-        self._c_x, c_u = problem.state_set.c[np.ix_(part.rows_x, own)], problem.input_set.c[part.rows_u][:, part.inputs]
-        self._b_u, self._c_u = problem.input_set.b[part.rows_u], c_u
-        states_of, inputs_of = regulated(problem, law, part)
-        a = problem.plant.a[np.ix_(own, own)]
-        self._phi, self._variance = _open_loop(self._c_x, a, noise[np.ix_(own, own)], problem.horizon)
-        of_x = np.einsum("mi,tij->tmj", self._c_x, states_of[1:]).reshape(-1, n_x + n)
-        of_u = np.einsum("mi,tij->tmj", c_u, inputs_of).reshape(-1, n_x + n)
-        self._x_of_start, self._x_of_z = of_x[:, :n_x], of_x[:, n_x:]
-        self._u_of_start, self._u_of_z = of_u[:, :n_x], of_u[:, n_x:]
-        self._plan, self._motion = inputs_of.reshape(-1, n_x + n), states_of[1:].reshape(-1, n_x + n)
-        # A path (p_t, r_t) to follow adds -2 Σ (x_t' Q p_t + u_t' R r_t) to the cost.
-        q_x, q_u = problem.q_x[np.ix_(own, own)], problem.q_u[np.ix_(part.inputs, part.inputs)]
-        self._path_x = -2.0 * np.einsum("tij,ik->jtk", states_of[:-1, :, n_x:], q_x).reshape(n, -1)
-        self._path_u = -2.0 * np.einsum("tij,ik->jtk", inputs_of[:, :, n_x:], q_u).reshape(n, -1)
-        pairs_x, pairs_u = _pairs(self._c_x, problem.horizon), _pairs(c_u, problem.horizon)
-        self._upper = np.concatenate([pairs_x[0], pairs_u[0] + np.where(pairs_u[0] >= 0, len(of_x), 0)])
-        self._lower = np.concatenate([pairs_x[1], pairs_u[1] + np.where(pairs_u[1] >= 0, len(of_x), 0)])
-        of_z = np.vstack([self._x_of_z, self._u_of_z])
-        rows = np.where((self._upper >= 0)[:, None], of_z[self._upper], -of_z[self._lower])
-        soft = np.arange(len(rows)) < len(pairs_x[0])
-        self._program = QuadraticProgram(
-            2.0 * np.eye(n),
-            np.ascontiguousarray(rows),
-            np.where(soft, SOFT, 0).astype(np.int32),
-            np.where(soft, problem.slack_linear, 0.0),
-            np.where(soft, problem.slack_quadratic, 0.0),
-        )
-
-    def deviations(self, cov: Array | None) -> Array:
-        """Standard deviations (H, m) of the state rows in the stages 1 … H, by the estimate's covariance (n_x, n_x)."""
-        if cov is None:
-            return np.sqrt(self._variance)
-        own = cov[np.ix_(self.part.states, self.part.states)]
-        seen = np.einsum("tmi,ij,tmj->tm", self._phi, own, self._phi)
-        return np.asarray(np.sqrt(np.maximum(self._variance + seen, 0.0)))
-
-    def question(self, x: Array, reference: Array, hold: Array, limits: Array, outlook: Outlook) -> _Question:
-        """State (n_x,), reference (n_x,), its input (n_u,) and limits (H, m_x), all of the whole plant."""
-        part = self.part
-        start = x[part.states] - reference[part.states]
-        linear = np.zeros(self._path_x.shape[0])
-        if outlook.path is not None:
-            linear = self._path_x @ outlook.path.states[:, part.states].ravel()
-            linear += self._path_u @ outlook.path.inputs[:, part.inputs].ravel()
-        room_x = (limits[:, part.rows_x] - self._c_x @ reference[part.states]).ravel() - self._x_of_start @ start
-        room_u = np.tile(self._b_u - self._c_u @ hold[part.inputs], self._steps) - self._u_of_start @ start
-        return _Question(start, room_x, room_u, linear)
-
-    def rooms(self, asked: _Question, z: Array) -> tuple[Array, Array]:
-        """Room that a plan leaves: of the state rows (H, m), of the input rows (H m_u,)."""
-        room_x = asked.room_x - self._x_of_z @ z
-        return room_x.reshape(self._steps, -1), asked.room_u - self._u_of_z @ z
-
-    def solve(self, asked: _Question, backoff: Array) -> Array | None:
-        """Best z with back-offs (H, m) of the state rows; None where the program found none."""
-        room = np.concatenate([asked.room_x - backoff.ravel(), asked.room_u, [OPEN]])
-        # An open side has index -1: the last entry.
-        upper, lower = room[self._upper], -room[self._lower]
-        # Where two back-offs meet no mean keeps both: it stays between them.
-        crossed = upper < lower
-        upper[crossed] = lower[crossed] = 0.5 * (upper + lower)[crossed]
-        solved = self._program.solve(asked.linear, np.minimum(upper, OPEN), np.maximum(lower, -OPEN))
-        return None if solved is None else solved[0]
-
-    def inputs(self, start: Array, z: Array) -> Array:
-        """Inputs (H, n_u) of the part, as deviations."""
-        return np.asarray(self._plan @ np.concatenate([start, z])).reshape(self._steps, -1)
-
-    def states(self, start: Array, z: Array) -> Array:
-        """States (H, n_x) of the part in the stages 1 … H, as deviations."""
-        return np.asarray(self._motion @ np.concatenate([start, z])).reshape(self._steps, -1)
-
-
-class _Places:
-    """Equilibria of one part: the one nearest to a target that keeps given limits."""
-
-    def __init__(self, problem: Problem, rests: Equilibria, part: Part) -> None:
-        (self._own,) = np.nonzero(np.isin(rests.held, part.states))
-        self._states, self._held = part.states, rests.held[self._own]
-        self._x_eq = rests.x_eq[np.ix_(part.states, self._own)]
-        rows = problem.state_set.c[np.ix_(part.rows_x, part.states)] @ self._x_eq
-        (self._used,) = np.nonzero(np.any(rows != 0.0, axis=1))
-        self._rows = rows[self._used]
-        if self._used.size and self._own.size:
-            price, curve = np.full(self._used.size, problem.slack_linear), np.full(self._used.size, 1.0)
-            sense = np.full(self._used.size, SOFT, dtype=np.int32)
-            self._program = QuadraticProgram(2.0 * np.eye(self._own.size), self._rows, sense, price, curve)
-
-    def short(self, target: Array, sides: Array) -> int:
-        """Number of rows that the target (n_x,) does not keep within `sides` (m,)."""
-        if not self._own.size:
-            return 0
-        return int(np.sum(self._rows @ target[self._held] > sides[self._used]))
-
-    def nearest(self, reference: Array, sides: Array) -> None:
-        """Move the part's states of `reference` (n_x,) to the nearest equilibrium within `sides` (m,) of its rows."""
-        if not self._used.size or not self._own.size:
-            return
-        y = reference[self._held]
-        room = sides[self._used] - self._rows @ y
-        if (room >= 0.0).all():
-            return
-        moved = self._program.solve(np.zeros(y.size), np.minimum(room, OPEN), np.full(room.size, -OPEN))
-        if moved is not None:
-            reference[self._states] = self._x_eq @ (y + moved[0])
-
-
-def _spread(
-    programs: Sequence[_PartProgram], asked: Sequence[_Question], deviations: Sequence[Array], budgets: Array
-) -> _Found | None:
-    """Plans of all parts, the budgets (H,) spread over the rows of all of them in a few rounds.
-
-    Each row begins with an equal share. Rows that do not bind keep a share that still leaves half of their room, and
-    those that bind get the rest. The plan of one round keeps the limits of the next, so that no round costs more.
-    """
-    sigma = np.hstack(deviations)
-    ends = np.cumsum([one.shape[1] for one in deviations])[:-1]
-    zs = [-0.5 * question.linear for question in asked]
-    rooms, inputs = zip(*(one.rooms(q, z) for one, q, z in zip(programs, asked, zs, strict=True)), strict=True)
-    backoff, room = _backoffs(budgets / max(1, sigma.shape[1]), sigma), np.hstack(rooms)
-    solved = 0
-    within = [bool((left >= 0.0).all()) for left in inputs]
-    if not (all(within) and bool((_risk(room, sigma).sum(axis=1) <= budgets).all())):
-        for number in range(ROUNDS):
-            if number:
-                backoff = _shifted(backoff, room, sigma, budgets)
-            for i, (one, question, own) in enumerate(
-                zip(programs, asked, np.split(backoff, ends, axis=1), strict=True)
-            ):
-                if within[i] and bool((rooms[i] >= own).all()):
-                    zs[i] = -0.5 * question.linear
-                    continue
-                z = one.solve(question, own)
-                if z is None:
-                    return None
-                zs[i], solved = z, solved + 1
-            room = np.hstack([one.rooms(q, z)[0] for one, q, z in zip(programs, asked, zs, strict=True)])
-    else:
-        backoff = np.minimum(backoff, np.maximum(room, 0.0))
-    return _Found(zs, [one.start for one in asked], np.split(backoff, ends, axis=1), solved)
-
-
-def _risk(room: Array, sigma: Array) -> Array:
-    """Probability (H, m) that a row is left whose mean keeps that room."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(sigma > 0.0, ndtr(-room / sigma), np.where(room < 0.0, 1.0, 0.0))
-
-
-def _backoffs(risk: Array, sigma: Array) -> Array:
-    """Back-offs (H, m) at which each row of a stage has the risk of that stage (H,)."""
-    return np.asarray(-ndtri(np.minimum(risk, LARGEST_RISK))[:, None] * sigma)
-
-
-def _rest(risk: Array, sigma: Array) -> Array:
-    """Back-offs (m,) of a plan that rests: the largest of all stages, each with its risk (H,)."""
-    return np.asarray(_backoffs(risk, sigma).max(axis=0))
-
-
-def _shifted(backoff: Array, room: Array, sigma: Array, budgets: Array) -> Array:
-    """Back-offs (H, m) after risk has gone from the rows that do not bind to those that do."""
-    binds = room <= backoff + _BINDS * sigma
-    farthest = np.maximum(backoff, -ndtri(_AWAY) * sigma)
-    kept = np.minimum(backoff + _KEEPS * np.maximum(room - backoff, 0.0), farthest)
-    left = budgets - np.where(binds, 0.0, _risk(kept, sigma)).sum(axis=1)
-    share = left / np.maximum(binds.sum(axis=1), 1)
-    return np.where(binds, _backoffs(share, sigma), kept)
-
-
-def _open_loop(c: Array, a: Array, noise: Array, steps: int) -> tuple[Array, Array]:
-    """C A^t (H, m, n_x) and the variance (H, m) of the rows by disturbances alone, of the stages t = 1 … H."""
-    phi, variance, spread = [], [], np.zeros_like(noise)
-    power = np.eye(len(a))
-    for _ in range(steps):
-        power, spread = a @ power, a @ spread @ a.T + noise
-        phi.append(c @ power)
-        variance.append(np.einsum("mi,ij,mj->m", c, spread, c))
-    return np.array(phi), np.array(variance)
-
-
-def _pairs(c: Array, steps: int) -> tuple[Index, Index]:
-    """Rows of all stages that limit each direction from above and from below, -1 for none: (H d,), (H d,)."""
-    rows = [dict(pair.sides) for pair in pairs_of(c)]
-    upper, lower = (np.array([sides.get(sign, -1) for sides in rows], dtype=np.intp) for sign in (1.0, -1.0))
-    stage = len(c) * np.arange(steps)[:, None]
-    above, below = (np.where(side >= 0, side + stage, -1).ravel() for side in (upper, lower))
-    return above, below

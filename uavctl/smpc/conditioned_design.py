@@ -68,10 +68,10 @@ class ConditionedDesign:
 AnyDesign = Design | ConditionedDesign  # what a flight is planned with, of either scheme
 
 
-def conditioned_id(problem: Problem, link: LinkModel, allowed: float) -> str:
+def conditioned_id(problem: Problem, link: LinkModel, allowed: float, slew_mps3: float) -> str:
     """Hash of what `ConditionedSolver` is made from."""
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
-    return digest((METHOD, anywhere, link, allowed))
+    return digest((METHOD, anywhere, link, allowed, slew_mps3))
 
 
 def longest_gap(link: LinkModel, allowed: float, most: int) -> int:

@@ -29,6 +29,7 @@ class QuadraticProgram:
 
     Attributes:
         sense: DAQP's state of each row (m,).
+        iterations: Of the last solve.
 
     Args:
         h: H (n, n), positive definite.
@@ -37,12 +38,21 @@ class QuadraticProgram:
         price: Linear price of a soft row (m,).
         curve: Quadratic price (m,): leaving by s costs price·s + curve·s².
         tolerance: Of feasibility, primal and dual.
+        most: Iterations after which a solve gives up.
     """
 
     def __init__(
-        self, h: Array, a: Array, sense: Sense, price: Array, curve: Array, tolerance: float = TOLERANCE
+        self,
+        h: Array,
+        a: Array,
+        sense: Sense,
+        price: Array,
+        curve: Array,
+        tolerance: float = TOLERANCE,
+        most: int = _MOST_ITERATIONS,
     ) -> None:
         self.sense = sense
+        self.iterations = 0
         model = daqp.Model()
         sides = np.full(a.shape[0], OPEN)
         model.setup(h, np.zeros(h.shape[0]), a, sides, -sides, sense)  # the soft rows fix the workspace
@@ -50,7 +60,7 @@ class QuadraticProgram:
             "primal_tol": tolerance,
             "dual_tol": tolerance,
             "eps_prox": 0.0,
-            "iter_limit": _MOST_ITERATIONS,
+            "iter_limit": most,
         }
         rho = 0.5 / np.maximum(curve, LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
@@ -65,6 +75,21 @@ class QuadraticProgram:
             return None
         return self._read()
 
+    def solve_sides(self, upper: Array, lower: Array, again: bool = False) -> Array | None:
+        """Minimiser (n,) for the f of the last question that gave one, zero without; None without an optimum.
+
+        Args:
+            upper: Upper sides (m,).
+            lower: Lower sides (m,).
+            again: Whether to begin with the rows, and their factors, at which the last solve ended. What comes out
+                depends on that solve too, in its last bits: only where it was of the same question.
+        """
+        sense = None if again else self.sense
+        if self._update(bupper=upper, blower=lower, sense=sense) < 0:
+            return None
+        found = self._read()
+        return None if found is None else found[0]
+
     def solve_anew(self, h: Array, f: Array, a: Array, upper: Array, lower: Array) -> tuple[Array, Array] | None:
         """The same with new matrices of the same sizes."""
         if self._update(H=h, f=f, A=a, bupper=upper, blower=lower, sense=self.sense) < 0:
@@ -73,6 +98,7 @@ class QuadraticProgram:
 
     def _read(self) -> tuple[Array, Array] | None:
         z, value, flag, info = self._solve()
+        self.iterations = info["iterations"]
         # NaN comes back as solved; the square's overflow counts as no number either (and vdot does not warn of it).
         if flag not in _OPTIMAL or not isfinite(value) or not isfinite(np.vdot(z, z)):
             return None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from sim.world import World
-from uavctl.build import build_controller, build_design
+from uavctl.build import build_controller, design_of
 from uavctl.config import Config
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.data import ControlMode, Decision, Flyer, Outgoing, Plan, Record, Setpoint, Vec3
@@ -209,7 +209,7 @@ def controller_of(config: Config, designed: Config) -> Controller:
     Raises:
         DesignError: There is none.
     """
-    design = build_design(designed)
+    design = design_of(designed)
     library = library_for(design).library if config.uses_library else None
     return build_controller(config, design, library)
 

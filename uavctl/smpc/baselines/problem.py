@@ -55,9 +55,16 @@ class Part:
     rows_u: Index
 
 
-def parts(problem: Problem) -> tuple[Part, ...]:
-    """Independent parts of a problem without disturbances; those without an input are left out."""
+def parts(problem: Problem, beside: Array | None = None) -> tuple[Part, ...]:
+    """Independent parts of a problem without disturbances; those without an input are left out.
+
+    Args:
+        problem: The problem.
+        beside: Rows (m, n_u) on inputs that tie them together beside those of the problem.
+    """
     plant, c_x, c_u = problem.plant, problem.state_set.c, problem.input_set.c
+    if beside is not None:
+        c_u = np.vstack([c_u, beside])
     coupled = np.block(
         [
             [(plant.a != 0) | (problem.q_x != 0) | (np.abs(c_x.T) @ np.abs(c_x) != 0), plant.b != 0],

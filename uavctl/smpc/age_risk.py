@@ -1,0 +1,72 @@
+"""The allowed risk, spread over the ages of the information that a plan may be based on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+from uavctl.errors import DesignError
+from uavctl.smpc.link import LinkModel
+
+Array = NDArray[np.float64]
+
+PRICE = 0.9  # h of π_t^h, what an age's back-off costs: 1 is best in transit, 0 at rest beside a limit
+LARGEST_RISK = 0.5  # of a row: a mean outside of its limit is no plan
+LEAST_RISK = 1e-9  # of an age's budget: what rounding may leave
+
+
+@dataclass(frozen=True, eq=False)
+class AgeRisk:
+    """How the risk of a time is spread over the ages of the information that its plan may be based on.
+
+    Attributes:
+        weights: π_t (H,), of information t = 1 … H steps old.
+        beyond: Probability that it is older than H: no plan is left then, and all of it counts as outside.
+        budgets: ε̄_t (H,) with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK bounds them.
+    """
+
+    weights: Array
+    beyond: float
+    budgets: Array
+
+
+def age_risk(link: LinkModel, deviations: Array, allowed: float, price: float = PRICE) -> AgeRisk:
+    """Spread the allowed risk so that Σ_t π_t^h β_t is least for a row with the back-offs β_t = Φ⁻¹(1 - ε̄_t) σ_t.
+
+    Args:
+        link: Model of the link.
+        deviations: σ_t (H,) of the row.
+        allowed: 1 - δ_x.
+        price: h.
+
+    Raises:
+        DesignError: Information is older than the horizon more often than is allowed.
+    """
+    steps = len(deviations)
+    older = np.array([link.outage(age) for age in range(steps + 1)])
+    weights, beyond = older[:-1] - older[1:], float(older[-1])
+    left = allowed - beyond
+    if left <= LEAST_RISK * allowed:
+        raise DesignError(
+            "smpc.horizon",
+            f"positions are {steps} steps old or more in {beyond:.3g} of all steps, and no more than {allowed:.3g} "
+            "may be outside of the limits",
+            "take a longer smpc.horizon or a lower smpc.delta_x",
+        )
+    if not deviations.all():
+        return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), LARGEST_RISK)))
+    # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
+    scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
+
+    def budgets(level: float) -> Array:
+        return np.asarray(ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))))
+
+    def excess(level: float) -> float:
+        return float(weights @ budgets(level)) - left
+
+    low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
+    return AgeRisk(weights, beyond, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))

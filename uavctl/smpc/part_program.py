@@ -1,0 +1,137 @@
+"""The program of one independent part: how to leave the regulator's plan so that rows are kept, at the least cost."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.baselines.mpc import regulated
+from uavctl.smpc.baselines.problem import Part, Problem
+from uavctl.smpc.layout import pairs_of
+from uavctl.smpc.lqg_bound import Lqr
+from uavctl.smpc.qp import SOFT, QuadraticProgram
+from uavctl.smpc.slew import SlewRows
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+MOST_ITERATIONS = 2000  # of one program
+
+
+class PartProgram:
+    """min |z|² with all rows kept, state rows at the price of their slack; one row for both sides of a direction.
+
+    Rooms come in one vector of the whole plant: those of the state rows, stage after stage, then those of the hard rows
+    of the parts, one part after the other (see `RegulatedRows`), and OPEN at its end for a side without a limit.
+
+    Attributes:
+        part: Its states, inputs and rows.
+        columns: Which of the state rows of a stage are the part's.
+        hard: Which of the hard rows are.
+
+    Args:
+        problem: The problem.
+        law: The regulator.
+        part: Its states, inputs and rows.
+        slew: Slew rows.
+        columns: See above.
+        hard: See above.
+        width: Number of state rows of a stage.
+        end: Where OPEN stands.
+    """
+
+    def __init__(
+        self, problem: Problem, law: Lqr, part: Part, slew: SlewRows, columns: slice, hard: slice, width: int, end: int
+    ) -> None:
+        self.part, self.columns, self.hard = part, columns, hard
+        self._steps = steps = problem.horizon
+        states, inputs = (of[:, :, part.states.size :] for of in regulated(problem, law, part))
+        n = states.shape[2]
+        self._plan, self._motion = inputs.reshape(-1, n), states[1:].reshape(-1, n)
+        # A path (p_t, r_t) to follow adds -2 Σ (x_t' Q p_t + u_t' R r_t) to the cost, which z = Σ … is the least of.
+        q_x, q_u = problem.q_x[np.ix_(part.states, part.states)], problem.q_u[np.ix_(part.inputs, part.inputs)]
+        self._of_path_x = np.einsum("tij,ik->jtk", states[:-1], q_x).reshape(n, -1)
+        self._of_path_u = np.einsum("tij,ik->jtk", inputs, q_u).reshape(n, -1)
+        c_x = problem.state_set.c[np.ix_(part.rows_x, part.states)]
+        c_u = problem.input_set.c[np.ix_(part.rows_u, part.inputs)]
+        d = slew.d[np.ix_(slew.own(part.inputs), part.inputs)]
+        changes = np.diff(inputs, axis=0, prepend=0.0)
+        of_x, of_u = c_x @ states[1:], np.concatenate([c_u @ inputs, d @ changes, -d @ changes], axis=1)
+        self._x_of_z, self._u_of_z = of_x.reshape(-1, n), of_u.reshape(-1, n)
+        above_x, below_x = _sides(c_x)
+        pairs_u, slews = _sides(c_u), len(c_u) + np.arange(len(d))
+        above_u, below_u = np.append(pairs_u[0], slews), np.append(pairs_u[1], slews + len(d))
+        rows_x, rows_u = _directions(of_x, above_x, below_x), _directions(of_u, above_u, below_u)
+        rows = np.vstack([rows_x, rows_u])
+
+        def places(of_states: Index, of_hard: Index) -> Index:
+            """Where the rooms (rows,) of one side stand."""
+            at_x = columns.start + width * np.arange(steps)[:, None] + of_states
+            at_u = width * steps + hard.start + of_u.shape[1] * np.arange(steps)[:, None] + of_hard
+            return np.append(np.where(of_states >= 0, at_x, end).ravel(), np.where(of_hard >= 0, at_u, end).ravel())
+
+        self._upper, self._lower = places(above_x, above_u), places(below_x, below_u)
+        self._soft = len(rows_x)
+        soft = np.arange(len(rows)) < self._soft
+        self._program = QuadraticProgram(
+            2.0 * np.eye(n),
+            np.ascontiguousarray(rows),
+            np.where(soft, SOFT, 0).astype(np.int32),
+            np.where(soft, problem.slack_linear, 0.0),
+            np.where(soft, problem.slack_quadratic, 0.0),
+            most=MOST_ITERATIONS,
+        )
+
+    def along(self, path_x: Array, path_u: Array) -> Array:
+        """z (n,) that follows a path of the whole plant (H, n_x), (H, n_u) at the least cost, without limits."""
+        part = self.part
+        z: Array = self._of_path_x @ path_x[:, part.states].ravel()
+        z += self._of_path_u @ path_u[:, part.inputs].ravel()
+        return z
+
+    def take(self, z: Array, room_x: Array, room_u: Array) -> None:
+        """Take the room off that z needs: of the state rows (H, m) of the whole plant, and of the hard rows."""
+        room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
+        room_u[self.hard] -= self._u_of_z @ z
+
+    def take_states(self, z: Array, room_x: Array) -> None:
+        """The same of the state rows alone."""
+        room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
+
+    @property
+    def iterations(self) -> int:
+        """Of the last program."""
+        return self._program.iterations
+
+    def solve(self, rooms: Array, again: bool) -> Array | None:
+        """Best z (n,); None where the program found none.
+
+        Args:
+            rooms: Room of all rows where z = 0, less their back-offs; OPEN at the end.
+            again: Whether to begin with the rows that bound in the last program: it must be of the same question.
+        """
+        upper, lower = rooms.take(self._upper), -rooms.take(self._lower)
+        # Where two back-offs meet no mean keeps both: it stays between them.
+        if (upper < lower).any():
+            crossed = upper < lower
+            upper[crossed] = lower[crossed] = 0.5 * (upper + lower)[crossed]
+        return self._program.solve_sides(upper, lower, again)
+
+    def add(self, z: Array, inputs: Array, states: Array) -> None:
+        """Add what z does to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""
+        part = self.part
+        inputs[:, part.inputs] += (self._plan @ z).reshape(self._steps, -1)
+        states[1:, part.states] += (self._motion @ z).reshape(self._steps, -1)
+
+
+def _sides(c: Array) -> tuple[Index, Index]:
+    """Rows that limit each direction from above and from below, -1 for none: (d,), (d,)."""
+    rows = [dict(pair.sides) for pair in pairs_of(c)]
+    above, below = (np.array([sides.get(sign, -1) for sides in rows], dtype=np.intp) for sign in (1.0, -1.0))
+    return above, below
+
+
+def _directions(of_z: Array, above: Index, below: Index) -> Array:
+    """Rows (H d, n) of the directions, from those of both sides (H, m, n)."""
+    chosen = np.where((above >= 0)[:, None], of_z[:, above], -of_z[:, below])
+    return np.asarray(chosen.reshape(-1, of_z.shape[2]))
