@@ -82,10 +82,16 @@ def linear_model(plant: PlantConfig) -> LinearModel:
         position, velocity, gain = plant.position_index, plant.velocity_index, plant.accel_per_input
     else:
         n = len(plant.axes)
-        flow = _drag_lag_flow(plant)
-        a, b, e = _split(expm(flow * plant.dt_s), 3 * n, n)
-        w = np.diag(np.square(plant.wind_std_mps2))
-        position, velocity, gain = tuple(range(0, 3 * n, 3)), tuple(range(1, 3 * n, 3)), (1.0,) * n
+        each = plant.states_per_axis
+        if plant.model == "drag-lag":
+            flow, deviations = _drag_lag_flow(plant), np.array(plant.wind_std_mps2)
+        else:
+            flow = _velocity_reference_flow(plant)
+            drift = np.array(plant.force_drift_mps2_rts) / np.sqrt(plant.dt_s)
+            deviations = np.column_stack([plant.wind_std_mps2, drift]).ravel()
+        a, b, e = _split(expm(flow * plant.dt_s), each * n, n)
+        w = np.diag(np.square(deviations))
+        position, velocity, gain = tuple(range(0, each * n, each)), tuple(range(1, each * n, each)), (1.0,) * n
     eigenvalues, vectors = np.linalg.eigh(w)
     return LinearModel(
         a=a,
@@ -113,6 +119,43 @@ def _drag_lag_flow(plant: PlantConfig) -> Array:
     for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s, strict=True)):
         flow[3 * i + 2, 3 * n + i] = gain / lag
         flow[3 * i + 1, 4 * n + i] = 1.0
+    return flow
+
+
+def _velocity_reference_flow(plant: PlantConfig) -> Array:
+    """Continuous-time generator of the vehicle's own loops on a reference that the input accelerates, each axis.
+
+    In the coordinates of the loops: reference P, V with P' = V, V' = u; the acceleration b that they make; their
+    integral j; the force f. The states are linear in these.
+    """
+    n = len(plant.axes)
+    states, total = 6 * n, 9 * n
+    flow = np.zeros((total, total))
+    for axis in range(n):
+        kp, kv, ki = plant.position_1ps[axis], plant.velocity_1ps[axis], plant.integral_1ps2[axis]
+        c, lag = plant.drag_1ps[axis], plant.lag_s[axis]
+        loops = np.zeros((10, 10))  # p, v, b, P, V, j, f, u, w, n
+        loops[0, 1] = 1.0
+        loops[1, [1, 2, 6, 8]] = [-c, 1.0, 1.0, 1.0]
+        loops[2, [0, 1, 2, 3, 4, 5, 7]] = np.array([-kv * kp, -kv, -1.0, kv * kp, kv, 1.0, 1.0]) / lag
+        loops[3, 4] = 1.0
+        loops[4, 7] = 1.0
+        loops[5, [0, 1, 3, 4]] = [-ki * kp, -ki, ki * kp, ki]
+        loops[6, 9] = 1.0
+        seen = np.zeros((9, 10))  # p, v, b + f, P - p, V - v, j + f, u, w, n
+        seen[[0, 1], [0, 1]] = 1.0
+        seen[2, [2, 6]] = 1.0
+        seen[3, [3, 0]] = [1.0, -1.0]
+        seen[4, [4, 1]] = [1.0, -1.0]
+        seen[5, [5, 6]] = 1.0
+        seen[[6, 7, 8], [7, 8, 9]] = 1.0
+        meant = np.zeros((10, 9))  # one of the loops' states that are seen so: that without a force
+        meant[[0, 1, 2, 5], [0, 1, 2, 5]] = 1.0
+        meant[3, [0, 3]] = meant[4, [1, 4]] = 1.0
+        meant[[7, 8, 9], [6, 7, 8]] = 1.0
+        one = seen @ loops @ meant
+        places = [*range(6 * axis, 6 * axis + 6), states + axis, 7 * n + 2 * axis, 7 * n + 2 * axis + 1]
+        flow[np.ix_(places, places)] = one
     return flow
 
 

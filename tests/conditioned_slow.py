@@ -36,7 +36,7 @@ def met(given: Problem, sides: Array) -> Array:
     c, found = given.state_set.c, sides.copy()
     for i in range(len(c)):
         for j in np.flatnonzero((c[:i] == -c[i]).all(axis=1)):
-            found[:, [i, j]] -= 0.5 * np.minimum(sides[:, i] + sides[:, j], 0.0)[:, None]
+            found[:, np.array([i, j])] -= 0.5 * np.minimum(sides[:, i] + sides[:, j], 0.0)[:, None]
     return found
 
 

@@ -44,6 +44,7 @@ from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
 from uavctl.smpc.plant import AXES, Plant, drag_lag
 from uavctl.smpc.sets import Polytope
+from uavctl.smpc.velocity_reference import HeldAxis, velocity_reference
 
 NANOSECONDS = 1e9
 
@@ -66,6 +67,9 @@ def build_plant(config: Config) -> Plant:
     plant = config.plant
     if plant.model == "drag-lag":
         return drag_lag(plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2, plant.dt_s, plant.axes)
+    if plant.model == "velocity-reference":
+        numbers = (getattr(plant, key) for key in HeldAxis._fields)
+        return velocity_reference([HeldAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes)
     a, b, e, w, accel = (
         np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e, plant.w, plant.accel_per_input)
     )
@@ -295,7 +299,7 @@ def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     std_mps2 = float(np.sqrt(np.diagonal(spread).max())) / plant.dt_s
     unexplained = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, LEAST_UNEXPLAINED_MPS2)
     lags: dict[str, float] = {}
-    if config.plant.model == "drag-lag":
+    if config.plant.lag_s:
         lags.update(zip(plant.axes, config.plant.lag_s, strict=True))
     return EnvelopeParameters(
         axes=tuple(axis in plant.axes for axis in AXES),

@@ -64,7 +64,14 @@ def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
 def build_names(design: AnyDesign) -> Names:
     """What the design's rows and states are called."""
     plant = design.plant
-    return names_of(design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index)
+    return names_of(
+        design.state_set.c.tolist(),
+        plant.n_x,
+        plant.axes,
+        plant.position_index,
+        plant.velocity_index,
+        plant.further,
+    )
 
 
 def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array) -> Trajectory:

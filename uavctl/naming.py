@@ -31,6 +31,7 @@ def names_of(
     axes: Sequence[str],
     position_index: Sequence[int],
     velocity_index: Sequence[int],
+    further: Sequence[tuple[str, str]] = (),
 ) -> Names:
     """Names of a plant's states, and of the rows of {x | c_x x <= b_x}.
 
@@ -40,10 +41,13 @@ def names_of(
         axes: Axes of local NED that the plant moves in.
         position_index: State index of each axis' position.
         velocity_index: State index of each axis' velocity.
+        further: (name, unit) of the states that follow position and velocity in each axis.
     """
     states = [(f"state {index}", "") for index in range(n_x)]
     for axis, position, velocity in zip(axes, position_index, velocity_index, strict=True):
         states[position], states[velocity] = (f"{axis} position", "m"), (f"{axis} velocity", "m/s")
+        for index, (name, unit) in enumerate(further, start=velocity + 1):
+            states[index] = (f"{axis} {name}", unit)
     return Names(tuple(states), tuple(_row(number, row, states) for number, row in enumerate(c_x)), tuple(axes))
 
 

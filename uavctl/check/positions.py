@@ -9,6 +9,7 @@ import numpy as np
 
 from uavctl.check.item import Item, State, item, judged
 from uavctl.check.seen import Sample, Seen
+from uavctl.config.mission_checks import position_index
 from uavctl.config.peers import CAMERAS
 from uavctl.config.types import Config
 from uavctl.data import Vec3
@@ -184,8 +185,8 @@ def _noise(samples: list[Sample], config: Config) -> Item:
 def limits_m(config: Config) -> dict[str, tuple[float, float]]:
     """Limits of each axis that the plant has [m]."""
     plant, sets = config.plant, config.sets
-    index = plant.position_index if plant.model == "matrices" else tuple(range(0, 3 * len(plant.axes), 3))
-    return {axis: (sets.state_lower[i], sets.state_upper[i]) for axis, i in zip(plant.axes, index, strict=True)}
+    places = position_index(plant)
+    return {axis: (sets.state_lower[i], sets.state_upper[i]) for axis, i in zip(plant.axes, places, strict=True)}
 
 
 def _place(samples: list[Sample], config: Config) -> Item:

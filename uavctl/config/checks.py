@@ -34,6 +34,17 @@ from uavctl.config.types import (
 
 _MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input")
 _DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
+_REFERENCE_KEYS: tuple[str, ...] = (
+    "drag_1ps",
+    "lag_s",
+    "position_1ps",
+    "velocity_1ps",
+    "integral_1ps2",
+    "wind_std_mps2",
+    "force_drift_mps2_rts",
+)
+_KEYS = {"matrices": _MATRIX_KEYS, "drag-lag": _DRAG_LAG_KEYS, "velocity-reference": _REFERENCE_KEYS}
+_POSITIVE = ("lag_s", "gain", "position_1ps", "velocity_1ps", "integral_1ps2")
 _AXES = ("north", "east", "down")
 _SUM = 1e-4  # shares are written rounded
 _TICKS_TRIED = 10_000
@@ -43,7 +54,7 @@ _RELATIVE = 1e-9  # asymmetry and negative eigenvalues below this share of W's s
 def dimensions(plant: PlantConfig) -> tuple[int, int]:
     """(n_x, n_u) that the other sections must fit."""
     n_u = len(plant.axes)
-    return (len(plant.a) if plant.model == "matrices" else 3 * n_u), n_u
+    return (plant.states_per_axis * n_u or len(plant.a)), n_u
 
 
 def check(sections: Mapping[str, Section | tuple[Section, ...]]) -> Iterator[Problem]:
@@ -74,9 +85,8 @@ def _plant(plant: PlantConfig) -> Iterator[Problem]:
         yield Problem(
             "plant.axes", f"{list(plant.axes)} repeats or turns round axes", "keep the order north, east, down"
         )
-    keys = {"matrices": _MATRIX_KEYS, "drag-lag": _DRAG_LAG_KEYS}
-    wanted = keys.pop(plant.model)
-    (foreign,) = keys.values()
+    wanted = _KEYS[plant.model]
+    foreign = dict.fromkeys(key for keys in _KEYS.values() for key in keys if key not in wanted)
     missing = [key for key in wanted if not getattr(plant, key)]
     for key in missing:
         yield Problem(f"plant.{key}", f'is missing, and model "{plant.model}" needs it', "add it")
@@ -86,7 +96,7 @@ def _plant(plant: PlantConfig) -> Iterator[Problem]:
                 f"plant.{key}", f'has no meaning with model "{plant.model}"', "remove it, or change the model"
             )
     if not missing:
-        yield from _matrices(plant) if plant.model == "matrices" else _drag_lag(plant)
+        yield from _matrices(plant) if plant.model == "matrices" else _each_axis(plant, wanted)
 
 
 def _matrices(plant: PlantConfig) -> Iterator[Problem]:
@@ -127,12 +137,12 @@ def _covariance(w: Rows) -> Iterator[Problem]:
         )
 
 
-def _drag_lag(plant: PlantConfig) -> Iterator[Problem]:
+def _each_axis(plant: PlantConfig, keys: tuple[str, ...]) -> Iterator[Problem]:
     n_u = len(plant.axes)
-    for key in _DRAG_LAG_KEYS:
+    for key in keys:
         values = getattr(plant, key)
         yield from _length(f"plant.{key}", values, n_u, "number of axes")
-        positive = key in ("lag_s", "gain")
+        positive = key in _POSITIVE
         if any(value <= 0 if positive else value < 0 for value in values):
             yield Problem(
                 f"plant.{key}", f"{list(values)} is out of range", f"give numbers {'> 0' if positive else '>= 0'}"
@@ -275,7 +285,13 @@ def _limits(limits: LimitsConfig) -> Iterator[Problem]:
 _CheckFunction = Callable[..., Iterator[Problem]]
 
 
-def _bias(sets: SetsConfig, estimator: EstimatorConfig) -> Iterator[Problem]:
+def _bias(plant: PlantConfig, sets: SetsConfig, estimator: EstimatorConfig) -> Iterator[Problem]:
+    if plant.model == "velocity-reference" and estimator.bias_drift:
+        yield Problem(
+            "estimator.bias_drift",
+            'an unknown part of the input is not what disturbs model "velocity-reference": its loops hold it',
+            "set bias_drift and bias_max to 0, and plant.force_drift_mps2_rts in their place",
+        )
     if (estimator.bias_drift > 0.0) != (estimator.bias_max > 0.0):
         missing = "bias_max" if estimator.bias_drift else "bias_drift"
         yield Problem(
@@ -303,7 +319,7 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("link",), _link),
     (("plant", "daemon"), _tick),
     (("limits",), _limits),
-    (("sets", "estimator"), _bias),
+    (("plant", "sets", "estimator"), _bias),
     (("security",), security.check),
     (("daemon",), peer_checks.roles),
     (("daemon", "source"), peer_checks.source),

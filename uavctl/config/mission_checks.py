@@ -16,7 +16,8 @@ _AXES = ("north", "east", "down")
 
 def position_index(plant: PlantConfig) -> tuple[int, ...]:
     """State index of each axis' position."""
-    return plant.position_index if plant.model == "matrices" else tuple(range(0, 3 * len(plant.axes), 3))
+    size = plant.states_per_axis
+    return tuple(range(0, size * len(plant.axes), size)) if size else plant.position_index
 
 
 def outside(plant: PlantConfig, sets: SetsConfig, place: Position, key: str, what: str) -> Iterator[Problem]:

@@ -23,7 +23,8 @@ Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are 
 all at once, each with file, line and key (exit code 2). So is what is beyond all bounds: every number has a range,
 and every list and text a longest length, whether it is told below or not (1e7 at most, 1000 characters).
 
-States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`).
+States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`; acceleration,
+lead of the vehicle's own reference in position and in velocity, and integral with model `velocity-reference`).
 n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
 """
 

@@ -38,8 +38,11 @@ class PlantConfig(Section, frozen=True, kw_only=True):
     """The plant x(k+1) = A x + B u + E w, w ~ N(0, W); states are ordered axis by axis."""
 
     model: Annotated[
-        Literal["matrices", "drag-lag"],
-        Meta(description="`matrices`: a, b, e, w as given; `drag-lag`: made from drag_1ps, lag_s, gain, wind_std_mps2"),
+        Literal["matrices", "drag-lag", "velocity-reference"],
+        Meta(
+            description="`matrices`: a, b, e, w as given; `drag-lag`: an acceleration setpoint is flown, after a lag; "
+            "`velocity-reference`: it moves a velocity and position that the vehicle's own loops hold"
+        ),
     ]
     dt_s: Annotated[float, Meta(ge=0.001, le=5, description="time step Δt [s]")]
     axes: Annotated[
@@ -70,9 +73,11 @@ class PlantConfig(Section, frozen=True, kw_only=True):
             description="acceleration setpoint per unit of input, each axis [m/s² per unit], with model `matrices`",
         ),
     ] = ()
-    drag_1ps: Annotated[Floats, Meta(max_length=3, description="drag c of each axis [1/s], with model `drag-lag`")] = ()
+    drag_1ps: Annotated[
+        Floats, Meta(max_length=3, description="drag c of each axis [1/s], not with model `matrices`")
+    ] = ()
     lag_s: Annotated[
-        Floats, Meta(max_length=3, description="acceleration lag T of each axis [s], with model `drag-lag`")
+        Floats, Meta(max_length=3, description="acceleration lag T of each axis [s], not with model `matrices`")
     ] = ()
     gain: Annotated[
         Floats, Meta(max_length=3, description="acceleration reached per acceleration asked for, with model `drag-lag`")
@@ -81,13 +86,49 @@ class PlantConfig(Section, frozen=True, kw_only=True):
         Floats,
         Meta(
             max_length=3,
-            description="standard deviation of the acceleration noise, constant over Δt [m/s²], with model `drag-lag`",
+            description="standard deviation of the acceleration noise, constant over Δt [m/s²], "
+            "not with model `matrices`",
         ),
     ] = ()
     dead_time_s: Annotated[
         float,
         Meta(ge=0, le=1, description="time from sending an input until it begins to act, all axes [s]"),
     ] = 0.0
+    position_1ps: Annotated[
+        Floats,
+        Meta(
+            max_length=3,
+            description="gain of the vehicle's own position loop, each axis [1/s], with model `velocity-reference`",
+        ),
+    ] = ()
+    velocity_1ps: Annotated[
+        Floats,
+        Meta(
+            max_length=3,
+            description="gain of the vehicle's own velocity loop, each axis [1/s], with model `velocity-reference`",
+        ),
+    ] = ()
+    integral_1ps2: Annotated[
+        Floats,
+        Meta(
+            max_length=3,
+            description="integral gain of the vehicle's own velocity loop, each axis [1/s²], "
+            "with model `velocity-reference`",
+        ),
+    ] = ()
+    force_drift_mps2_rts: Annotated[
+        Floats,
+        Meta(
+            max_length=3,
+            description="standard deviation of what a lasting force (wind) gains in a second, each axis "
+            "[m/s² / √s], with model `velocity-reference`; there it takes the place of estimator.bias_drift",
+        ),
+    ] = ()
+
+    @property
+    def states_per_axis(self) -> int:
+        """Number of states of an axis, position and velocity first; 0 where the matrices say."""
+        return {"matrices": 0, "drag-lag": 3, "velocity-reference": 6}[self.model]
 
 
 class SetsConfig(Section, frozen=True, kw_only=True):

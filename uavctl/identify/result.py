@@ -19,6 +19,10 @@ from uavctl.identify.recorded import History
 AXES = ("north", "east", "down")
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
 _DIGITS = 4
+_OF_OTHER_MODELS = (
+    *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
+    *("position_1ps", "velocity_1ps", "integral_1ps2", "force_drift_mps2_rts"),
+)
 
 
 class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
@@ -148,7 +152,7 @@ def _config(config: Config, responses: Sequence[AxisResponse], link: LinkFit) ->
     plant = msgspec.structs.replace(
         config.plant,
         model="drag-lag",
-        **dict.fromkeys(("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"), ()),
+        **dict.fromkeys(_OF_OTHER_MODELS, ()),
         drag_1ps=_rounded(one.drag_1ps for one in responses),
         lag_s=_rounded(one.lag_s for one in responses),
         gain=_rounded(one.gain for one in responses),

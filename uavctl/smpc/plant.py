@@ -34,6 +34,8 @@ class Plant:
         velocity_index: State index of each axis' velocity.
         accel_per_input: Acceleration setpoint per unit of input [m/s² per unit]: a number an axis (n_axes,) where each
             axis has its own input, in the axes' order; else a map (n_axes, n_u).
+        further: (name, unit) of the states that follow position and velocity in each axis; empty where that is not
+            known.
 
     Raises:
         DesignError: Shapes do not fit, W is no covariance, or A has no real logarithm.
@@ -48,6 +50,7 @@ class Plant:
     position_index: tuple[int, ...]
     velocity_index: tuple[int, ...]
     accel_per_input: Array
+    further: tuple[tuple[str, str], ...] = ()
     _accel_map: Array = field(init=False, repr=False)
     _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
     _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
@@ -209,6 +212,7 @@ def drag_lag(
         position_index=tuple(range(0, 3 * len(axes), 3)),
         velocity_index=tuple(range(1, 3 * len(axes), 3)),
         accel_per_input=np.ones(len(axes)),
+        further=(("acceleration", "m/s²"),),
     )
 
 

@@ -19,6 +19,7 @@ from uavctl.data import ControlMode, Decision, Flyer, Outgoing, Plan, Record, Se
 from uavctl.flight.controller import Controller
 from uavctl.library_store import library_for
 from uavctl.loop import ControlLoop
+from uavctl.smpc.design import Design
 from uavctl.trial.case import TrialCell, believed, blackout_s, flown, length_s
 from uavctl.trial.metrics import beyond_m, distances_m, largest, mean, rms_m, settled_s
 from uavctl.trial.own_loop import Moment, OwnLoop, Path
@@ -210,7 +211,7 @@ def controller_of(config: Config, designed: Config) -> Controller:
         DesignError: There is none.
     """
     design = design_of(designed)
-    library = library_for(design).library if config.uses_library else None
+    library = library_for(design).library if config.uses_library and isinstance(design, Design) else None
     return build_controller(config, design, library)
 
 
