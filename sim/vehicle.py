@@ -88,7 +88,7 @@ def linear_model(plant: PlantConfig) -> LinearModel:
         else:
             flow = _velocity_reference_flow(plant)
             drift = np.array(plant.force_drift_mps2_rts) / np.sqrt(plant.dt_s)
-            deviations = np.column_stack([plant.wind_std_mps2, drift]).ravel()
+            deviations = np.column_stack([plant.wind_std_mps2, plant.input_std_mps2, drift]).ravel()
         a, b, e = _split(expm(flow * plant.dt_s), each * n, n)
         w = np.diag(np.square(deviations))
         position, velocity, gain = tuple(range(0, each * n, each)), tuple(range(1, each * n, each)), (1.0,) * n
@@ -129,8 +129,8 @@ def _velocity_reference_flow(plant: PlantConfig) -> Array:
     integral j; the force f. The states are linear in these.
     """
     n = len(plant.axes)
-    states, total = 6 * n, 9 * n
-    flow = np.zeros((total, total))
+    states = 6 * n
+    flow = np.zeros((10 * n, 10 * n))
     for axis in range(n):
         kp, kv, ki = plant.position_1ps[axis], plant.velocity_1ps[axis], plant.integral_1ps2[axis]
         c, lag = plant.drag_1ps[axis], plant.lag_s[axis]
@@ -154,8 +154,10 @@ def _velocity_reference_flow(plant: PlantConfig) -> Array:
         meant[3, [0, 3]] = meant[4, [1, 4]] = 1.0
         meant[[7, 8, 9], [6, 7, 8]] = 1.0
         one = seen @ loops @ meant
-        places = [*range(6 * axis, 6 * axis + 6), states + axis, 7 * n + 2 * axis, 7 * n + 2 * axis + 1]
+        disturbed = 7 * n + 3 * axis
+        places = [*range(6 * axis, 6 * axis + 6), states + axis, disturbed, disturbed + 2]
         flow[np.ix_(places, places)] = one
+        flow[:, disturbed + 1] = flow[:, states + axis]
     return flow
 
 

@@ -35,6 +35,7 @@ AXIS = HeldAxis(
     velocity_1ps=2.0,
     integral_1ps2=1.0,
     wind_std_mps2=0.1,
+    input_std_mps2=0.05,
     force_drift_mps2_rts=0.3,
 )
 OVERRIDES = (
@@ -44,6 +45,7 @@ OVERRIDES = (
     "plant.position_1ps=[1,1.5,1]",
     "plant.velocity_1ps=[2,2,5]",
     "plant.integral_1ps2=[1,1,1]",
+    "plant.input_std_mps2=[0.05,0.05,0.04]",
     "plant.force_drift_mps2_rts=[0.3,0.2,0.1]",
     f"sets.state_lower={[-3.0, -1.5, *[-9] * 4, -2.5, -1.5, *[-9] * 4, -2.5, -1.0, *[-9] * 4]}",
     f"sets.state_upper={[3.0, 1.5, *[9] * 4, 2.5, 1.5, *[9] * 4, 0.0, 1.0, *[9] * 4]}",
@@ -98,7 +100,8 @@ def test_a_step_is_that_of_the_loops_integrated(
     axis = AXIS._replace(drag_1ps=drag, lag_s=lag)
     plant = velocity_reference([axis], DT, ("north",))
     end = solve_ivp(loops(axis, u, wind, gains), (0.0, DT), start, rtol=1e-11, atol=1e-12).y[:, -1]
-    step = plant.a @ seen(np.array(start)) + plant.b @ [u] + plant.e @ [wind, gains]
+    # What was sent, and what was not but moves the reference, make the input together.
+    step = plant.a @ seen(np.array(start)) + plant.b @ [u + 0.3] + plant.e @ [wind, -0.3, gains]
     np.testing.assert_allclose(step, seen(end), rtol=0.0, atol=1e-9)
 
 
@@ -118,7 +121,7 @@ def test_every_such_plant_has_a_motion_within_the_step(
     drag: float, lag: float, gains: tuple[float, float, float], dt_s: float
 ) -> None:
     position, velocity, integral = gains
-    axis = HeldAxis(drag, lag, position, velocity, integral, 0.1, 0.1)
+    axis = HeldAxis(drag, lag, position, velocity, integral, 0.1, 0.1, 0.1)
     plant = velocity_reference([axis], dt_s, ("down",))
     a, b, e = plant.transition(0.5 * dt_s)
     np.testing.assert_allclose(a @ a, plant.a, rtol=0.0, atol=1e-8)
@@ -130,7 +133,7 @@ def test_the_force_gains_its_drift_in_a_second() -> None:
     """However long the steps are: what the disturbance adds to the sum a + f in each adds up."""
     for dt_s in (0.05, 0.2):
         plant = velocity_reference([AXIS], dt_s, ("north",))
-        assert np.sqrt(plant.w[1, 1] * dt_s**2 / dt_s) == pytest.approx(AXIS.force_drift_mps2_rts)
+        assert np.sqrt(plant.w[2, 2] * dt_s**2 / dt_s) == pytest.approx(AXIS.force_drift_mps2_rts)
 
 
 def test_a_steady_force_is_held_without_an_input() -> None:
@@ -147,7 +150,7 @@ def test_a_steady_force_is_held_without_an_input() -> None:
 
 def test_it_rests_and_reaches_and_has_a_regulator() -> None:
     plant = build_plant(load_config("room", list(OVERRIDES)))
-    assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES, 3, 6)
+    assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES, 3, 9)
     rest = plant.equilibrium((1.0, -2.0, -0.5))
     assert rest[list(plant.position_index)].tolist() == [1.0, -2.0, -0.5]
     assert np.count_nonzero(rest) == 3
@@ -162,6 +165,17 @@ def test_positions_show_all_of_it() -> None:
     for _ in range(STATES - 1):
         rows.append(rows[-1] @ plant.a)
     assert np.linalg.matrix_rank(np.array(rows) / np.linalg.norm(rows, axis=1)[:, None]) == STATES
+
+
+def test_a_filter_of_positions_goes_on_correcting_the_reference() -> None:
+    """Whatever moved it: the covariance of its lead settles, and the error of an estimate dies out."""
+    plant, noise_m = held(), 0.003
+    cov, shows = np.eye(STATES), np.eye(STATES)[:1]
+    for _ in range(round(60.0 / DT)):
+        gain = cov @ shows.T / (shows @ cov @ shows.T + noise_m**2)
+        cov = plant.a @ (cov - gain @ shows @ cov) @ plant.a.T + plant.e @ plant.w @ plant.e.T
+    loop = plant.a @ (np.eye(STATES) - gain @ shows)
+    assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
 
 
 def test_its_states_have_names() -> None:

@@ -41,10 +41,11 @@ _REFERENCE_KEYS: tuple[str, ...] = (
     "velocity_1ps",
     "integral_1ps2",
     "wind_std_mps2",
+    "input_std_mps2",
     "force_drift_mps2_rts",
 )
 _KEYS = {"matrices": _MATRIX_KEYS, "drag-lag": _DRAG_LAG_KEYS, "velocity-reference": _REFERENCE_KEYS}
-_POSITIVE = ("lag_s", "gain", "position_1ps", "velocity_1ps", "integral_1ps2")
+_POSITIVE = ("lag_s", "gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2")
 _AXES = ("north", "east", "down")
 _SUM = 1e-4  # shares are written rounded
 _TICKS_TRIED = 10_000

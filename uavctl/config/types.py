@@ -116,6 +116,14 @@ class PlantConfig(Section, frozen=True, kw_only=True):
             "with model `velocity-reference`",
         ),
     ] = ()
+    input_std_mps2: Annotated[
+        Floats,
+        Meta(
+            max_length=3,
+            description="standard deviation of what moves the vehicle's reference without having been sent, each axis, "
+            "constant over Δt [m/s²], with model `velocity-reference`",
+        ),
+    ] = ()
     force_drift_mps2_rts: Annotated[
         Floats,
         Meta(

@@ -21,7 +21,7 @@ _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing 
 _DIGITS = 4
 _OF_OTHER_MODELS = (
     *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
-    *("position_1ps", "velocity_1ps", "integral_1ps2", "force_drift_mps2_rts"),
+    *("position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "force_drift_mps2_rts"),
 )
 
 

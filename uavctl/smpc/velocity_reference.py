@@ -12,6 +12,10 @@ Only the sums a = b + f and i = j + f meet a motion, and both take a change of f
 
 So a force that stays needs no state, and where it is learnt the loops are known to fly against it already. The lead
 and not the reference is the state: it is zero where the loops begin, wherever that is.
+
+The input is u = r + e of what was sent, r, and an error e: jerk limits, setpoints that come late or not at all, and a
+vehicle's own estimate that wanders, move the reference by what nobody sent. Without it the reference would be the sum
+of all that was ever sent, and no position could correct it.
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ class HeldAxis(NamedTuple):
         velocity_1ps: Gain kv of the velocity loop [1/s].
         integral_1ps2: Integral gain ki of the velocity loop [1/s²].
         wind_std_mps2: Standard deviation of w, held over Δt [m/s²].
+        input_std_mps2: Standard deviation of e, held over Δt [m/s²].
         force_drift_mps2_rts: Standard deviation of what f gains in a second [m/s² / √s].
     """
 
@@ -57,11 +62,12 @@ class HeldAxis(NamedTuple):
     velocity_1ps: float
     integral_1ps2: float
     wind_std_mps2: float
+    input_std_mps2: float
     force_drift_mps2_rts: float
 
 
 def velocity_reference(held: Sequence[HeldAxis], dt_s: float, axes: tuple[str, ...]) -> Plant:
-    """Axes with the states (p, v, a, q, s, i), input u, and the disturbances (w, n), all held over Δt.
+    """Axes with the states (p, v, a, q, s, i), input r, and the disturbances (w, e, n), all held over Δt.
 
     Args:
         held: Numbers of each axis.
@@ -80,11 +86,11 @@ def velocity_reference(held: Sequence[HeldAxis], dt_s: float, axes: tuple[str, .
             raise DesignError(f"plant.{key}", f"{values} has a number that is not positive", "give numbers above 0")
     parts = [exponential(_generator(one) * dt_s)[:STATES] for one in held]
     # n is what f gains in a second: over a step it gains n Δt, with the deviation drift √Δt.
-    spread = [(one.wind_std_mps2, one.force_drift_mps2_rts / np.sqrt(dt_s)) for one in held]
+    spread = [(one.wind_std_mps2, one.input_std_mps2, one.force_drift_mps2_rts / np.sqrt(dt_s)) for one in held]
     return Plant(
         a=block_diag(*(part[:, :STATES] for part in parts)),
         b=block_diag(*(part[:, STATES : STATES + 1] for part in parts)),
-        e=block_diag(*(part[:, STATES + 1 :] for part in parts)),
+        e=block_diag(*(part[:, [STATES + 1, STATES, STATES + 2]] for part in parts)),
         w=np.diag(np.square(np.array(spread, dtype=np.float64)).ravel()),
         dt_s=dt_s,
         axes=axes,
