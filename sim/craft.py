@@ -73,6 +73,16 @@ class Craft(Protocol):
         ...
 
     @property
+    def acceleration_mps2(self) -> Vec3:
+        """True acceleration at `measured_ns`; zero on the floor."""
+        ...
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of attitude, rates and acceleration: now, or the last step of its physics."""
+        ...
+
+    @property
     def landed(self) -> bool:
         """Whether it stands on the floor."""
         ...
@@ -111,6 +121,9 @@ class Craft(Protocol):
 
     def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
         """What its own loops take for position and velocity is wrong by so much from now on."""
+
+    def mislead_attitude(self, error_rad: Vec3) -> None:
+        """Turn what its own loops take for its attitude by so much about body axes, from now on."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +189,16 @@ class SteeredPlant:
         return self._plant.velocity_mps
 
     @property
+    def acceleration_mps2(self) -> Vec3:
+        """True acceleration; zero on the floor."""
+        return self._plant.acceleration_mps2
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of the acceleration: now."""
+        return self._plant.now_ns
+
+    @property
     def landed(self) -> bool:
         """Whether it has reached the floor."""
         return self.grounded or (self.has_down and self.position_m[2] >= 0.0)
@@ -231,6 +254,9 @@ class SteeredPlant:
         """What its laws take for position and velocity is wrong by so much from now on."""
         self._errors = (position_error_m, velocity_error_mps)
 
+    def mislead_attitude(self, error_rad: Vec3) -> None:
+        """Do nothing: its laws know no attitude."""
+
     def steer(self) -> None:
         """Evaluate the law of what is asked, and hold its acceleration."""
         self._steer_ns = self.now_ns + STEER_NS
@@ -280,3 +306,9 @@ def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
         2.0 * (x * y + w * z) * bx + (1.0 - 2.0 * (x * x + z * z)) * by + 2.0 * (y * z - w * x) * bz,
         2.0 * (x * z - w * y) * bx + 2.0 * (y * z + w * x) * by + (1.0 - 2.0 * (x * x + y * y)) * bz,
     )
+
+
+def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:
+    """A vector in NED, in body axes."""
+    w, x, y, z = attitude
+    return rotated((w, -x, -y, -z), ned)

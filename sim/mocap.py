@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.craft import LEVEL, Quaternion, heading_rad, rotated
+from sim.craft import LEVEL, Quaternion, heading_rad, in_body
 from sim.spans import within
 from uavctl.config.peers import FrameConfig
 from uavctl.config.sim import CameraConfig
@@ -191,12 +191,6 @@ def turn(frame: FrameConfig) -> Quaternion:
         return cos, 0.0, 0.0, -sin
     half = math.sqrt(0.5)  # the same, then half a turn about (1, 1, 0): NED to ENU
     return 0.0, half * (cos - sin), half * (cos + sin), 0.0
-
-
-def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:
-    """A vector in NED, in body axes."""
-    w, x, y, z = attitude
-    return rotated((w, -x, -y, -z), ned)
 
 
 def euler(attitude: Quaternion) -> Vec3:

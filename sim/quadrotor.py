@@ -12,7 +12,7 @@ from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2, Airframe
 from sim.attitude import AttitudeLoop
 from sim.battery import Battery
 from sim.cascade import Cascade
-from sim.rigid_body import LEVEL, Body, Motion, Quaternion, acceleration, step, uprighted
+from sim.rigid_body import LEVEL, Body, Motion, Quaternion, acceleration, step, turned, uprighted
 from sim.rotors import Rotors
 from sim.vehicle import MAX_ACCEL_MPS2, LinearModel
 from sim.wind import Wind
@@ -71,6 +71,7 @@ class Quadrotor:
         self._grounded = False
         self._accel: Vec3 = ZERO
         self._errors: tuple[Vec3, Vec3] | None = None
+        self._turn: Vec3 | None = None  # of the attitude that the loops believe
         hover = airframe.hover_rps
         self._rotors.speeds_rps = self._rotors.commands_rps = (hover, hover, hover, hover)
         self.cascade.begin(self._motion)
@@ -124,8 +125,13 @@ class Quadrotor:
         return self.wind.velocity_mps
 
     @property
+    def measured_ns(self) -> int:
+        """Time of attitude, rates and acceleration: the last point of the grid."""
+        return self._grid_ns
+
+    @property
     def acceleration_mps2(self) -> Vec3:
-        """Acceleration in NED [m/s²]; zero on the floor."""
+        """Acceleration in NED at the last point of the grid [m/s²]; zero on the floor."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
         wrench = self._rotors.wrench(self._rotors.speeds_rps)
@@ -211,6 +217,10 @@ class Quadrotor:
         right = position_error_m == velocity_error_mps == ZERO
         self._errors = None if right else (position_error_m, velocity_error_mps)
 
+    def mislead_attitude(self, error_rad: Vec3) -> None:
+        """Turn what its own loops take for its attitude by so much about body axes, from now on."""
+        self._turn = None if error_rad == ZERO else error_rad
+
     def rest(self) -> None:
         """Stand on the floor, rotors off, until `grounded` is cleared."""
         north, east, _ = self.position_m
@@ -252,7 +262,10 @@ class Quadrotor:
 
     def _step(self) -> None:
         motion = self._motion
-        self._control(motion if self._errors is None else _mistaken(motion, *self._errors))
+        believed = motion if self._errors is None else _mistaken(motion, *self._errors)
+        if self._turn is not None:
+            believed = believed._replace(attitude=turned(motion.attitude, self._turn))
+        self._control(believed)
         wrenches = self._rotors.step()
         self._motion = step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
         self.battery.drain(wrenches[0].thrust_n, STEP_S)

@@ -193,6 +193,7 @@ class Vehicle:
         self, config: Config, seed: np.random.SeedSequence, start_ns: int, script: Script | None = None
     ) -> None:
         self.model = linear_model(config.plant if script is None else script.plant)
+        self._speeding = self.model.flow[list(self.model.velocity_index)]  # rows of v'
         self._rng = np.random.default_rng(seed)
         self._given = None if script is None else iter(script.disturbances)
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
@@ -244,6 +245,16 @@ class Vehicle:
     def velocity_mps(self) -> Vec3:
         """Velocity in local NED [m/s]; zero along axes that the plant has not."""
         return self._vec3(self.model.velocity_index, (0.0, 0.0, 0.0))
+
+    @property
+    def acceleration_mps2(self) -> Vec3:
+        """Acceleration in local NED [m/s²]; zero along axes that the plant has not, and on the floor."""
+        values = [0.0, 0.0, 0.0]
+        if not self.grounded:
+            changes = self._speeding @ np.concatenate((self.state, self._u, self._w))
+            for axis, value in zip(self.model.axes, changes.tolist(), strict=True):
+                values[axis] = value
+        return values[0], values[1], values[2]
 
     def _vec3(self, index: tuple[int, ...], default: Vec3) -> Vec3:
         values = list(default)

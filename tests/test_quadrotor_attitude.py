@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from quadrotor_rig import Array
+from quadrotor_rig import HOVER_SUM_RPS, Array, quadrotor, run
 from scipy.linalg import expm
 
 from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
@@ -13,6 +13,8 @@ from sim.quadrotor import STEP_S
 from sim.rigid_body import LEVEL, Body, Motion, step, turned
 from sim.rotors import Rotors
 from uavctl.data import Vec3
+
+DRAG_1PS = CRAZYFLIE_2.rotor_drag_kg[0] * HOVER_SUM_RPS / CRAZYFLIE_2.mass_kg  # at hover
 
 
 def turn_to(angle: Vec3, seconds: float) -> Array:
@@ -101,3 +103,18 @@ def test_a_lean_points_the_thrust_along_the_wanted_acceleration(yaw: float) -> N
     # The shortest turn from level to the lean, then the heading: without lean the nose points along yaw.
     level = lean((0.0, 0.0, 0.0), yaw, 0.5).attitude
     np.testing.assert_allclose(level, (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)), atol=1e-15)
+
+
+def test_a_vehicle_that_takes_a_tilt_for_level_accelerates_by_it() -> None:
+    """Nose 1 degree too high by its belief: it flies nose down, 9.81 tan 1° = 0.17 m/s² to the north."""
+    one = quadrotor("px4")
+    one.mislead_attitude((0.0, math.radians(1.0), 0.0))
+    one.accelerate((0.0, 0.0, 0.0))
+    run(one, 1.5)
+    speed = one.velocity_mps
+    pull = one.acceleration_mps2[0] + DRAG_1PS * speed[0]
+    assert pull == pytest.approx(GRAVITY_MPS2 * math.tan(math.radians(1.0)), rel=0.05)
+    assert abs(speed[1]) < 0.01
+    one.mislead_attitude((0.0, 0.0, 0.0))
+    run(one, 1.5)
+    assert abs(one.acceleration_mps2[0] + DRAG_1PS * one.velocity_mps[0]) < 0.01

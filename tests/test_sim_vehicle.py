@@ -63,6 +63,25 @@ def test_stops_on_the_way_change_no_bit(name: str) -> None:
         assert straight.state.tolist() == halting.state.tolist()
 
 
+@pytest.mark.parametrize("name", ["paper", "room"])
+def test_its_acceleration_is_the_slope_of_its_velocity_wind_and_all(name: str) -> None:
+    flown = vehicle(load_config(name))
+    step_ns = flown.model.dt_ns // 1000
+    middle_ns = flown.model.dt_ns // 2
+    for k, accel in enumerate(accels(10)):
+        flown.accelerate(accel)
+        speeds = []
+        for at_ns in (middle_ns - step_ns, middle_ns, middle_ns + step_ns):
+            flown.advance(k * flown.model.dt_ns + at_ns)
+            speeds.append(np.array(flown.velocity_mps))
+            if at_ns == middle_ns:
+                told = flown.acceleration_mps2
+        assert told == pytest.approx((speeds[2] - speeds[0]) / (2e-9 * step_ns), abs=1e-5)
+        flown.advance((k + 1) * flown.model.dt_ns)
+    flown.rest()
+    assert flown.acceleration_mps2 == (0.0, 0.0, 0.0)
+
+
 def test_paper_between_the_boundaries_is_a_first_order_lag() -> None:
     flown = vehicle(load_config("paper", ["plant.w=[[0.6,0],[0,0.6]]"]))
     w = math.sqrt(0.6) * np.random.default_rng(np.random.SeedSequence(1)).standard_normal(2)
