@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.commands import Commands, Request
@@ -18,6 +19,7 @@ from sim.craft import Craft, SteeredPlant
 from sim.estimator import Estimator
 from sim.failsafe import Failsafes
 from sim.geodesy import Origin
+from sim.inertial import ERRORS, InertialSensors
 from sim.parameters import Kind, Parameters
 from sim.personality import PERSONALITIES
 from sim.pilot import CRASHED, WARNING, Pilot
@@ -35,6 +37,7 @@ NO_INDEX = 65535  # param_index that is none
 HASH = "_HASH_CHECK"
 # MAV_DATA_STREAM, as ArduPilot groups its messages; 0 is all.
 DATA_STREAMS = {
+    1: (27, 116),
     2: (1, 24),
     3: (65,),
     6: (32, 33),
@@ -51,19 +54,23 @@ class Autopilot:
         config: the configuration.
         vehicle: what flies: the linear plant, or a vehicle with loops of its own.
         start_ns: time of the start.
+        seed: of the errors of inertial data.
         airborne: whether it starts in the air.
 
     Attributes:
         craft: what flies.
         parameters: its parameters.
         estimator: its estimate.
+        inertial: its inertial sensors.
         pilot: its state machine.
         telemetry: its streams.
         text: the last STATUSTEXT that it sent, empty before the first.
         steered_by: (system, component) id of whom the last setpoint that counts came from, None before the first.
     """
 
-    def __init__(self, config: Config, vehicle: Plant | Craft, start_ns: int, *, airborne: bool) -> None:
+    def __init__(
+        self, config: Config, vehicle: Plant | Craft, start_ns: int, seed: np.random.SeedSequence, *, airborne: bool
+    ) -> None:
         kind = self._kind = PERSONALITIES[config.sim.autopilot]
         craft: Craft = SteeredPlant(vehicle) if isinstance(vehicle, Plant) else vehicle
         boot_ns = self._boot_ns = start_ns - UPTIME_NS
@@ -79,7 +86,10 @@ class Autopilot:
         self.estimator = Estimator(kind, self.parameters, craft, self._age_ns)
         self.pilot = Pilot(kind, craft, self.parameters, self.estimator, boot_ns, airborne=airborne, radio=radio)
         origin = Origin(*kind.origin_deg_m)
-        whole = Vehicle(kind, craft, self.pilot, self.estimator, self.parameters, origin, boot_ns, radio)
+        errors = ERRORS[kind.name].scaled(config.sim.inertial.errors)
+        self.inertial = InertialSensors(errors, craft, seed, flown=config.sim.inertial.flown)
+        parts = self.pilot, self.estimator, self.inertial, self.parameters
+        whole = Vehicle(kind, craft, *parts, origin, boot_ns, radio)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
         self._failsafes = Failsafes(kind, self.pilot, self.parameters, self.estimator, craft.battery)
@@ -114,7 +124,7 @@ class Autopilot:
         """Time of the next thing to do of itself [ns]; None after a crash."""
         if self.pilot.crashed:
             return None
-        parts = self.telemetry, self.pilot, self.estimator, self._failsafes
+        parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial
         return min((part.next_ns for part in parts if part.next_ns is not None), default=None)
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
@@ -122,6 +132,7 @@ class Autopilot:
         if self.pilot.crashed:
             return ()
         self.estimator.run(at_ns)
+        self.inertial.run(at_ns)
         self.pilot.run(at_ns)
         self._failsafes.run(at_ns)
         for msg in self.telemetry.due(at_ns):

@@ -50,13 +50,13 @@ class Peers:
         script: Script | None = None,
     ) -> None:
         config = self._config = with_spans(config)
-        for_vehicle, for_cameras, for_channel = np.random.SeedSequence(config.sim.seed).spawn(3)
+        for_vehicle, for_cameras, for_channel, for_inertial = np.random.SeedSequence(config.sim.seed).spawn(4)
         self.vehicle: Vehicle | Quadrotor
         if config.sim.plant == "quadrotor" and script is None:
             self.vehicle = quadrotor(config, for_vehicle, start_ns)
         else:
             self.vehicle = Vehicle(config, for_vehicle, start_ns, script)
-        self.autopilot = Autopilot(config, self.vehicle, start_ns, airborne=airborne)
+        self.autopilot = Autopilot(config, self.vehicle, start_ns, for_inertial, airborne=airborne)
         self.channel: Channel | ScriptedChannel
         if script is None:
             self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))

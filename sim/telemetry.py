@@ -9,10 +9,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.airframe import GRAVITY_MPS2
 from sim.arming import preflight
 from sim.craft import Craft, heading_rad
 from sim.estimator import Estimator
 from sim.geodesy import Origin
+from sim.inertial import InertialSensors
 from sim.parameters import Parameters
 from sim.personality import Personality
 from sim.pilot import Phase, Pilot
@@ -24,6 +26,7 @@ SHORTEST_INTERVAL_NS = 1_000_000
 ARMED_FLAG = 128  # MAV_MODE_FLAG
 CAPACITY_MAH = 240.0
 HOME_POSITION, AUTOPILOT_VERSION, MESSAGE_INTERVAL = 242, 148, 244  # message ids
+FORCE_AND_RATES = 63  # HIGHRES_IMU_UPDATED_FLAGS: XACC to ZGYRO
 
 Message = Any  # pymavlink's classes have no types
 # MAV_SYS_STATUS_SENSOR
@@ -56,8 +59,8 @@ COMMON_MS = {
     245: 1000,  # EXTENDED_SYS_STATE
 }
 USUAL_MS = {
-    "px4": {**COMMON_MS, 31: 250, 111: 100, 141: 1000, 230: 1000, 242: 2000},
-    "ardupilot": {**COMMON_MS, 193: 1000},
+    "px4": {**COMMON_MS, 31: 250, 105: 0, 111: 100, 141: 1000, 230: 1000, 242: 2000},
+    "ardupilot": {**COMMON_MS, 27: 0, 116: 0, 193: 1000},
 }
 
 
@@ -69,6 +72,7 @@ class Vehicle:
     craft: Craft
     pilot: Pilot
     estimator: Estimator
+    inertial: InertialSensors
     parameters: Parameters
     origin: Origin
     boot_ns: int
@@ -93,6 +97,7 @@ class Telemetry:
             0: self._heartbeat,
             1: self._status,
             24: self._gps,
+            27: self._raw_imu,
             30: self._attitude,
             31: self._quaternion,
             32: self._local,
@@ -101,7 +106,9 @@ class Telemetry:
             65: self._radio,
             74: self._hud,
             85: self._target,
+            105: self._highres_imu,
             111: self._timesync,
+            116: self._second_imu,
             141: self._altitude,
             147: self._battery,
             148: self._version,
@@ -194,17 +201,34 @@ class Telemetry:
         )
 
     def _euler(self) -> Vec3:
-        w, x, y, z = self._v.craft.attitude
+        w, x, y, z = attitude = self._v.inertial.attitude()
         roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
-        return roll, pitch, heading_rad(self._v.craft.attitude)
+        return roll, pitch, heading_rad(attitude)
 
     def _attitude(self, at_ns: int) -> Message:
-        return mavlink.MAVLink_attitude_message(self._boot_ms(at_ns), *self._euler(), *self._v.craft.rates_rps)
+        return mavlink.MAVLink_attitude_message(self._boot_ms(at_ns), *self._euler(), *self._v.inertial.rates())
 
     def _quaternion(self, at_ns: int) -> Message:
-        craft = self._v.craft
-        return mavlink.MAVLink_attitude_quaternion_message(self._boot_ms(at_ns), *craft.attitude, *craft.rates_rps)
+        inertial = self._v.inertial
+        turn = inertial.attitude()
+        return mavlink.MAVLink_attitude_quaternion_message(self._boot_ms(at_ns), *turn, *inertial.rates())
+
+    def _highres_imu(self, _at_ns: int) -> Message:
+        """HIGHRES_IMU of PX4: SI units; of its fields those of accelerometer and gyroscope alone."""
+        measured_ns, force, rates = self._v.inertial.measure(0)
+        nothing = [0.0] * 7  # magnetometer, barometer and their temperature
+        boot_us = self._boot_us(measured_ns)
+        return mavlink.MAVLink_highres_imu_message(boot_us, *force, *rates, *nothing, FORCE_AND_RATES)
+
+    def _raw_imu(self, _at_ns: int) -> Message:
+        """RAW_IMU of ArduPilot: scaled like SCALED_IMU, despite its name."""
+        measured_ns, force, rates = self._v.inertial.measure(0)
+        return mavlink.MAVLink_raw_imu_message(self._boot_us(measured_ns), *in_thousandths(force, rates), 0, 0, 0)
+
+    def _second_imu(self, _at_ns: int) -> Message:
+        measured_ns, force, rates = self._v.inertial.measure(1)
+        return mavlink.MAVLink_scaled_imu2_message(self._boot_ms(measured_ns), *in_thousandths(force, rates), 0, 0, 0)
 
     def _local(self, at_ns: int) -> Message | None:
         estimator = self._v.estimator
@@ -309,3 +333,9 @@ class Telemetry:
 def clipped_mm(metres: float) -> int:
     """Millimetres that fit 32 bits."""
     return min(max(round(1000.0 * metres), -(2**31)), 2**31 - 1)
+
+
+def in_thousandths(force_mps2: Vec3, rates_rps: Vec3) -> tuple[int, ...]:
+    """Convert specific force to mg and body rates to mrad/s, 16 bits, truncated towards zero as ArduPilot does."""
+    values = *(each / GRAVITY_MPS2 for each in force_mps2), *rates_rps
+    return tuple(int(min(max(1000.0 * each, -32768.0), 32767.0)) for each in values)

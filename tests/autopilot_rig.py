@@ -6,6 +6,7 @@ import math
 import random
 from typing import Any, Literal
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import WITH_SIH_DRAG, quadrotor, steady
 from sim_rig import ARM, TAKE_OFF, Client, S, decode
@@ -54,7 +55,7 @@ class Flight:
         airframe = {"airframe": WITH_SIH_DRAG} if name == "px4" else {}  # the one of the recorded flights
         self.vehicle: Quadrotor = quadrotor(name, wind=steady(wind), at=(0.0, 0.0, -5.0), speed=speed, **airframe)
         config = load_config("room", [f"sim.autopilot={name}"])
-        self.autopilot = Autopilot(config, self.vehicle, 0, airborne=airborne)
+        self.autopilot = Autopilot(config, self.vehicle, 0, np.random.SeedSequence(1), airborne=airborne)
         self.client = Client()
         self.seen: list[tuple[int, Any]] = []
         self.external: str | None = None  # kind of the external positions that are sent

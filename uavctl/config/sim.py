@@ -100,6 +100,24 @@ class QuadrotorConfig(Section, frozen=True, kw_only=True):
     charge: Annotated[float, Meta(gt=0, le=1, description="charge of the battery at the start")] = 1.0
 
 
+class InertialConfig(Section, frozen=True, kw_only=True):
+    """Inertial measurements of the simulated autopilot, and the attitude told with them (docs/vehicle.md)."""
+
+    errors: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="size of the errors of inertial measurements, and of the attitude once they are asked for, "
+            "relative to those of docs/vehicle.md; 0 is none",
+        ),
+    ] = 1.0
+    flown: Annotated[
+        bool,
+        Meta(description="whether the quadrotor flies by the wrong attitude too: what it takes for level is not"),
+    ] = False
+
+
 class FaultConfig(Section, frozen=True, kw_only=True):
     """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
@@ -154,6 +172,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
     camera: CameraConfig
     wind: WindConfig = WindConfig()
     quadrotor: QuadrotorConfig = QuadrotorConfig()
+    inertial: InertialConfig = InertialConfig()
     plant: Annotated[
         Literal["linear", "quadrotor"],
         Meta(

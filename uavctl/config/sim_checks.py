@@ -47,6 +47,12 @@ def sim(config: SimConfig) -> Iterator[Problem]:
                     'has no effect with plant "linear", whose disturbance is that of [plant]',
                     'remove it, or set sim.plant = "quadrotor"',
                 )
+        if config.inertial.flown:
+            yield Problem(
+                "sim.inertial.flown",
+                'has no effect with plant "linear", which is always level',
+                'remove it, or set sim.plant = "quadrotor"',
+            )
     elif config.start_position_m[2] >= 0.0:
         yield Problem(
             "sim.start_position_m[2]",
