@@ -54,7 +54,10 @@ def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
         mission = replace(mission, waypoints=waypoints, accept_m=given.accept_m)
     return replace(
         mission,
-        trajectory=build_trajectory(given.trajectory, design, rests) if given.trajectory.times_s else None,
+        trajectory=build_trajectory(given.trajectory, design, rests, config.plant.dead_time_s)
+        if given.trajectory.times_s
+        else None,
+        dead_ns=round(config.plant.dead_time_s * NANOSECONDS),
         fences=tuple(_fence(number, one, design, rests) for number, one in enumerate(config.fence)),
         land=given.then == "land",
         lead_ns=round(config.envelope.lead_s * NANOSECONDS),
@@ -74,10 +77,10 @@ def build_names(design: AnyDesign) -> Names:
     )
 
 
-def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array) -> Trajectory:
+def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, dead_s: float = 0.0) -> Trajectory:
     """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
 
-    For `rests` see `build_mission`.
+    Its rows begin `dead_s` after its time zero: there begins what is sent then. For `rests` see `build_mission`.
 
     Raises:
         DesignError: The motion leaves the state limits.
@@ -85,7 +88,7 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array) -
     plant = design.plant
     times_s, places = np.array(given.times_s), np.array(given.positions_m)
     last_s = plant.dt_s * np.ceil(times_s[-1] / plant.dt_s - _ROUNDING)
-    grid_s = plant.dt_s * np.arange(round(last_s / plant.dt_s) + design.horizon + 1)
+    grid_s = dead_s + plant.dt_s * np.arange(round(last_s / plant.dt_s) + design.horizon + 1)
     within_s = np.clip(grid_s, times_s[0], times_s[-1])
     moves = ((grid_s >= times_s[0]) & (grid_s < times_s[-1]))[:, None]
     if given.interpolation == "linear":

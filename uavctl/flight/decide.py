@@ -130,9 +130,9 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     base = _base(state, tick, inp, controller)
     if base is None:
         return Choice(state, "no estimate of this boundary")
-    mission = advance(controller.mission, state.mission, base.mean, base.at_ns)
+    mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
     state = replace(state, mission=mission)
-    if controller.mission.land and state.order is None and over(controller.mission, mission, base.at_ns):
+    if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
         return _fall(state, landing, tick, inp, controller, MISSION_OVER)
     choice = _replan(state, mission, base, tick, controller)
@@ -160,10 +160,10 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
     reason = "news: a new plan" if news else "inertial data: a new plan"
     if state.order is not None:
         reason = f"{reason}, as ordered: {told(state.order)}"
-    mission = obey(controller.mission, mission, state.order, base.mean, base.at_ns)
-    mission = lead(controller.mission, mission, base.mean, base.at_ns)
+    mission = obey(controller.mission, mission, state.order, base.mean, tick.boundary_ns)
+    mission = lead(controller.mission, mission, base.mean, tick.boundary_ns)
     state = replace(state, mission=mission, order=None)
-    target, outlook = ask_for(controller.mission, mission, base.at_ns)
+    target, outlook = ask_for(controller.mission, mission, tick.boundary_ns)
     late = min(tick.age_steps or 0, controller.late_steps)
     # The solver counts what acts on the plant in all; `ask` takes the bias off again.
     sent = controller.plant.to_input(state.accel_mps2)

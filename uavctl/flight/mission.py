@@ -151,6 +151,7 @@ class Mission:
     fences: tuple[Fence, ...] = ()
     land: bool = False
     lead_ns: int = 0
+    dead_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -265,7 +266,8 @@ def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
         return state.stay
     if mission.trajectory is None:
         return tuple(mission.waypoints[state.waypoint].target.tolist())
-    states, since_ns = mission.trajectory.states, max(at_ns - state.start_ns - state.paused_ns, 0)
+    states = mission.trajectory.states
+    since_ns = max(at_ns - state.start_ns - state.paused_ns - mission.dead_ns, 0)
     row, into_ns = divmod(since_ns, mission.dt_ns)
     if row + 1 >= len(states):
         return tuple(states[-1].tolist())
@@ -275,7 +277,7 @@ def wanted(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 
 def ask_for(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Outlook]:
     """Question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
-    limits = _limits(mission, at_ns - state.start_ns)
+    limits = _limits(mission, at_ns - state.start_ns + mission.dead_ns)
     led = state.led
     if led is not None and at_ns - led.at_ns < mission.lead_ns and led.target == wanted(mission, state, at_ns):
         return np.array(led.first), Outlook(limits=limits)

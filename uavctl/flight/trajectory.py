@@ -19,9 +19,13 @@ Array = NDArray[np.float64]
 _CALM = 1e-2
 # Keeps the system regular where a state is seen by nothing; moves nothing that is.
 _REGULAR = 1e-12
+_FIRM = 1e3  # metres of a missed position that a unit of a state is worth that a motion begins without
 # A plan along a motion has to end at rest, and is to leave the motion late: what it does in a stage costs this many
 # times what the same does in the next. More would brake harder than a vehicle can, less would slow it down at once.
 _LATER = 2.0
+# Both are of steps of this length, or longer: of shorter ones an input does less and changes less, and braking takes
+# more of them.
+_STEP_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +59,15 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Mo
     if velocities_mps is not None:
         rows.append(sparse.kron(sparse.eye_array(n), dt_s * velocity))
         right.append(dt_s * velocities_mps[:, columns].ravel())
+    loops = np.flatnonzero(_of_loops(plant))
+    if loops.size:
+        rows.append(_FIRM * sparse.eye_array(n_x, n * n_x, format="csr")[loops])
+        right.append(np.zeros(loops.size))
     seen = sparse.vstack(rows)
     now, then = sparse.eye_array(n - 1, n), sparse.eye_array(n - 1, n, k=1)
-    effect = np.linalg.norm(position @ (plant.b + plant.a @ plant.b), axis=0)
+    steps = max(2, round(2.0 * _STEP_S / plant.dt_s))
+    held = sum(np.linalg.matrix_power(plant.a, step) for step in range(steps)) @ plant.b
+    effect = np.linalg.norm(position @ held, axis=0) * max(_STEP_S / plant.dt_s, 1.0)
     calm = sparse.kron(then - now, np.sqrt(_CALM) * np.diag(effect))
     cost = sparse.block_diag([seen.T @ seen, calm.T @ calm])
     model = sparse.hstack([sparse.kron(now, plant.a) - sparse.kron(then, np.eye(n_x)), sparse.kron(now, plant.b)])
@@ -69,6 +79,18 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Mo
         states=found[: n * n_x].reshape(n, n_x),
         inputs=found[n * n_x : n * (n_x + n_u)].reshape(n, n_u),
     )
+
+
+def _of_loops(plant: Plant) -> NDArray[np.bool_]:
+    """Which states (n_x,) are of the vehicle's own loops.
+
+    They end by themselves: a motion cannot choose to begin with them, and inputs that made them zero at a given stage
+    would be large.
+    """
+    loops = np.zeros(plant.n_x, dtype=np.bool_)
+    for place in plant.velocity_index:
+        loops[place + 2 : place + 1 + len(plant.further)] = True  # behind position, velocity and acceleration
+    return loops
 
 
 def along(plant: Plant, motion: Motion, horizon: int, rest: int, lower: Array, upper: Array) -> Trajectory:
@@ -92,14 +114,15 @@ def along(plant: Plant, motion: Motion, horizon: int, rest: int, lower: Array, u
     rows = np.minimum(np.arange(n)[:, None] + np.arange(rest + 1), n - 1)
     states, inputs = motion.states[rows], motion.inputs[rows[:, :rest]]
     reach = _reach(plant, rest)
-    cost = np.asarray(np.kron(np.diag(_LATER ** -np.arange(rest, dtype=np.float64)), np.eye(n_u)))
+    later = _LATER ** min(plant.dt_s / _STEP_S, 1.0)
+    cost = np.asarray(np.kron(np.diag(later ** -np.arange(rest, dtype=np.float64)), np.eye(n_u)))
     rest_x, rest_u = _equilibria(plant)
     # At rest wherever it comes to be: the part of x_N that is no equilibrium is to vanish.
-    moving = _complement(rest_x)
+    moving, seen = _moving(plant, rest_x), ~_of_loops(plant)
     braked = states[:, rest] - states[:, rest] @ (reach[rest] @ _least(cost, moving @ reach[rest]) @ moving).T
     places = np.clip(braked[:, list(plant.position_index)], lower, upper)
     anchors, anchor_inputs = places @ rest_x, places @ rest_u
-    change = (anchors - states[:, rest]) @ _least(cost, reach[rest]).T
+    change = (anchors - states[:, rest])[:, seen] @ _least(cost, reach[rest][seen]).T
     path_states, path_inputs = np.zeros((n, horizon, n_x)), np.zeros((n, horizon, n_u))
     for t in range(rest):
         path_states[:, t] = states[:, t] + change @ reach[t].T - anchors
@@ -120,7 +143,7 @@ def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
         DesignError: The plant cannot rest everywhere.
     """
     rest_x, _ = _equilibria(plant)
-    moving, effect = _complement(rest_x), _reach(plant, rest)[rest]
+    moving, effect = _moving(plant, rest_x), _reach(plant, rest)[rest]
     brakes = effect @ _least(np.eye(rest * plant.n_u), moving @ effect) @ moving
     stopped = (np.eye(plant.n_x) - brakes) @ np.linalg.matrix_power(plant.a, rest)
     return Room(
@@ -148,9 +171,13 @@ def _least(cost: Array, effect: Array) -> Array:
     return least
 
 
-def _complement(rest_x: Array) -> Array:
-    """Rows (n_x - n_axes, n_x) that vanish on equilibria, and only there."""
-    return np.asarray(np.linalg.svd(rest_x)[2][len(rest_x) :])
+def _moving(plant: Plant, rest_x: Array) -> Array:
+    """Rows (…, n_x) that vanish on equilibria, and elsewhere only by what ends by itself."""
+    loops = _of_loops(plant)
+    if not loops.any():
+        return np.asarray(np.linalg.svd(rest_x)[2][len(rest_x) :])
+    loops[list(plant.position_index)] = True
+    return np.asarray(np.eye(plant.n_x)[~loops])
 
 
 def _equilibria(plant: Plant) -> tuple[Array, Array]:
