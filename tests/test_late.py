@@ -17,7 +17,7 @@ from optimisation_cases import paper_spec
 from scipy.linalg import solve_discrete_lyapunov
 
 from logs.replay import replay
-from uavctl.build import build_design, build_solver
+from uavctl.build import build_conditioned, build_design, build_solver
 from uavctl.build_late import build_delayed_link, late_steps
 from uavctl.config import Config, load_config
 from uavctl.data import Decision, Plan, SolveStatus
@@ -269,6 +269,18 @@ def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: floa
     promised = np.array([link.outage(step) for step in range(7)])
     assert np.all(measured <= promised + 5.0 * np.sqrt(promised * (1.0 - promised) / 40_000) + 1e-12)
     assert promised[6] < 0.5 * build_delayed_link(one_a_step).outage(6)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("overrides", CAMERAS)
+def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides: list[str], phase: float) -> None:
+    """A link's model is of the longest ways: the budget of an age that it has not must not be a licence."""
+    config = load_config("room", ["smpc.scheme=age-conditioned", "smpc.horizon=48", *overrides])
+    risk = build_conditioned(config).solver.risk
+    measured = silent(config, phase, 12)
+    spent = (measured[:-1] - measured[1:]) @ risk.budgets[:12] + measured[-1]
+    assert (np.diff(risk.budgets) >= 0.0).all()
+    assert spent <= 1.0 - config.smpc.delta_x + 5.0 * np.sqrt(0.05 / 40_000)
 
 
 @pytest.mark.parametrize(

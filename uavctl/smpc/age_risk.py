@@ -26,7 +26,7 @@ class AgeRisk:
     Attributes:
         weights: π_t (H,), of information t = 1 … H steps old.
         beyond: Probability that it is older than H: no plan is left then, and all of it counts as outside.
-        budgets: ε̄_t (H,) with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK bounds them.
+        budgets: ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK bounds them.
     """
 
     weights: Array
@@ -63,7 +63,9 @@ def age_risk(link: LinkModel, deviations: Array, allowed: float, price: float = 
     scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
 
     def budgets(level: float) -> Array:
-        return np.asarray(ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))))
+        # No younger age has more: a link that is better than its model uses up no more risk.
+        each = ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0)))
+        return np.ascontiguousarray(np.minimum.accumulate(each[::-1])[::-1])
 
     def excess(level: float) -> float:
         return float(weights @ budgets(level)) - left
