@@ -82,6 +82,9 @@ def test_an_age_beyond_the_design_is_told_and_one_beyond_a_step_fails() -> None:
     assert state(slow, "position age") is State.NOTE
     late = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02"])
     assert state(late, "position age") is State.BAD
+    # Plans of the other scheme count with every age up to the horizon.
+    planned = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02", "smpc.scheme=age-conditioned"])
+    assert state(planned, "position age") is State.NOTE
 
 
 def test_a_gap_as_long_as_the_horizon_fails() -> None:

@@ -6,6 +6,7 @@ import time
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -22,6 +23,8 @@ from uavctl.smpc.conditioned_design import ConditionedDesign, conditioned_record
 from uavctl.smpc.design import Design
 from uavctl.smpc.design_record import design_record
 from uavctl.smpc.terminal import stationary_cost
+
+_RARE = 1e-9  # ages that are all older than this share of the time are told together
 
 
 def design(
@@ -74,8 +77,13 @@ def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
     for heading in ("age [steps]", "probability", "may be outside"):
         ages.add_column(heading, justify="right")
     risk, problem = made.solver.risk, made.solver.problem
-    for age, (weight, budget) in enumerate(zip(risk.weights, risk.budgets, strict=True), start=1):
+    left = 1.0 - np.cumsum(risk.weights)
+    told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
+    for age, (weight, budget) in enumerate(zip(risk.weights[:told], risk.budgets, strict=False), start=1):
         ages.add_row(str(age), f"{weight:.3g}", f"{budget:.2%}")
+    if told < problem.horizon:
+        rest = f"{risk.weights[told:].sum():.3g}"
+        ages.add_row(f"{told + 1} to {problem.horizon}", rest, f"up to {risk.budgets[-1]:.2%}")
     ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full")
     names = build_names(made)
     limits = Table(title="Where a plan may rest", title_justify="left")
