@@ -7,7 +7,7 @@ import numpy as np
 
 from uavctl.data import Estimate, Matrix, Plan, SolveStatus, Vector
 from uavctl.flight.kalman import Array
-from uavctl.smpc.answer import Answer, Outlook, Solver
+from uavctl.smpc.answer import Answer, Outlook, Solver, all_finite
 
 # What arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
@@ -60,7 +60,7 @@ def _complete(answer: Answer, shape: tuple[int, int], n_x: int) -> bool:
     return (
         answer.inputs.shape == shape
         and answer.states.shape == (shape[0] + 1, n_x)
-        and all(np.isfinite(values).all() for values in (answer.inputs, answer.states, answer.reference))
+        and all_finite((answer.inputs, answer.states, answer.reference))
     )
 
 
@@ -94,4 +94,6 @@ def _row(values: Array) -> Vector:
 
 
 def _rows(values: Array) -> Matrix:
+    if len(values) and not np.count_nonzero(values) and not np.signbit(values).any():
+        return (tuple(values[0].tolist()),) * len(values)  # what the inputs of an open-loop plan keep
     return tuple(map(tuple, values.tolist()))

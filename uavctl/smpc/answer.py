@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -57,13 +58,19 @@ NOMINAL = Outlook()
 
 def finite(x: Array, target: Array, outlook: Outlook) -> bool:
     """Whether a question is made of finite numbers."""
-    given = [x, target, *(one for one in (outlook.cov, outlook.limits, outlook.sent) if one is not None)]
+    given = [x, target]
+    for one in (outlook.cov, outlook.limits, outlook.sent):
+        if one is not None:
+            given.append(one)
     if outlook.path is not None:
         given += [outlook.path.states, outlook.path.inputs]
+    return all_finite(given)
+
+
+def all_finite(given: Iterable[Array]) -> bool:
+    """Whether arrays are made of finite numbers."""
     # A sum of squares is finite where all of them are, unless it overflows: then each is looked at.
-    if math.isfinite(sum(float(np.vdot(values, values)) for values in given)):
-        return True
-    return all(bool(np.isfinite(values).all()) for values in given)
+    return all(math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all()) for values in given)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ class _Margins:
         sigma: Standard deviations (H, m).
         budgets: ε̄ of the stages (H,).
         backoff: Back-offs (H, m) of rows that share the budgets equally.
-        rest: What a plan that rests keeps (m,) from rows that have each budget to themselves.
+        rest: What a plan that rests keeps from the rows that an equilibrium may be at, each budget to itself.
     """
 
     sigma: Array
@@ -132,7 +132,7 @@ class ConditionedSolver:
         self._resting = np.flatnonzero(np.any(placed != 0.0, axis=1))
         self._placed = placed[self._resting]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
-        self._low, self._high = problem.input_set.bounds
+        self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
         self.risk = age_risk(link, self._pacing(), allowed, price)
@@ -178,7 +178,7 @@ class ConditionedSolver:
         for one, z in (*along, *found.left):
             one.add(z, inputs, states)
         cost, slack, gave_way = self._price(inputs, states, found, outlook)
-        if first is not None and (first[1] > self._slew.side + KEPT).any():
+        if first is not None and max(first[1].tolist()) > self._slew.side + KEPT:
             gave_way += self._slew_gave_way(first[1])
         states += reference
         states[0] = x
@@ -214,18 +214,19 @@ class ConditionedSolver:
         key = outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
-            rest = (self._whole[late] * sigma).max(axis=0)
+            rest = (self._whole[late] * sigma[:, self._resting]).max(axis=0)
             self._last = key, _Margins(sigma, self._budgets[late], self._shared[late] * sigma, rest)
         return self._last[1]
 
     def _reference(self, target: Array, limits: Array, margins: _Margins) -> Array:
         """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
         sides = limits if limits.ndim == 1 else limits.min(axis=0)
-        short = self._placed @ target[self._rests.held] > (sides - margins.rest)[self._resting]
-        if not short.any():
+        short = self._placed.dot(target[self._rests.held]) > sides[self._resting] - margins.rest
+        count = np.count_nonzero(short)
+        if not count:
             return target
         reference = np.array(target)
-        rest = (quantile(margins.budgets / int(short.sum()))[:, None] * margins.sigma).max(axis=0)
+        rest = (quantile(margins.budgets / count)[:, None] * margins.sigma).max(axis=0)
         for one, places in zip(self._parts, self._places, strict=True):
             places.nearest(reference, (sides - rest)[one.columns])
         return reference
@@ -251,10 +252,10 @@ class ConditionedSolver:
         """
         backoff, sigma, budgets = margins.backoff, margins.sigma, margins.budgets
         over, tight = room < backoff, hard < 0.0
-        if not tight.any():
-            stages = np.flatnonzero(over.any(axis=1))
-            if not stages.size:
+        if not np.count_nonzero(tight):
+            if not np.count_nonzero(over):
                 return _Found((), backoff, room, 0)
+            stages = np.flatnonzero(over.any(axis=1))
             if (spent(room[stages], sigma[stages]).sum(axis=1) <= budgets[stages]).all():
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
         todo = [one for one in self._parts if tight[one.hard].any() or over[:, one.columns].any()]
@@ -285,11 +286,13 @@ class ConditionedSolver:
 
     def _price(self, du: Array, dx: Array, found: _Found, outlook: Outlook) -> tuple[float, float, tuple[GaveWay, ...]]:
         """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
-        problem, last = self.problem, dx[-1]
-        dx = dx[:-1]
-        if outlook.path is not None:
-            dx, du = dx - outlook.path.states, du - outlook.path.inputs
-        cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
+        problem = self.problem
+        if outlook.path is None:
+            # The regulator's own cost, and the square of what leaves it.
+            cost = dx[0] @ self._tail @ dx[0] + sum(np.vdot(z, z) for _, z in found.left)
+        else:
+            last, dx, du = dx[-1], dx[:-1] - outlook.path.states, du - outlook.path.inputs
+            cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
         if not found.left:
             return float(cost), 0.0, ()
         over = np.maximum(found.backoff - found.room, 0.0)
@@ -315,7 +318,7 @@ class ConditionedSolver:
         """Inputs (H, n_u) within their limits to the last bit, and whether they were but for rounding."""
         if not self._box:
             return inside(inputs, self.problem.input_set.c, self.problem.input_set.b)
-        cut = np.minimum(np.maximum(inputs, self._low), self._high)
+        cut: Array = np.minimum(np.maximum(inputs, self._low), self._high)
         return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
 
 

@@ -9,7 +9,7 @@ from uavctl.smpc.baselines.mpc import regulated
 from uavctl.smpc.baselines.problem import Part, Problem
 from uavctl.smpc.layout import pairs_of
 from uavctl.smpc.lqg_bound import Lqr
-from uavctl.smpc.qp import SOFT, QuadraticProgram
+from uavctl.smpc.qp import ACTIVE, BELOW, SOFT, QuadraticProgram, Sense
 from uavctl.smpc.slew import SlewRows
 
 Array = NDArray[np.float64]
@@ -71,8 +71,9 @@ class PartProgram:
             return np.append(np.where(of_states >= 0, at_x, end).ravel(), np.where(of_hard >= 0, at_u, end).ravel())
 
         self._upper, self._lower = places(above_x, above_u), places(below_x, below_u)
-        self._soft = len(rows_x)
-        soft = np.arange(len(rows)) < self._soft
+        self._width = above_u.size  # of the hard rows of a stage
+        self._slews = range(len(rows_x) + pairs_u[0].size, len(rows_x) + self._width)  # those of the first stage
+        soft = np.arange(len(rows)) < len(rows_x)
         self._program = QuadraticProgram(
             2.0 * np.eye(n),
             np.ascontiguousarray(rows),
@@ -111,11 +112,28 @@ class PartProgram:
             again: Whether to begin with the rows that bound in the last program: it must be of the same question.
         """
         upper, lower = rooms.take(self._upper), -rooms.take(self._lower)
+        begin = None if again else self._ramps(upper, lower)
         # Where two back-offs meet no mean keeps both: it stays between them.
         if (upper < lower).any():
             crossed = upper < lower
             upper[crossed] = lower[crossed] = 0.5 * (upper + lower)[crossed]
-        return self._program.solve_sides(upper, lower, again)
+        return self._program.solve_sides(upper, lower, begin, again)
+
+    def _ramps(self, upper: Array, lower: Array) -> Sense | None:
+        """Rows to begin with: the setpoint goes from the one sent last to the regulator's as fast as it may.
+
+        It is there where the room of all slew rows so far adds up to none that is missing.
+        """
+        begin = None
+        for i in self._slews:
+            for sides, sign, state in ((upper, 1.0, ACTIVE), (lower, -1.0, BELOW)):
+                if sign * sides[i] < 0.0:
+                    missing = (sign * sides[i :: self._width]).cumsum() < 0.0
+                    if begin is None:
+                        begin = self._program.sense.copy()
+                    count = int(missing.argmin()) or self._steps
+                    begin[i : i + count * self._width : self._width] += state
+        return begin
 
     def add(self, z: Array, inputs: Array, states: Array) -> None:
         """Add what z does to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""

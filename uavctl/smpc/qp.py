@@ -17,6 +17,7 @@ Sense = NDArray[np.int32]
 
 OPEN = 1e30  # DAQP's infinity
 SOFT, EQUAL = 8, 5
+ACTIVE, BELOW = 1, 3  # a row to begin with, at its upper side or at its lower one
 TOLERANCE = 1e-10
 _MOST_ITERATIONS = 2000
 # Share of the largest curvature that a soft row has at least: without any, DAQP loses its way between equalities.
@@ -75,17 +76,18 @@ class QuadraticProgram:
             return None
         return self._read()
 
-    def solve_sides(self, upper: Array, lower: Array, again: bool = False) -> Array | None:
+    def solve_sides(self, upper: Array, lower: Array, begin: Sense | None = None, again: bool = False) -> Array | None:
         """Minimiser (n,) for the f of the last question that gave one, zero without; None without an optimum.
 
         Args:
             upper: Upper sides (m,).
             lower: Lower sides (m,).
+            begin: `sense` with ACTIVE or BELOW added to the rows to begin with; None: with none.
             again: Whether to begin with the rows, and their factors, at which the last solve ended. What comes out
                 depends on that solve too, in its last bits: only where it was of the same question.
         """
-        sense = None if again else self.sense
-        if self._update(bupper=upper, blower=lower, sense=sense) < 0:
+        sense = self.sense if begin is None else begin
+        if self._update(bupper=upper, blower=lower, sense=None if again else sense) < 0:
             return None
         found = self._read()
         return None if found is None else found[0]

@@ -45,7 +45,8 @@ class RegulatedRows:
             of_x, of_u = (of[:, :, : part.states.size] for of in regulated(problem, law, part))
             states[:, part.states[:, None], part.states] = of_x
             inputs[:, part.inputs[:, None], part.states] = of_u
-        self._plan = np.vstack([inputs.reshape(-1, n_x), states.reshape(-1, n_x)])
+        # Tall matrices, column by column: the product is a few long sums then.
+        self._plan = np.asfortranarray(np.vstack([inputs.reshape(-1, n_x), states.reshape(-1, n_x)]))
         self.rows = np.concatenate([part.rows_x for part in parts])
         self.columns = _after_another([part.rows_x.size for part in parts])
         changes = np.diff(inputs, axis=0, prepend=0.0)
@@ -74,7 +75,7 @@ class RegulatedRows:
         self._owner, self._above = np.hstack(first)
         self._below = self._above + np.concatenate([np.full(one.shape[1], one.shape[1]) for one in first])
         of_x = problem.state_set.c[self.rows] @ states[1:]
-        self._room = -np.vstack([of_x.reshape(-1, n_x), *hard])
+        self._room = np.asfortranarray(-np.vstack([of_x.reshape(-1, n_x), *hard]))
 
     def room(
         self, dx: Array, sides: Array, hold: Array | None, first: tuple[Array, Array] | None
@@ -87,7 +88,7 @@ class RegulatedRows:
             hold: Input at the reference (n_u,); None for zero.
             first: See `SlewRows.first`; None where nothing is known of what was sent.
         """
-        room = self._room @ dx
+        room: Array = self._room.dot(dx)
         of_x, hard = room[: self._steps * self.rows.size].reshape(self._steps, -1), room[self._steps * self.rows.size :]
         of_x += sides
         hard += self._hard_sides
@@ -103,7 +104,7 @@ class RegulatedRows:
 
     def plan(self, dx: Array) -> tuple[Array, Array]:
         """Inputs (H, n_u) and states (H+1, n_x), both as deviations from the reference."""
-        plan = self._plan @ dx
+        plan: Array = self._plan.dot(dx)
         return plan[: self._steps * self._n_u].reshape(-1, self._n_u), plan[self._steps * self._n_u :].reshape(
             -1, self._n_x
         )

@@ -7,6 +7,8 @@ sent is behind the plan by half a step in the mean.
 
 from __future__ import annotations
 
+from operator import le
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,11 +40,13 @@ class SlewRows:
         self.side = slew_mps3 * plant.dt_s
         self._set = input_set
         self._low, self._high = input_set.bounds
+        self._lows, self._highs = self._low.tolist(), self._high.tolist()
         d = plant.accel_map
         with np.errstate(invalid="ignore"):  # an input without limits that an axis does not feel
             widest = np.nansum(np.abs(d) * (self._high - self._low), axis=1)
         self.axes = np.flatnonzero(np.any(d != 0.0, axis=1) & (widest > self.side))
         self.d = d[self.axes]
+        self._sides = np.full(self.axes.size, self.side)
         self._box = all(np.count_nonzero(row) == 1 for row in input_set.c)
         self._nearest: QuadraticProgram | None = None
         if not self._box:
@@ -60,6 +64,8 @@ class SlewRows:
         That is `side`, or as far as the nearest input in U is away: from there on every input may stay.
         """
         at = self.d @ sent
+        if self._box and all(map(le, self._lows, sent.tolist())) and all(map(le, sent.tolist(), self._highs)):
+            return at, self._sides
         away = np.abs(self.d @ self._within(sent) - at)
         return at, np.maximum(away + _APART * (1.0 + away), self.side)
 
