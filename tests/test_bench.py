@@ -3,32 +3,39 @@ from __future__ import annotations
 import gc
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
 import pytest
+from baseline_rig import problem
 from numpy.typing import NDArray
 from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
 
 from uavctl.bench import BenchResult, Sizes, run, run_bench
 from uavctl.bench.frozen_qp import FrozenProgram, time_frozen_qp
 from uavctl.bench.growth import copies, few_policies, growth_with_axes, lengthened
+from uavctl.bench.in_flight import InFlight
 from uavctl.bench.plot import bench_svg
 from uavctl.bench.states import LOOP_STEPS, closed_loops, draw_states
 from uavctl.bench.timing import FROZEN, Case, exponent, timed
+from uavctl.build import build_conditioned
 from uavctl.cli import bench_cmd
 from uavctl.cli.app import run as command
+from uavctl.config import load_config
 from uavctl.data import SolveStatus
 from uavctl.errors import UavctlError
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook
 from uavctl.smpc.components import decompose
+from uavctl.smpc.conditioned import ConditionedSolver
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design
 from uavctl.smpc.horizon import horizon_of
 from uavctl.smpc.library import Library
 from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.smpc.link import bernoulli
 from uavctl.smpc.meanqp import MeanProblem
 
 Array = NDArray[np.float64]
@@ -36,7 +43,7 @@ Array = NDArray[np.float64]
 WANTED = {
     "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "library_us", "ratio_printed_library",
     "ratio_exact_library", "growth_h", "growth_axes", "qp_us", "ratio_cvxpy_library", "shares", "gap", "library_s",
-    "library_bytes", "memory_mb", "ready_s", "frozen_us", "mixture_us",
+    "library_bytes", "memory_mb", "ready_s", "frozen_us", "mixture_us", "conditioned",
 }  # fmt: skip
 SMALL = Sizes(states=12, printed=1, cvxpy=3, exact=6, runs=2, horizons=(5, 8, 12), policies=3, growth_states=30, axes=3)
 
@@ -66,7 +73,8 @@ def told() -> list[tuple[str, int, int | None]]:
 def result(design: Design, library: Library, told: list[tuple[str, int, int | None]]) -> BenchResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_library", lambda *_: library)
-        return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL)
+        conditioned = build_conditioned(load_config("paper"))
+        return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL, conditioned)
 
 
 def test_one_run_has_all_figures(result: BenchResult) -> None:
@@ -85,6 +93,33 @@ def test_ratios_are_of_the_medians_shown(result: BenchResult) -> None:
     assert result.ratio_cvxpy_library == pytest.approx(2 * result.cvxpy_axis_ms / library_ms)
     assert result.ratio_exact_library == pytest.approx(2 * result.exact_axis_ms / library_ms)
     assert 0.0 < result.library_us.p50 <= result.library_us.p99 <= result.library_us.max
+
+
+def test_the_conditioned_decision_is_timed_on_the_same_states(result: BenchResult) -> None:
+    ours = result.conditioned
+    assert ours is not None
+    assert 0.0 < ours.us.p50 <= ours.us.p99 <= ours.us.max
+    assert ours.ratio_cvxpy == pytest.approx(result.cvxpy_ms * 1e3 / ours.us.p50)
+    assert 0.0 < ours.left_alone < 1.0
+    assert ours.iterations.max == round(ours.iterations.max) > 0
+
+
+def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
+    asked: list[Outlook] = []
+
+    class Recorder(ConditionedSolver):
+        def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+            asked.append(outlook)
+            return super().solve(seq, x, target, outlook)
+
+    given = problem("paper")
+    in_flight = InFlight(Recorder(given, bernoulli(np.array([0.7])), 0.05))
+    for seq in range(9):
+        assert in_flight.solve(seq, START, given.target).status is SolveStatus.OPTIMAL
+    covs = [one.cov for one in asked if one.cov is not None]
+    assert len(covs) == 9
+    assert all((one != other).any() for one, other in pairwise(covs))
+    assert all(one.sent is given.u_target for one in asked)
 
 
 def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
@@ -123,7 +158,7 @@ def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list
     assert last.pop("making the library") == (0, None)
     assert {"states", "all methods in turns", "printed, jointly", "longer horizons", "more axes"} == last.keys()
     assert all(done == total for done, total in last.values())
-    decisions = SMALL.runs * (result.states + result.exact_states) + result.cvxpy_states
+    decisions = SMALL.runs * (2 * result.states + result.exact_states) + result.cvxpy_states
     assert last["all methods in turns"] == (decisions, decisions)
 
 
@@ -329,7 +364,10 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
     """The command with its measurement replaced by one that was made; the arguments it was given."""
     given: list[tuple[float, int, int]] = []
 
-    def fake(_design: Design, loss: float, seed: int, advance: run.Advance, sizes: Sizes) -> BenchResult:
+    def fake(
+        _design: Design, loss: float, seed: int, advance: run.Advance, sizes: Sizes, conditioned: ConditionedSolver
+    ) -> BenchResult:
+        assert conditioned.problem.horizon == 12
         for done in range(3):
             advance("states", done, 2)
         given.append((loss, seed, sizes.states))
@@ -359,7 +397,15 @@ def test_the_command_shows_ratios_shares_and_growth(
     out = capsys.readouterr().out
     assert f"{result.ratio_cvxpy_library:.0f} ×" in out
     assert f"{result.shares.frozen:.1%}" in out
-    for words in ("as printed, jointly", "policy library", "H = 12", "3 axes", "Certified gap", "Peak memory"):
+    for words in (
+        "as printed, jointly",
+        "policy library",
+        "conditioned on the age",
+        "H = 12",
+        "3 axes",
+        "Certified gap",
+        "Peak memory",
+    ):
         assert words in out
     assert measured[0][2] == 1000
 

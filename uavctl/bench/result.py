@@ -53,6 +53,15 @@ class QpTimes(msgspec.Struct, frozen=True, kw_only=True):
     cost_difference: float  # largest relative difference of the two optima
 
 
+class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
+    """Decision of scheme `age-conditioned` for all axes, each with a covariance of its own and a setpoint sent last."""
+
+    us: Quantiles
+    iterations: Quantiles  # of all its programs together
+    left_alone: float  # share of the states from which the regulator's own plan keeps everything
+    ratio_cvxpy: float  # the problem as printed, axis by axis, in the same run
+
+
 class Memory(msgspec.Struct, frozen=True, kw_only=True):
     """Peak resident set of the process [MB]."""
 
@@ -84,6 +93,7 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
     ratio_printed_library: float  # as printed, jointly
     ratio_cvxpy_library: float  # as printed, axis by axis
     ratio_exact_library: float
+    conditioned: ConditionedTimes | None  # null: silence outlasts the horizon too often for it
     shares: Shares
     gap: Quantiles  # certified
     certificate_excess: float  # most by which an exact optimum is outside the certified bounds, relative; 0: never

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from uavctl.bench.frozen_qp import time_frozen_qp
 from uavctl.bench.growth import growth_with_axes, growth_with_horizon
-from uavctl.bench.result import BenchResult, Memory, Quantiles, Shares
+from uavctl.bench.in_flight import InFlight
+from uavctl.bench.result import BenchResult, ConditionedTimes, Memory, Quantiles, Shares
 from uavctl.bench.states import draw_states
 from uavctl.bench.timing import EXACT, FROZEN, MIXTURE, Case, Timed, clock_us, median, timed
 from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.components import decompose
+from uavctl.smpc.conditioned import ConditionedSolver
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design
 from uavctl.smpc.library import Library, make_library
@@ -63,7 +65,14 @@ class Sizes:
 DEFAULT_SIZES = Sizes()
 
 
-def run_bench(design: Design, loss: float, seed: int, advance: Advance, sizes: Sizes = DEFAULT_SIZES) -> BenchResult:
+def run_bench(
+    design: Design,
+    loss: float,
+    seed: int,
+    advance: Advance,
+    sizes: Sizes = DEFAULT_SIZES,
+    conditioned: ConditionedSolver | None = None,
+) -> BenchResult:
     """Measure everything on the same states.
 
     Args:
@@ -72,6 +81,7 @@ def run_bench(design: Design, loss: float, seed: int, advance: Advance, sizes: S
         seed: Of states and policies.
         advance: Told of the progress.
         sizes: How much is measured.
+        conditioned: Solver of scheme `age-conditioned` for the same plant; None: it is left out.
 
     Raises:
         UavctlError: No state is feasible.
@@ -97,8 +107,10 @@ def run_bench(design: Design, loss: float, seed: int, advance: Advance, sizes: S
         Case(ConicSolver(design), points[: sizes.exact], target),
         Case(PrintedSolver(design), points[: sizes.cvxpy], target, once=True),
     ]
+    if conditioned is not None:
+        compared.append(Case(InFlight(conditioned), points, target))
     asked = sum(len(case.asked(run, sizes.runs)) for case in compared for run in range(sizes.runs))
-    by_library, exact, axes = timed(compared, sizes.runs, phase("all methods in turns", asked))
+    by_library, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
     few = points[: sizes.printed]
     whole = Case(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), few, target)
     (joint,) = timed([whole], 1, phase("printed, jointly", len(few)))
@@ -136,6 +148,7 @@ def run_bench(design: Design, loss: float, seed: int, advance: Advance, sizes: S
         ratio_printed_library=joint_ms * 1e3 / library_us.p50,
         ratio_cvxpy_library=axes_ms * 1e3 / library_us.p50,
         ratio_exact_library=exact_ms * 1e3 / library_us.p50,
+        conditioned=_conditioned(ours[0], axes_ms) if ours else None,
         shares=_shares(by_library),
         gap=_quantiles(gaps),
         certificate_excess=_excess(by_library.answers, exact.answers),
@@ -150,6 +163,16 @@ def run_bench(design: Design, loss: float, seed: int, advance: Advance, sizes: S
         qp_us=qp,
         clock_us=clock_us(),
         wall_s=time.perf_counter() - begin,
+    )
+
+
+def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
+    us = _quantiles(found.us)
+    return ConditionedTimes(
+        us=us,
+        iterations=_quantiles(np.array([answer.iterations for answer in found.answers])),
+        left_alone=sum(answer.iterations == 0 for answer in found.answers) / len(found.answers),
+        ratio_cvxpy=axes_ms * 1e3 / us.p50,
     )
 
 
