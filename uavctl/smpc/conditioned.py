@@ -258,7 +258,7 @@ class ConditionedSolver:
             stages = np.flatnonzero(over.any(axis=1))
             if (spent(room[stages], sigma[stages]).sum(axis=1) <= budgets[stages]).all():
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
-        todo = [one for one in self._parts if tight[one.hard].any() or over[:, one.columns].any()]
+        todo = [one for one in self._parts if tight[one.hard].any() or np.count_nonzero(over[:, one.columns])]
         left: dict[PartProgram, Array] = {}
         found, now = None, room
         iterations = 0
@@ -266,7 +266,7 @@ class ConditionedSolver:
             if number:
                 binds = binding(backoff, now, sigma)
                 stages = np.flatnonzero(binds.any(axis=1))
-                todo = [one for one in todo if binds[:, one.columns].any()]
+                todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
                     break
                 backoff = backoff.copy()
@@ -301,8 +301,8 @@ class ConditionedSolver:
             return float(cost), 0.0, ()
         cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
         gave_way = tuple(
-            GaveWay(constraint="state", stage=int(t) + 1, index=int(self._rows[i]), amount=float(over[t, i]))
-            for t, i in np.argwhere(over > KEPT)
+            GaveWay(constraint="state", stage=t + 1, index=int(self._rows[i]), amount=float(over[t, i]))
+            for t, i in np.argwhere(over > KEPT).tolist()
         )
         return float(cost), slack, gave_way
 

@@ -48,6 +48,7 @@ class PartProgram:
         states, inputs = (of[:, :, part.states.size :] for of in regulated(problem, law, part))
         n = states.shape[2]
         self._plan, self._motion = inputs.reshape(-1, n), states[1:].reshape(-1, n)
+        self._inputs, self._states = _slice(part.inputs), _slice(part.states)
         # A path (p_t, r_t) to follow adds -2 Σ (x_t' Q p_t + u_t' R r_t) to the cost, which z = Σ … is the least of.
         q_x, q_u = problem.q_x[np.ix_(part.states, part.states)], problem.q_u[np.ix_(part.inputs, part.inputs)]
         self._of_path_x = np.einsum("tij,ik->jtk", states[:-1], q_x).reshape(n, -1)
@@ -57,7 +58,7 @@ class PartProgram:
         d = slew.d[np.ix_(slew.own(part.inputs), part.inputs)]
         changes = np.diff(inputs, axis=0, prepend=0.0)
         of_x, of_u = c_x @ states[1:], np.concatenate([c_u @ inputs, d @ changes, -d @ changes], axis=1)
-        self._x_of_z, self._u_of_z = of_x.reshape(-1, n), of_u.reshape(-1, n)
+        self._x_of_z, self._u_of_z = np.asfortranarray(of_x.reshape(-1, n)), of_u.reshape(-1, n)
         above_x, below_x = _sides(c_x)
         pairs_u, slews = _sides(c_u), len(c_u) + np.arange(len(d))
         above_u, below_u = np.append(pairs_u[0], slews), np.append(pairs_u[1], slews + len(d))
@@ -97,7 +98,7 @@ class PartProgram:
 
     def take_states(self, z: Array, room_x: Array) -> None:
         """The same of the state rows alone."""
-        room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
+        room_x[:, self.columns] -= self._x_of_z.dot(z).reshape(self._steps, -1)
 
     @property
     def iterations(self) -> int:
@@ -114,8 +115,8 @@ class PartProgram:
         upper, lower = rooms.take(self._upper), -rooms.take(self._lower)
         begin = None if again else self._ramps(upper, lower)
         # Where two back-offs meet no mean keeps both: it stays between them.
-        if (upper < lower).any():
-            crossed = upper < lower
+        crossed = upper < lower
+        if np.count_nonzero(crossed):
             upper[crossed] = lower[crossed] = 0.5 * (upper + lower)[crossed]
         return self._program.solve_sides(upper, lower, begin, again)
 
@@ -137,9 +138,15 @@ class PartProgram:
 
     def add(self, z: Array, inputs: Array, states: Array) -> None:
         """Add what z does to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""
-        part = self.part
-        inputs[:, part.inputs] += (self._plan @ z).reshape(self._steps, -1)
-        states[1:, part.states] += (self._motion @ z).reshape(self._steps, -1)
+        inputs[:, self._inputs] += self._plan.dot(z).reshape(self._steps, -1)
+        states[1:, self._states] += self._motion.dot(z).reshape(self._steps, -1)
+
+
+def _slice(index: Index) -> slice | Index:
+    """The same places as a slice, where they are one beside the other: it takes no copy."""
+    if not index.size or index[-1] - index[0] + 1 != index.size:
+        return index
+    return slice(int(index[0]), int(index[-1]) + 1)
 
 
 def _sides(c: Array) -> tuple[Index, Index]:
