@@ -23,6 +23,8 @@ def quantile(risk: Array) -> Array:
 
 def spent(room: Array, sigma: Array) -> Array:
     """Probability that a row is left whose mean keeps that room; all of the same shape."""
+    if np.count_nonzero(sigma) == sigma.size:
+        return np.asarray(ndtr(room / -sigma))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(sigma > 0.0, ndtr(-room / sigma), np.where(room < 0.0, 1.0, 0.0))
 
@@ -33,7 +35,7 @@ def binding(backoff: Array, room: Array, sigma: Array) -> Flags:
 
 
 def shifted(backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Flags) -> Array:
-    """Back-offs after risk has gone from the rows that do not bind to those that do.
+    """Back-offs after risk has gone from the rows that do not bind to those that do, in stages where some do.
 
     What does not bind keeps half of its room, so the plan at hand keeps all of them.
 
@@ -46,6 +48,8 @@ def shifted(backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Fl
     """
     farthest = np.maximum(backoff, _AWAY * sigma)
     kept = np.minimum(backoff + _KEEPS * np.maximum(room - backoff, 0.0), farthest)
+    count = binds.sum(axis=1)
     left = budgets - np.where(binds, 0.0, spent(kept, sigma)).sum(axis=1)
-    share = quantile(left / np.maximum(binds.sum(axis=1), 1))
-    return np.where(binds, share[:, None] * sigma, kept)
+    share = quantile(left / np.maximum(count, 1))
+    moved = np.where(binds, share[:, None] * sigma, kept)
+    return np.where(count[:, None] > 0, moved, backoff)

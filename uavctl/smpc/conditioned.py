@@ -265,12 +265,13 @@ class ConditionedSolver:
         for number in range(ROUNDS):
             if number:
                 binds = binding(backoff, now, sigma)
-                stages = np.flatnonzero(binds.any(axis=1))
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
                     break
+                stages = np.flatnonzero(binds.any(axis=1))
+                span = slice(int(stages[0]), int(stages[-1]) + 1)
                 backoff = backoff.copy()
-                backoff[stages] = shifted(backoff[stages], now[stages], sigma[stages], budgets[stages], binds[stages])
+                backoff[span] = shifted(backoff[span], now[span], sigma[span], budgets[span], binds[span])
             rooms = np.concatenate([(room - backoff).ravel(), hard, _OPEN])
             left, now = dict(left), now.copy()
             for one in todo:
