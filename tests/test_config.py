@@ -39,7 +39,7 @@ def changed(old: str, new: str) -> str:
 
 
 def test_presets_load_and_have_the_numbers_of_the_paper() -> None:
-    assert presets() == ("paper", "room")
+    assert presets() == ("paper", "room", "room-ardupilot", "room-px4")
     paper = load_config("paper")
     assert paper.plant.a[0] == (1.0, 0.79, 0.0, 0.0)
     assert (paper.smpc.horizon, paper.smpc.tau, paper.schedule.delays) == (12, 4, 5)
