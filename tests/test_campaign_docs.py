@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import pytest
 from uavctl.build import build_design
 from uavctl.campaign.read import read_campaign
 from uavctl.campaign.setting import Setting, met
+from uavctl.campaign.trial_read import is_trial, read_trial
 from uavctl.errors import DesignError
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "campaigns"
-FILES = sorted(FOLDER.glob("*.toml"))
+EVERY = sorted(FOLDER.glob("*.toml"))
+FILES = [file for file in EVERY if not is_trial(file)]
 # (file, controller, link that it believes in): there is no such design, as the file's head says.
 REFUSED = {
     *(("loss", "smpc as printed", f"{loss} %") for loss in range(40, 100, 10)),
@@ -22,7 +25,14 @@ REFUSED = {
 
 
 def test_they_are_there() -> None:
-    assert [file.stem for file in FILES] == ["bursts", "delay", "loss", "wrong-link", "wrong"]
+    assert [file.stem for file in EVERY] == ["bursts", "delay", "flights", "loss", "wrong-link", "wrong"]
+
+
+def test_the_flights_of_the_quadrotor_can_be_read_and_are_as_many_as_the_file_says() -> None:
+    (file,) = set(EVERY) - set(FILES)
+    spec, text = read_trial(file)
+    cells = math.prod(map(len, (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.controller, spec.link)))
+    assert spec.name == file.stem and f"{spec.runs} flights of each of {cells} cells" in text
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -16,7 +16,7 @@ from uavctl.campaign import pool
 from uavctl.campaign.pool import ONE_THREAD, processes
 from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.spec import CHUNK
-from uavctl.campaign.tasks import Columns, Task, tasks_of
+from uavctl.campaign.tasks import Columns, Work, tasks_of
 from uavctl.errors import UsageError
 
 ORPHAN = """
@@ -39,7 +39,7 @@ def test_a_worker_that_is_killed_is_replaced_and_nothing_is_lost(
     with processes(1) as crew:
         assert crew._pool.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
 
-        def keep(task: Task, columns: Columns) -> None:
+        def keep(task: Work, columns: Columns) -> None:
             if not kept:
                 os.kill(crew._pool.submit(os.getpid).result(), signal.SIGKILL)
             kept[task.name] = columns

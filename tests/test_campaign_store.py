@@ -13,7 +13,7 @@ from uavctl.campaign.again import again
 from uavctl.campaign.cells import cells_of, document
 from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.campaign.tasks import Task, fly_task, lost, tasks_of
+from uavctl.campaign.tasks import Task, fly_task, tasks_of
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UavctlError, UsageError
 
@@ -49,7 +49,7 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
 
 
 def test_rows_without_figures_are_kept(given: list[Task]) -> None:
-    rows = table_of(lost(given[1], "it died")).to_pylist()
+    rows = table_of(given[1].lost("it died")).to_pylist()
     assert len(rows) == 4 and rows[0]["error"] == "it died" and rows[0]["ages"] == []
     assert np.isnan(rows[0]["cost"]) and rows[0]["steps"] == 0
 

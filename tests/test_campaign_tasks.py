@@ -15,7 +15,7 @@ from uavctl.campaign import controllers, spec
 from uavctl.campaign.controllers import build
 from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.setting import met
-from uavctl.campaign.tasks import Columns, Task, fly_task, lost, tasks_of
+from uavctl.campaign.tasks import Columns, Task, Work, fly_task, tasks_of
 from uavctl.campaign.world import fly
 from uavctl.smpc.batch import News
 from uavctl.smpc.batch_smpc import BatchSmpc
@@ -119,7 +119,7 @@ class FakeCrew:
         self.submitted: list[str] = []
         self._broken = False
 
-    def submit(self, task: Task) -> Future[Columns]:
+    def submit(self, task: Work) -> Future[Columns]:
         future: Future[Columns] = Future()
         self.submitted.append(task.name)
         if self.deadly.get(task.name, 0):
@@ -128,7 +128,7 @@ class FakeCrew:
         if self._broken:
             future.set_exception(DeadError())
         else:
-            future.set_result(lost(task, ""))
+            future.set_result(task.lost(""))
         return future
 
     def broken(self, error: BaseException) -> bool:

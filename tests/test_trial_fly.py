@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools"))
 
 import flights
 
+from uavctl.config import Config
 from uavctl.data import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
 from uavctl.trial.case import AUTOPILOTS, TrialCell, TrialPilot, believed, blackout_s, flown, length_s
 from uavctl.trial.eight import eight
@@ -90,13 +92,19 @@ def test_the_room_is_that_of_the_state_limits_in_any_order_of_axes() -> None:
     assert lower.tolist() == [-3.0, -2.5, -2.5] and upper.tolist() == [3.0, 2.5, 0.0]
 
 
-def test_who_knows_the_link_is_made_for_it_and_its_design_for_the_configured_one() -> None:
+def test_who_knows_the_link_is_made_for_it_and_who_is_conditioned_needs_no_design_for_it() -> None:
     knows, designed = believed(replace(OURS, link=LOSES))
-    assert (knows.link.loss, designed.link.loss) == (0.6, 0.3)
+    assert (knows.link.loss, designed.link.loss) == (0.6, 0.0)
+    assert replace_link(designed, knows) == knows
+    unknowing = replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES)
+    assert believed(unknowing)[0].link.loss == 0.3
     printed = TrialPilot("printed", knows_link=True)
-    assert [one.link.loss for one in believed(replace(OURS, pilot=printed, link=("link.loss=0.2",)))] == [0.2, 0.2]
-    knows, designed = believed(replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES))
-    assert knows is designed and knows.link.loss == 0.3
+    knows, designed = believed(replace(OURS, pilot=printed, link=("link.loss=0.2",)))
+    assert knows is designed and knows.link.loss == 0.2
+
+
+def replace_link(one: Config, other: Config) -> Config:
+    return msgspec.structs.replace(one, link=other.link)
 
 
 def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:

@@ -32,38 +32,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from uavctl.errors import UavctlError
-from uavctl.trial.case import AUTOPILOTS, SCENARIOS, TrialCell, TrialPilot
+from uavctl.trial.case import AUTOPILOTS, SCENARIOS, Scenario, TrialCell, TrialPilot
+from uavctl.trial.figures import SHOWN
 from uavctl.trial.fly import TrialFlight, fly
 from uavctl.trial.own_loop import TUNED, OwnTuning
 
 SCHEMES = ("hahn-stursberg", "age-conditioned")
 PILOTS = ("configured", *SCHEMES, "own", "own-tuned")
 WIDTH = 170
-# Heading, figure, factor and digits, by scenario.
-FIGURES = {
-    "hold": (
-        ("hold rms cm", "hold_rms_m", 100.0, 1),
-        ("hold max cm", "hold_max_m", 100.0, 1),
-        ("to 0.3 m s", "near_s", 1.0, 1),
-        ("to 0.1 m s", "nearer_s", 1.0, 1),
-        ("beyond wall m", "beyond_m", 1.0, 2),
-    ),
-    "eight": (
-        ("tracking cm", "tracking_m", 100.0, 1),
-        ("tracking max cm", "tracking_max_m", 100.0, 1),
-        ("beyond wall m", "beyond_m", 1.0, 2),
-    ),
-    "blackout": (
-        ("beyond wall m", "blackout_beyond_m", 1.0, 2),
-        ("hold rms cm", "hold_rms_m", 100.0, 1),
-        ("to 0.3 m s", "near_s", 1.0, 1),
-    ),
-}
-COUNTS = (
-    ("limited %", "limited", 100.0, 0),
-    ("gave way %", "gave_way", 100.0, 1),
-    ("fallback %", "fallback", 100.0, 1),
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -196,15 +172,15 @@ def flights(cell: TrialCell, seeds: Sequence[int], seconds: float, from_s: float
 
 
 def _table(
-    scenario: str, cells: list[TrialCell], found: dict[TrialCell, list[TrialFlight]], given: argparse.Namespace
+    scenario: Scenario, cells: list[TrialCell], found: dict[TrialCell, list[TrialFlight]], given: argparse.Namespace
 ) -> Table:
     what = f"{scenario}, {given.seeds} seeds from {given.first}: median (worst)"
     table = Table(title=what, title_justify="left")
     for heading in ("autopilot", "Hz", "loss", "air", "pilot"):
         table.add_column(heading, no_wrap=True)
-    figures = (*FIGURES[scenario], *COUNTS)
-    for heading, *_ in figures:
-        table.add_column(heading, justify="right")
+    shown = SHOWN[scenario]
+    for one in shown:
+        table.add_column(one.heading, justify="right")
     table.add_column("ended")
     before: tuple[object, ...] = ()
     for cell in cells:
@@ -217,16 +193,9 @@ def _table(
         if not flown:
             table.add_row(*names, "refused")
             continue
-        told = [_told([factor * getattr(one, key) for one in flown], digits) for _, key, factor, digits in figures]
+        told = [figure.told([getattr(one, figure.key) for one in flown]) for figure in shown]
         table.add_row(*names, *told, " ".join(sorted({one.mode for one in flown})))
     return table
-
-
-def _told(values: list[float], digits: int) -> str:
-    """Median and worst; the larger, the worse."""
-    if any(map(math.isnan, values)):
-        return "-"
-    return f"{median(values):.{digits}f} ({max(values):.{digits}f})"
 
 
 def _name(cell: TrialCell) -> str:

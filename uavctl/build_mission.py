@@ -104,7 +104,7 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
         )
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
-    return along(plant, motion, design.horizon, design.settles, *_room(design, rests))
+    return along(plant, motion, design.horizon, design.settles, *resting_places(design, rests))
 
 
 def build_rests(design: Design) -> Array:
@@ -117,12 +117,12 @@ def build_rests(design: Design) -> Array:
 
 def _resting(design: AnyDesign, rests: Array) -> Room | None:
     try:
-        return room(design.plant, design.settles, *_room(design, rests))
+        return room(design.plant, design.settles, *resting_places(design, rests))
     except DesignError:
         return None
 
 
-def _room(design: AnyDesign, rests: Array) -> tuple[Array, Array]:
+def resting_places(design: AnyDesign, rests: Array) -> tuple[Array, Array]:
     """Least and largest place to rest at of each axis [m]."""
     index = design.plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)

@@ -14,8 +14,8 @@ from uavctl.config.checks import dimensions
 from uavctl.config.problem import Problem
 from uavctl.errors import ConfigError
 
-_CONFIGURATION = "the configuration"
-_OWN_PLACE = re.compile(rf"{_CONFIGURATION}:\d+: ")
+CONFIGURATION = "the configuration"
+_OWN_PLACE = re.compile(rf"{CONFIGURATION}:\d+: ")
 
 Placed = tuple[tuple[str, str], ...]  # (key path in the campaign's file, override) of each
 
@@ -101,7 +101,7 @@ def compose(spec: CampaignSpec, configuration: str, told: Told | None = None) ->
     told = told or Told(Source(spec.name, {}))
 
     def configured(overrides: Sequence[str]) -> Config:
-        return parse(configuration, _CONFIGURATION, overrides).config
+        return parse(configuration, CONFIGURATION, overrides).config
 
     base = configured(())
     links = [told.load(configured, _own(told, "link", i, one.set)) for i, one in enumerate(spec.link)]

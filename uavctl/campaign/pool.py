@@ -19,7 +19,7 @@ from multiprocessing.connection import wait
 from typing import Any, Protocol
 
 from uavctl import __version__
-from uavctl.campaign.tasks import Columns, Task, fly_task
+from uavctl.campaign.tasks import Columns, Work
 from uavctl.errors import UavctlError, UsageError
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -36,7 +36,7 @@ class Crew(Protocol):
 
     size: int
 
-    def submit(self, task: Task) -> Future[Columns]:
+    def submit(self, task: Work) -> Future[Columns]:
         """Have a task flown."""
         ...
 
@@ -56,10 +56,10 @@ class Processes:
         self.size = workers
         self._pool = _pool(workers)
 
-    def submit(self, task: Task) -> Future[Columns]:
+    def submit(self, task: Work) -> Future[Columns]:
         """See `Crew`."""
         try:
-            return self._pool.submit(fly_task, task)
+            return self._pool.submit(task.fly)
         except BrokenProcessPool as error:  # it broke under another task
             ended: Future[Columns] = Future()
             ended.set_exception(error)
@@ -103,9 +103,9 @@ class Cluster:
         self.size = size
         self._pool = pool
 
-    def submit(self, task: Task) -> Future[Columns]:
+    def submit(self, task: Work) -> Future[Columns]:
         """See `Crew`."""
-        return self._pool.submit(fly_task, task)
+        return self._pool.submit(task.fly)
 
     def broken(self, error: BaseException) -> bool:
         """See `Crew`."""

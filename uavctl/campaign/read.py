@@ -28,7 +28,7 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
-    text = _text(path)
+    text = text_of(path)
     table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
     source = Source(str(path), key_lines(text))
     found: list[Problem] = []
@@ -55,7 +55,12 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     return compose(spec, dump_config(base), told), text
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """The text of a campaign's file.
+
+    Raises:
+        ConfigError: It cannot be read.
+    """
     try:
         return read_text(path)
     except DataFileError as error:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 from uavctl.campaign.pool import Crew
-from uavctl.campaign.tasks import Columns, Task, lost
+from uavctl.campaign.tasks import Columns, Work
 
-Keep = Callable[[Task, Columns], None]
+Keep = Callable[[Work, Columns], None]
 _LOOK_S = 0.2
 _AHEAD = 2  # tasks for each worker: the one that it flies, and the next
 
 
-def fly_tasks(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[[], bool]) -> None:
+def fly_tasks(tasks: Iterable[Work], crew: Crew, keep: Keep, stopped: Callable[[], bool]) -> None:
     """Fly tasks and keep what comes of them, in any order.
 
     A task whose worker dies is flown once more, alone; if that ends the same way, its runs are kept as lost.
@@ -25,7 +25,7 @@ def fly_tasks(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[[
         stopped: Asked from time to time: whether to end. What is under way is still kept.
     """
     waiting = iter(tasks)
-    under_way: dict[Future[Columns], Task] = {}
+    under_way: dict[Future[Columns], Work] = {}
     while True:
         while len(under_way) < _AHEAD * crew.size and not stopped():
             task = next(waiting, None)
@@ -50,7 +50,7 @@ def fly_tasks(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[[
             _fly_alone(suspects, crew, keep, stopped)
 
 
-def _fly_alone(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[[], bool]) -> None:
+def _fly_alone(tasks: Iterable[Work], crew: Crew, keep: Keep, stopped: Callable[[], bool]) -> None:
     """Fly tasks one after the other, so that it is clear which of them takes its worker with it."""
     for task in tasks:
         if stopped():
@@ -60,11 +60,11 @@ def _fly_alone(tasks: Iterable[Task], crew: Crew, keep: Keep, stopped: Callable[
         if not _kept(future, task, crew, keep):
             if stopped():
                 return  # who asked for the end may have ended the worker too
-            keep(task, lost(task, "the worker died, twice"))
+            keep(task, task.lost("the worker died, twice"))
             crew.renew()
 
 
-def _kept(future: Future[Columns], task: Task, crew: Crew, keep: Keep) -> bool:
+def _kept(future: Future[Columns], task: Work, crew: Crew, keep: Keep) -> bool:
     """Keep what came of a task; False if its worker died."""
     error = future.exception()
     if error is None:

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from uavctl.campaign.tasks import Columns, Task
+from uavctl.campaign.tasks import Columns, Work
 from uavctl.errors import UavctlError, UsageError
 
 DOCUMENT, SPECIFICATION, RUNS, PARTS = "campaign.json", "campaign.toml", "runs.parquet", "parts"
@@ -53,10 +53,16 @@ SCHEMA = pa.schema(
 
 
 class Store:
-    """The folder of one campaign."""
+    """The folder of one campaign.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: The folder.
+        schema: Columns of the table of runs.
+    """
+
+    def __init__(self, folder: Path, schema: pa.Schema = SCHEMA) -> None:
         self.folder = folder
+        self._schema = schema
         self._parts = folder / PARTS
 
     @contextmanager
@@ -101,11 +107,11 @@ class Store:
         """Whether all runs are in the table."""
         return (self.folder / RUNS).exists()
 
-    def kept(self, tasks: Sequence[Task]) -> set[str]:
+    def kept(self, tasks: Sequence[Work]) -> set[str]:
         """Names of the tasks that are there."""
         return {task.name for task in tasks if self._part(task).exists()}
 
-    def keep(self, task: Task, columns: Columns) -> None:
+    def keep(self, task: Work, columns: Columns) -> None:
         """Write a task's rows; once this returns, they survive a kill.
 
         Raises:
@@ -113,10 +119,10 @@ class Store:
         """
         draft = self._part(task).with_suffix(".draft")
         with self._disk():
-            pq.write_table(table_of(columns), draft, **_WRITER)
+            pq.write_table(table_of(columns, self._schema), draft, **_WRITER)
             _settle(draft, self._part(task))
 
-    def finish(self, tasks: Sequence[Task]) -> Path:
+    def finish(self, tasks: Sequence[Work]) -> Path:
         """Put all parts together, in order, and remove them.
 
         Raises:
@@ -126,7 +132,7 @@ class Store:
         with self._disk():
             if not self.complete():
                 draft = path.with_suffix(".draft")
-                with pq.ParquetWriter(draft, SCHEMA, **_WRITER) as writer:
+                with pq.ParquetWriter(draft, self._schema, **_WRITER) as writer:
                     for _, of_cell in groupby(tasks, lambda task: task.cell):
                         table = pa.concat_tables([self._read(task) for task in of_cell]).combine_chunks()
                         writer.write_table(table, row_group_size=_GROUP_ROWS)
@@ -145,12 +151,12 @@ class Store:
                 f"{self.folder}: {error.strerror or error}; make room or mend it, and go on with --resume"
             ) from error
 
-    def _part(self, task: Task) -> Path:
+    def _part(self, task: Work) -> Path:
         return self._parts / f"{task.name}.parquet"
 
-    def _read(self, task: Task) -> pa.Table:
+    def _read(self, task: Work) -> pa.Table:
         try:
-            return pq.read_table(self._part(task), schema=SCHEMA)
+            return pq.read_table(self._part(task), schema=self._schema)
         except (pa.ArrowException, OSError) as error:
             raise UavctlError(f"{self._part(task)} is damaged ({error}); remove it and go on with --resume") from error
 
@@ -168,13 +174,13 @@ class Store:
         _write(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")  # the last: now it is one
 
 
-def table_of(columns: Columns) -> pa.Table:
+def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
     """Rows of a task as they are stored."""
     arrays = []
-    for name in SCHEMA.names:
-        field, values = SCHEMA.field(name), columns[name]
+    for name in schema.names:
+        field, values = schema.field(name), columns[name]
         arrays.append(_histograms(values) if name == "ages" else pa.array(values, type=field.type, from_pandas=False))
-    return pa.Table.from_arrays(arrays, schema=SCHEMA)
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def first_difference(there: object, here: object, path: str = "") -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,33 @@ _REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap")
 _AT_LIMIT = 1e-9
 
 
+class Work(Protocol):
+    """What a worker is given: some runs of a cell, in any world."""
+
+    @property
+    def cell(self) -> int:
+        """Index of the cell."""
+        ...
+
+    @property
+    def runs(self) -> int:
+        """How many."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Names it within its campaign; sorts as the rows do."""
+        ...
+
+    def fly(self) -> Columns:
+        """Fly the runs; what raises is told in a row, and stops nothing."""
+        ...
+
+    def lost(self, error: str) -> Columns:
+        """The rows of runs that all ended without figures."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Task:
     """Runs `first` … `first` + `runs` - 1 of a cell."""
@@ -36,7 +64,20 @@ class Task:
     @property
     def name(self) -> str:
         """Names it within its campaign; sorts as the rows do."""
-        return f"{self.cell:05d}-{self.first:08d}"
+        return name_of(self.cell, self.first)
+
+    def fly(self) -> Columns:
+        """See `fly_task`."""
+        return fly_task(self)
+
+    def lost(self, error: str) -> Columns:
+        """The rows of a task whose runs all ended without figures."""
+        return _without_figures(self, self.first, self.runs, error)
+
+
+def name_of(cell: int, first: int) -> str:
+    """Name of a task that begins with a run of a cell; sorts as the rows do."""
+    return f"{cell:05d}-{first:08d}"
 
 
 def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:
@@ -57,17 +98,12 @@ def fly_task(task: Task) -> Columns:
     try:
         built(task.recipe)
     except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
-        return lost(task, _told(error))
+        return task.lost(told_of(error))
     try:
         return _figures(task, task.first, task.runs)
     except Exception:  # noqa: BLE001 as above
         rows = [_alone(task, task.first + i) for i in range(task.runs)]
         return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-
-
-def lost(task: Task, error: str) -> Columns:
-    """The rows of a task whose runs all ended without figures."""
-    return _without_figures(task, task.first, task.runs, error)
 
 
 def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:
@@ -84,10 +120,11 @@ def _alone(task: Task, run: int) -> Columns:
     try:
         return _figures(task, run, 1)
     except Exception as error:  # noqa: BLE001 as above
-        return _without_figures(task, run, 1, _told(error))
+        return _without_figures(task, run, 1, told_of(error))
 
 
-def _told(error: Exception) -> str:
+def told_of(error: Exception) -> str:
+    """What ended a run, in words."""
     return f"{type(error).__name__}: {error}"
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,7 @@ from rich.table import Table
 from uavctl.errors import UsageError
 
 try:
-    import pyarrow  # noqa: F401 everything below needs it
+    import pyarrow  # everything below needs it
 except ImportError as missing:
     raise UsageError("campaigns are kept by pyarrow, which is not there; install uavctl[campaign]") from missing
 
@@ -32,12 +33,18 @@ from uavctl.campaign.read import read_campaign
 from uavctl.campaign.run import fly_tasks
 from uavctl.campaign.spec import MOST_RUNS
 from uavctl.campaign.statistics import CellSummary, summarise
-from uavctl.campaign.store import Store
-from uavctl.campaign.tasks import Columns, Task, tasks_of
+from uavctl.campaign.store import SCHEMA, Store
+from uavctl.campaign.tasks import Columns, Work, tasks_of
+from uavctl.campaign.trial_cells import SCHEMA as TRIALS
+from uavctl.campaign.trial_cells import places_of, trial_document, trial_tasks
+from uavctl.campaign.trial_page import write_trial_report
+from uavctl.campaign.trial_read import is_trial, read_trial
+from uavctl.campaign.trial_results import summarise_trial
 from uavctl.cli import INTERRUPTED, refly_cmd
 from uavctl.cli.common import WORKERS, Common, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.cli.prepare import ready_library
+from uavctl.cli.trial_picture import TrialResult, trial_picture
 
 _NAMES = ("controller", "link", "disturbance", "plant")
 
@@ -78,6 +85,8 @@ def campaign(
 ) -> int:
     """Fly a grid of controllers, links, disturbances and plants, each on the same noise and the same losses.
 
+    With `world = "quadrotor"` in its file it is flights of the true vehicle, beside its own position loop.
+
     The results do not depend on the number of workers, nor on where they are. Every finished task is kept at once: a
     campaign that was interrupted or killed goes on with --resume.
     """
@@ -91,31 +100,77 @@ def campaign(
         flight = refly_cmd.refly(spec, refly, out)
         Common(json=json).show(flight, lambda: refly_cmd.picture(flight))
         return 0 if flight.summary.steps else 1
-    read, text = read_campaign(spec, runs)
+    given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
     begun = time.perf_counter()
-    store = Store(out or _new_folder(read.spec.name))
+    store = Store(out or _new_folder(given.name), given.schema)
     store.check(resume)  # the designs may take minutes
     try:
-        cells = cells_of(read, ready_library)
-        tasks = list(tasks_of(cells))
-        with store.opened(document(read, cells), text, resume):
+        described, tasks = given.prepare()
+        with store.opened(described, given.text, resume):
             if not store.complete() and not _fly(store, tasks, _crew(dask, workers)):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
             _tell("writing the page")
-            report = write_report(store.folder)
+            report = given.write(store.folder)
     except KeyboardInterrupt:
         _tell(_interrupted(store, spec, runs))
         return INTERRUPTED
-    result = CampaignResult(
-        name=read.spec.name,
-        runs_file=str(runs_file),
-        report=str(report),
-        wall_s=time.perf_counter() - begun,
-        cells=summarise(store.folder),
-    )
-    Common(json=json).show(result, lambda: _picture(result))
-    return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
+    shared = {"name": given.name, "runs_file": str(runs_file), "report": str(report)}
+    return given.conclude(store.folder, shared, time.perf_counter() - begun, json)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A campaign of either world.
+
+    Attributes:
+        name: Its name.
+        text: Of its file.
+        schema: Of its table of runs.
+        prepare: Makes what `campaign.json` holds, and all tasks.
+        write: Writes the page into a folder.
+        conclude: Shows what came of a folder; gives the exit code.
+    """
+
+    name: str
+    text: str
+    schema: pyarrow.Schema
+    prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
+    write: Callable[[Path], Path]
+    conclude: Callable[[Path, dict[str, str], float, bool], int]
+
+
+def _of_runs(spec: Path, runs: int | None) -> _Given:
+    """A campaign in the linear world."""
+    read, text = read_campaign(spec, runs)
+
+    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+        cells = cells_of(read, ready_library)
+        return document(read, cells), list(tasks_of(cells))
+
+    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
+        result = CampaignResult(**shared, wall_s=wall_s, cells=summarise(folder))
+        Common(json=json).show(result, lambda: _picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
+
+    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, conclude)
+
+
+def _of_trials(path: Path, runs: int | None) -> _Given:
+    """A campaign in the world of the quadrotor."""
+    spec, text = read_trial(path, runs)
+
+    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+        places = places_of(spec, ready_library)
+        return trial_document(spec, places), list(trial_tasks(spec, places))
+
+    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
+        _, cells = summarise_trial(folder)
+        result = TrialResult(**shared, wall_s=wall_s, cells=cells)
+        Common(json=json).show(result, lambda: trial_picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in cells) else 1
+
+    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, conclude)
 
 
 def _new_folder(name: str) -> Path:
@@ -127,7 +182,7 @@ def _crew(dask: str | None, workers: int | None) -> AbstractContextManager[Crew]
     return processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
 
 
-def _fly(store: Store, tasks: list[Task], crew: AbstractContextManager[Crew]) -> bool:
+def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Crew]) -> bool:
     """Fly the tasks that are not there; False if it was interrupted."""
     kept = store.kept(tasks)
     left = [task for task in tasks if task.name not in kept]
@@ -135,7 +190,7 @@ def _fly(store: Store, tasks: list[Task], crew: AbstractContextManager[Crew]) ->
         return True
     with stop_on_signals() as stopped, crew as flying, _progress(tasks, kept) as advance:
 
-        def keep(task: Task, columns: Columns) -> None:
+        def keep(task: Work, columns: Columns) -> None:
             store.keep(task, columns)
             advance(task)
 
@@ -144,7 +199,7 @@ def _fly(store: Store, tasks: list[Task], crew: AbstractContextManager[Crew]) ->
 
 
 @contextmanager
-def _progress(tasks: list[Task], kept: set[str]) -> Iterator[Callable[[Task], None]]:
+def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     left = (TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, *left, console=messages(), transient=True) as progress:

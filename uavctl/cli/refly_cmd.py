@@ -15,6 +15,7 @@ from uavctl.build import design_of
 from uavctl.campaign.again import again
 from uavctl.campaign.refly import Agreement, Reflight, agreement, reflight
 from uavctl.campaign.results import read_cells
+from uavctl.campaign.trial_results import told_trial
 from uavctl.campaign.verdict import SMPC
 from uavctl.cli.engagement import Engagement
 from uavctl.cli.flying import new_recording
@@ -44,6 +45,11 @@ def refly(folder: Path, which: str, out: Path | None) -> Reflown:
         UavctlError: The campaign cannot be read, or this version would make another design of it.
     """
     cell, run = _numbers(which)
+    if told_trial(folder) is not None:
+        raise UsageError(
+            f"{folder} holds flights of the quadrotor; fly one again by `uavctl loopback` with its configuration, "
+            "sim.plant = quadrotor and sim.seed as in runs.parquet"
+        )
     _check_kind(folder, cell)
     found = again(folder, cell, run, ready_library)
     return fly_again(reflight(found, f"{found.campaign}, cell {cell}, run {run}"), out)

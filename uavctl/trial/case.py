@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from uavctl.config import Config, load_config
+from uavctl.config import Config, load_config, parse
 from uavctl.data import Vec3
 from uavctl.trial.eight import CENTRE_M, eight
 from uavctl.trial.own_loop import OwnTuning
@@ -33,10 +34,11 @@ class TrialPilot:
 
     Attributes:
         name: What it is called.
-        config: Preset or file that it is made from.
+        config: Preset or file that it is made from; what messages call it, where there is a text.
         overrides: Of it.
         own: How the vehicle is set up that flies by its own position loop; None where ours flies.
         knows_link: Whether it is designed for the link that it meets; else for that of its configuration.
+        text: TOML text that it is made from instead, for who has not the file; empty for none.
     """
 
     name: str
@@ -44,6 +46,16 @@ class TrialPilot:
     overrides: tuple[str, ...] = ()
     own: OwnTuning | None = None
     knows_link: bool = False
+    text: str = ""
+
+    def load(self, overrides: Sequence[str]) -> Config:
+        """Its configuration with its own and further overrides.
+
+        Raises:
+            ConfigError: An override is none.
+        """
+        every = (*self.overrides, *overrides)
+        return parse(self.text, self.config, every).config if self.text else load_config(self.config, every)
 
 
 @dataclass(frozen=True)
@@ -89,24 +101,24 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
     if cell.scenario == "blackout":
         begin = blackout_s(seed)
         more.append(f"link.blackout=[[{begin}, {begin + BLACKOUT_S}]]")
-    return _with_mission(load_config(cell.pilot.config, (*cell.pilot.overrides, *more)), cell.scenario)
+    return _with_mission(cell.pilot.load(more), cell.scenario)
 
 
 def believed(cell: TrialCell) -> tuple[Config, Config]:
     """The configurations that a controller of ours and its design are made from.
 
-    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for the link that it meets:
-    of the design, which is then that of the configured link, it has names and places alone.
+    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for its link: of the design,
+    which is then that of a link without losses, it has names and places alone.
 
     Raises:
         ConfigError: An override is none.
     """
-    overrides = (*cell.pilot.overrides, f"sim.autopilot={cell.autopilot}")
-    configured = _with_mission(load_config(cell.pilot.config, overrides), cell.scenario)
-    if not cell.pilot.knows_link:
-        return configured, configured
-    knowing = _with_mission(load_config(cell.pilot.config, (*overrides, *cell.link)), cell.scenario)
-    return knowing, configured if knowing.conditioned else knowing
+    overrides = (f"sim.autopilot={cell.autopilot}", *(cell.link if cell.pilot.knows_link else ()))
+    knows = _with_mission(cell.pilot.load(overrides), cell.scenario)
+    if not knows.conditioned:
+        return knows, knows
+    replace = msgspec.structs.replace
+    return knows, replace(knows, link=replace(knows.link, model="bernoulli", loss=0.0, probability=()))
 
 
 def blackout_s(seed: int) -> float:

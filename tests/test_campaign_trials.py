@@ -1,0 +1,165 @@
+"""Campaigns of flights of the quadrotor: read, flown, kept, resumed, summed up."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from uavctl.campaign import trial_cells
+from uavctl.campaign.store import Store, table_of
+from uavctl.campaign.trial_cells import CHUNK, SCHEMA, TrialTask, places_of, seed_of, trial_document, trial_tasks
+from uavctl.campaign.trial_page import trial_html
+from uavctl.campaign.trial_read import is_trial, read_trial
+from uavctl.campaign.trial_results import summarise_trial
+from uavctl.cli.app import run
+from uavctl.cli.prepare import ready_library
+from uavctl.errors import ConfigError
+from uavctl.trial.case import TrialCell
+from uavctl.trial.fly import TrialFlight, fly
+
+RUNS = CHUNK + 1  # two tasks a cell
+HEAD = f"""
+name = "small"
+world = "quadrotor"
+config = "room"
+set = ["smpc.scheme=age-conditioned", "link.loss=0.4"]
+runs = {RUNS}
+seconds = 2.0
+from_s = 1.0
+scenario = ["hold", "blackout"]
+autopilot = ["ardupilot"]
+rate_hz = [20.0]
+"""
+OWN = '[[controller]]\nname = "own loop"\nkind = "own-loop"\ntuned = true\n'
+OURS = '[[controller]]\nname = "ours"\nkind = "smpc"\n'
+REFUSED = '[[controller]]\nname = "too sure"\nkind = "smpc"\nset = ["smpc.delta_x=0.99999999999"]\n'
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "small.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign flown by one worker."""
+    folder = tmp_path_factory.mktemp("trials")
+    spec = written(folder, HEAD + OWN + OURS + REFUSED)
+    assert run(["campaign", str(spec), "--workers", "1", "--out", str(folder / "one")]) == 0
+    return folder / "one"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (HEAD + OWN + OWN, 'controller[1].name: "own loop" is there twice'),
+        (HEAD + OWN + 'set = ["smpc.horizon=10"]\n', "the vehicle's own loop has no design"),
+        (HEAD + OURS + "tuned = true\n", "controller[0].tuned"),
+        (HEAD + OURS + 'set = ["smpc.horizonn=10"]\n', "smpc.horizonn"),
+        (HEAD + OWN + '[[link]]\nname = "x"\nset = ["cost.input=[1]"]\n', "is no key of [link]"),
+        (HEAD.replace("from_s = 1.0", "from_s = 2.0") + OWN, "from_s: 2 s is not within the flight"),
+        (HEAD.replace('"hold", ', '"loop", ') + OWN, "scenario"),
+        (HEAD + "steps = 4\n" + OWN, "steps"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: str, told: str) -> None:
+    file = written(tmp_path, text)
+    assert is_trial(file)
+    with pytest.raises(ConfigError) as caught:
+        read_trial(file)
+    assert told in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path) -> None:
+    spec, _ = read_trial(written(tmp_path, HEAD + OWN + OURS))
+    places = places_of(spec, lambda config, design: None)
+    assert [(one.cell.scenario, one.cell.pilot.name) for one in places] == [
+        ("hold", "own loop"), ("hold", "ours"), ("blackout", "own loop"), ("blackout", "ours")
+    ]  # fmt: skip
+    tasks = list(trial_tasks(spec, places))
+    assert [(one.cell, one.first, one.runs) for one in tasks] == [
+        (c, f, r) for c in range(4) for f, r in ((0, 5), (5, 1))
+    ]
+    assert len({seed_of(spec.master, i) for i in range(1000)}) == 1000
+    assert seed_of(0, 3) != seed_of(1, 3)
+    ours, own = places[1], places[0]
+    assert ours.usable_room is not None and 0.3 < ours.usable_room < 1.0
+    assert (own.usable_room, own.design_id) == (None, None)
+
+
+def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
+    rows = pq.read_table(flown / "runs.parquet").to_pylist()
+    assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
+    assert not any(row["error"] for row in rows)
+    spec, _ = read_trial(flown.parent / "small.toml")
+    cell = places_of(spec, ready_library)[1].cell
+    alone = fly(cell, seed_of(spec.master, 5), seconds=2.0, from_s=1.0)
+    row = next(row for row in rows if (row["cell"], row["run"]) == (1, 5))
+    for name in (*trial_cells.REAL, "positions", "mode", "seed"):
+        assert row[name] == getattr(alone, name) or np.isnan(row[name]), name
+
+
+def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
+    path = flown.parent / "small.toml"
+    spec, text = read_trial(path)
+    places = places_of(spec, ready_library)
+    tasks, store = list(trial_tasks(spec, places)), Store(tmp_path / "two", SCHEMA)
+    with store.opened(trial_document(spec, places), text, resume=False):
+        for task in tasks[3::-2]:
+            store.keep(task, task.fly())
+    assert run(["campaign", str(path), "--workers", "2", "--out", str(store.folder), "--resume"]) == 0
+    assert (store.folder / "runs.parquet").read_bytes() == (flown / "runs.parquet").read_bytes()
+    assert run(["campaign", str(path), "--runs", "2", "--out", str(store.folder), "--resume"]) != 0
+
+
+def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFlight:
+        if seed == seed_of(0, 1):
+            raise RuntimeError("no more")
+        return TrialFlight(seed, hold_rms_m=0.5, mode="GUIDED")
+
+    spec, _ = read_trial(written(tmp_path, HEAD + OWN))
+    task = next(trial_tasks(spec, places_of(spec, ready_library)))
+    monkeypatch.setattr(trial_cells, "fly", fails)
+    rows = table_of(task.fly(), SCHEMA).to_pylist()
+    assert [row["error"] for row in rows] == ["", "RuntimeError: no more", "", "", ""]
+    assert [row["hold_rms_m"] for row in rows] == pytest.approx([0.5, np.nan, 0.5, 0.5, 0.5], nan_ok=True)
+    dead = table_of(replace(task, runs=2).lost("it died"), SCHEMA).to_pylist()
+    assert [(row["run"], row["error"]) for row in dead] == [(0, "it died"), (1, "it died")]
+
+
+def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> None:
+    rows = pq.read_table(flown / "runs.parquet").to_pylist()
+    told, cells = summarise_trial(flown)
+    assert [cell.place.refused[:12] for cell in cells] == ["", "", "smpc.delta_x"] * 2
+    for cell in cells:
+        mine = [row for row in rows if row["cell"] == cell.place.index]
+        assert (cell.runs, cell.failed) == (len(mine), 0)
+        if mine:
+            holds = [row["hold_rms_m"] for row in mine]
+            assert cell.median["hold_rms_m"] == median(holds) and cell.worst["hold_rms_m"] == max(holds)
+            assert cell.modes == {"GUIDED": RUNS}
+    page = trial_html(told, cells)
+    assert "own loop" in page and "Not flown, or failed" in page and "too sure" in page
+
+
+def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flown.parent / "small.toml"
+    capsys.readouterr()
+    assert run(["campaign", str(path), "--out", str(flown), "--resume", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [cell["place"]["controller"] for cell in document["cells"]] == ["own loop", "ours", "too sure"] * 2
+    assert run(["campaign", "--refly", "0:0", str(flown)]) == 2
+    assert "flights of the quadrotor" in capsys.readouterr().err
+
+
+def test_a_task_s_name_sorts_as_its_rows() -> None:
+    names = [TrialTask(cell, first, 1, None, 1.0, 0.0, 0).name for cell in (0, 9, 10) for first in (0, 5, 95)]  # type: ignore[arg-type]
+    assert names == sorted(names)
