@@ -41,6 +41,6 @@ def write(folder: Path, cells: Sequence[Mapping[str, Any]], rows: Sequence[Mappi
     count = max((row["run"] for row in rows), default=0) + 1
     told = {"version": 1, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count, "steps": STEPS}
     (folder / "campaign.json").write_bytes(msgspec.json.encode({**told, "cells": list(cells)}))
-    fields = [(name, _TYPES.get(name, pa.float64())) for name in runs(0, [1.0])[0]]
+    fields = [(name, _TYPES.get(name, pa.float64())) for name in (rows or runs(0, [1.0]))[0]]
     pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=pa.schema(fields)), folder / "runs.parquet")
     return folder

@@ -20,8 +20,9 @@ from uavctl.config import Config
 from uavctl.data import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
 from uavctl.trial.case import AUTOPILOTS, TrialCell, TrialPilot, believed, blackout_s, flown, length_s
 from uavctl.trial.eight import eight
-from uavctl.trial.fly import FlightTally, fly, room_of
+from uavctl.trial.fly import FlightTally, fly
 from uavctl.trial.own_loop import OwnTuning
+from uavctl.trial.room import room_of
 
 OWN = TrialCell(TrialPilot("own", own=OwnTuning()), "hold", "ardupilot", 20.0, "30 %", ("link.loss=0.3",), "gusts")
 LOSES = ("link.loss=0.6",)

@@ -17,7 +17,9 @@ from uavctl.smpc.components import decompose
 from uavctl.smpc.conditioned_design import AnyDesign
 from uavctl.smpc.design import Design
 from uavctl.smpc.equilibria import equilibria
+from uavctl.smpc.plant import Plant
 from uavctl.smpc.program import terminal_backoff_x
+from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
 
@@ -104,7 +106,8 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
         )
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
-    return along(plant, motion, design.horizon, design.settles, *resting_places(design, rests))
+    places = resting_places(design.plant, design.state_set, rests)
+    return along(plant, motion, design.horizon, design.settles, *places)
 
 
 def build_rests(design: Design) -> Array:
@@ -117,16 +120,17 @@ def build_rests(design: Design) -> Array:
 
 def _resting(design: AnyDesign, rests: Array) -> Room | None:
     try:
-        return room(design.plant, design.settles, *resting_places(design, rests))
+        places = resting_places(design.plant, design.state_set, rests)
+        return room(design.plant, design.settles, *places)
     except DesignError:
         return None
 
 
-def resting_places(design: AnyDesign, rests: Array) -> tuple[Array, Array]:
-    """Least and largest place to rest at of each axis [m]."""
-    index = design.plant.position_index
+def resting_places(plant: Plant, state_set: Polytope, rests: Array) -> tuple[Array, Array]:
+    """Least and largest place to rest at of each axis [m], by the right sides (m_x,) at rest."""
+    index = plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
-    for c, side in zip(design.state_set.c, rests, strict=True):
+    for c, side in zip(state_set.c, rests, strict=True):
         (used,) = np.nonzero(c)
         if used.size == 1 and used[0] in index:
             axis, place = index.index(int(used[0])), side / c[used[0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from itertools import product
 
@@ -15,6 +16,7 @@ from uavctl.campaign.verdict import SMPC
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import PidGains
+from uavctl.trial.room import usable_seen
 
 VERSION = 1
 
@@ -130,8 +132,18 @@ def told(cell: Cell) -> dict[str, object]:
         "promised_u": None if delta_u is None else 1.0 - delta_u,
         "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
         "link_loss": _plain_loss(cell.setting.link),
+        "usable_room": None if smpc is None or recipe is None else _usable(recipe),
         "refused": cell.refused,
     }
+
+
+def _usable(recipe: Recipe) -> float | None:
+    """Share of the room in which a plan may rest; None where a wall is open, or the plant cannot rest anywhere."""
+    try:
+        share = usable_seen(recipe.config, recipe.design)
+    except DesignError:
+        return None
+    return share if math.isfinite(share) else None
 
 
 def _gains(gains: PidGains) -> dict[str, list[float]]:

@@ -74,6 +74,7 @@ def _sections(view: View) -> Iterator[Section]:
     yield _difference_section(view)
     for place, (scene, cells) in enumerate(view.scenes.items()):
         yield from _scene_section(view, scene, cells, f"s{place}")
+    yield from _ways_section(view)
     yield _age_section(view)
     yield _cells_section(view)
     yield _failures_section(view)
@@ -166,6 +167,38 @@ def _age_section(view: View) -> Section:
         return Section("Age of information", "", page.paragraph("No run ended in order."))
     figures = page.wide_or_narrow(*plots.ages(view.cells, view.results))
     return Section("Age of information", note, legend(plots.age_entries(view.cells)) + figures)
+
+
+def _ways_section(view: View) -> Iterator[Section]:
+    """Of a room with walls; a box of other units has none that a vehicle could touch."""
+    if all(cell.beyond_m is None for cell in view.cells):
+        return
+    columns = (
+        "controller",
+        "where",
+        "to 0.3 m [s]",
+        "to 0.1 m [s]",
+        "hold, rms [m]",
+        "beyond a wall [m]",
+        "usable room",
+    )
+    rows = [
+        (
+            cell.controller,
+            view.place(group_of(cell)),
+            *("–" if value is None else f"{value:.3g}" for value in (cell.near_s, cell.nearer_s, cell.hold_rms_m)),
+            "–" if cell.beyond_m is None else f"{cell.beyond_m:.2f}",
+            "–" if cell.usable_room is None else f"{percent(cell.usable_room)}",
+        )
+        for cell in view.cells
+        if not cell.refused
+    ]
+    note = (
+        "To 0.3 m, to 0.1 m: first time so near to the target, median of the runs. Hold: distance from it in the "
+        "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
+        "room: share of it in which a plan may rest."
+    )
+    yield Section("Through the room", note, _table(columns, rows, frozenset(range(2, 7))))
 
 
 _COLUMNS = (

@@ -30,6 +30,7 @@ _FIGURES = (
     "fallbacks",
     "largest_gap",
 )
+_SINCE = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions have them not
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,6 +46,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     promised_x: float | None = None  # 1 - δ_x
     promised_u: float | None = None  # 1 - δ_u
     design_id: str | None = None
+    usable_room: float | None = None  # share of it in which a plan may rest
     link_loss: float | None = None  # of the flown link, where losses are independent and nothing else acts
 
 
@@ -155,10 +157,16 @@ def _of_cell(table: pa.Table, index: int) -> Runs:
     failed = tuple((int(numbers[i]), errors[i] or "the cost is not a finite number") for i in np.flatnonzero(~good))
     return Runs(
         index=numbers[good],
-        figures={name: rows[name].to_numpy()[good].astype(np.float64) for name in _FIGURES},
+        figures={name: _column(rows, name, good) for name in (*_FIGURES, *_SINCE)},
         ages=_histogram(rows["ages"], good),
         failed=failed,
     )
+
+
+def _column(rows: pa.Table, name: str, good: NDArray[np.bool_]) -> Values:
+    if name in _SINCE and name not in rows.column_names:
+        return np.full(int(good.sum()), np.nan)
+    return np.asarray(rows[name].to_numpy()[good], dtype=np.float64)
 
 
 def _histogram(lists: pa.ChunkedArray, good: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -56,6 +58,11 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     largest_gap: float | None
     mean_age: float | None  # steps
     ages: list[int]  # steps at age 0, 1, …
+    near_s: float | None = None  # first time within 0.3 m of the target, median; null if half of them never were
+    nearer_s: float | None = None  # the same for 0.1 m
+    hold_rms_m: float | None = None  # distance from it in the second half of a run, median
+    beyond_m: float | None = None  # furthest beyond a wall of all runs; negative is the room that was left
+    usable_room: float | None = None  # share of it in which a plan may rest
 
 
 def summarise(folder: Path) -> list[CellSummary]:
@@ -109,7 +116,18 @@ def cell_summary(results: Results, cell: Cell) -> CellSummary:
         largest_gap=float(gaps.max()) if gaps.size else None,
         mean_age=float(np.average(np.arange(runs.ages.size), weights=runs.ages)) if ages.size else None,
         ages=runs.ages.tolist(),
+        near_s=_finite(np.median, runs["near_s"]),
+        nearer_s=_finite(np.median, runs["nearer_s"]),
+        hold_rms_m=_finite(np.median, runs["hold_rms_m"]),
+        beyond_m=_finite(np.max, runs["beyond_m"]),
+        usable_room=cell.usable_room,
     )
+
+
+def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
+    """A figure of values; None of none, and where it is infinite or none."""
+    found = float(figure(values)) if values.size else math.nan
+    return found if math.isfinite(found) else None
 
 
 def difference(a: Runs, b: Runs, column: str, per: float = 1.0) -> Difference | None:

@@ -48,6 +48,10 @@ SCHEMA = pa.schema(
         ("age_sum", _I64),
         ("ages", pa.list_(_I64)),
         ("largest_gap", _F64),
+        ("near_s", _F64),
+        ("nearer_s", _F64),
+        ("hold_rms_m", _F64),
+        ("beyond_m", _F64),
     ]
 )
 

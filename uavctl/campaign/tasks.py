@@ -13,6 +13,7 @@ from uavctl.campaign.cells import Cell
 from uavctl.campaign.controllers import Recipe, built
 from uavctl.campaign.setting import Setting, met
 from uavctl.campaign.spec import CHUNK
+from uavctl.campaign.ways import ways
 from uavctl.campaign.world import Flown, fly
 from uavctl.smpc.batch_smpc import Tally
 
@@ -20,7 +21,8 @@ Columns = dict[str, NDArray[np.generic]]
 
 _MET = ("decisions", "infeasible", "slack_used", "fallbacks")
 _WHOLE = ("steps", "state_violations", "input_violations", "saturated", "max_age", *_MET)
-_REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap")
+_WAYS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")
+_REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap", *_WAYS)
 _AT_LIMIT = 1e-9
 
 
@@ -160,6 +162,7 @@ def _figures(task: Task, first: int, runs: int) -> Columns:
             "max_age": found.age.max(axis=1),
             "age_sum": found.age.sum(axis=1),
             "ages": np.stack([np.bincount(row, minlength=steps) for row in found.age]),
+            **ways(task.setting.base, found.states),
         }
     if tally is not None:
         for name in _MET:

@@ -20,8 +20,9 @@ from uavctl.config import Config, dump_config, load_config
 from uavctl.errors import DesignError
 from uavctl.smpc.design import Design
 from uavctl.trial.case import AutopilotName, TrialCell, TrialPilot, believed
-from uavctl.trial.fly import TrialFlight, fly, usable_room
+from uavctl.trial.fly import TrialFlight, fly
 from uavctl.trial.own_loop import TUNED, OwnTuning
+from uavctl.trial.room import usable_room
 
 VERSION = 1
 CHUNK = 5  # flights of a task: a minute or less

@@ -12,24 +12,22 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from sim.world import World
-from uavctl.build import build_controller, design_of, resting
-from uavctl.build_mission import resting_places
+from uavctl.build import build_controller, design_of
 from uavctl.config import Config
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.data import ControlMode, Decision, Flyer, Outgoing, Plan, Record, Setpoint, Vec3
 from uavctl.flight.controller import Controller
 from uavctl.library_store import library_for
 from uavctl.loop import ControlLoop
-from uavctl.smpc.conditioned_design import AnyDesign
 from uavctl.smpc.design import Design
 from uavctl.trial.case import TrialCell, believed, blackout_s, flown, length_s
 from uavctl.trial.metrics import beyond_m, distances_m, largest, mean, rms_m, settled_s
 from uavctl.trial.own_loop import Moment, OwnLoop, Path
+from uavctl.trial.room import room_of
 
 Array = NDArray[np.float64]
 
 SLACK = 1e-6  # more is slack that was used
-_AXES = ("north", "east", "down")
 _CONTROLLERS = 8  # kept at hand: their solvers take a second each to make
 
 
@@ -264,31 +262,6 @@ def _judged(
     if cell.scenario == "blackout":
         found["blackout_beyond_m"] = largest(beyond[times >= blackout_s(config.sim.seed)])
     return TrialFlight(seed=config.sim.seed, **found, **counts)  # type: ignore[arg-type]
-
-
-def room_of(config: Config) -> tuple[Array, Array]:
-    """Least and largest position in the room (3,); infinite where there is no wall."""
-    lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
-    index = config.plant.position_index or tuple(
-        config.plant.states_per_axis * i for i in range(len(config.plant.axes))
-    )
-    for axis, place in zip(config.plant.axes, index, strict=True):
-        lower[_AXES.index(axis)] = config.sets.state_lower[place]
-        upper[_AXES.index(axis)] = config.sets.state_upper[place]
-    return lower, upper
-
-
-def usable_room(config: Config, design: AnyDesign) -> float:
-    """Share of the room's volume in which a plan of ours may rest; NaN where a wall is open.
-
-    Raises:
-        DesignError: There is no such scheme.
-    """
-    lower, upper = room_of(config)
-    least, most = resting_places(design, resting(design))
-    axes = [_AXES.index(axis) for axis in config.plant.axes]
-    whole = (upper - lower)[axes]
-    return float(np.prod(np.clip(most - least, 0.0, None) / whole)) if np.isfinite(whole).all() else math.nan
 
 
 def _share(part: int, whole: int) -> float:
