@@ -27,6 +27,7 @@ from uavctl.trial.room import room_of
 
 Array = NDArray[np.float64]
 
+NEAR_M, NEARER_M = 0.3, 0.1  # of the target
 SLACK = 1e-6  # more is slack that was used
 _CONTROLLERS = 8  # kept at hand: their solvers take a second each to make
 
@@ -68,9 +69,6 @@ class TrialFlight:
     mode: str = ""
 
 
-NEAR_M, NEARER_M = 0.3, 0.1
-
-
 @dataclass
 class WatchedFlyer:
     """The true motion, tick by tick, under whoever flies; implements `uavctl.data.Flyer`.
@@ -104,6 +102,12 @@ class FlightTally:
 
     Attributes:
         begun_ns: Time of the first decision with somewhere to go to; None before.
+        setpoints: That were sent.
+        limited: Of them, that the last gate changed.
+        plans: That were made.
+        gave_way: Of them, that a constraint gave way in.
+        ticks: From the first such decision on.
+        fallen: Of them, in which no plan was flown.
         positions: That ticks were given.
     """
 
