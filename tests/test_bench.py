@@ -73,7 +73,7 @@ def told() -> list[tuple[str, int, int | None]]:
 def result(design: Design, library: Library, told: list[tuple[str, int, int | None]]) -> BenchResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_library", lambda *_: library)
-        conditioned = build_conditioned(load_config("paper"))
+        conditioned = build_conditioned(load_config("paper")).solver
         return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL, conditioned)
 
 

@@ -50,7 +50,7 @@ def test_who_is_never_near_has_no_time_and_a_steady_distance_is_held() -> None:
 
 def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
     config = load_config("room", ["smpc.scheme=age-conditioned"])
-    assert usable_seen(config, None) == pytest.approx(share(build_conditioned(config).rests(np.zeros((9, 9)))))
+    assert usable_seen(config, None) == pytest.approx(share(build_conditioned(config).solver.rests(np.zeros((9, 9)))))
     design = build_design(CONFIG)
     assert usable_seen(CONFIG, design) == pytest.approx(share(build_rests(design)))
     assert usable_seen(CONFIG, design) < usable_seen(config, None) < 1.0

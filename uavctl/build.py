@@ -300,7 +300,8 @@ def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     unexplained = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, LEAST_UNEXPLAINED_MPS2)
     lags: dict[str, float] = {}
     if config.plant.lag_s:
-        lags.update(zip(plant.axes, config.plant.lag_s, strict=True))
+        dead_s = config.plant.dead_time_s
+        lags.update((axis, dead_s + lag_s) for axis, lag_s in zip(plant.axes, config.plant.lag_s, strict=True))
     return EnvelopeParameters(
         axes=tuple(axis in plant.axes for axis in AXES),
         lower_m=_vec3(lower),

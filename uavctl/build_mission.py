@@ -106,8 +106,7 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
         )
         motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
     _check_limits(motion, design)
-    places = resting_places(design.plant, design.state_set, rests)
-    return along(plant, motion, design.horizon, design.settles, *places)
+    return along(plant, motion, design.horizon, design.settles, *resting_places(design.plant, design.state_set, rests))
 
 
 def build_rests(design: Design) -> Array:

@@ -77,7 +77,7 @@ def bench(
 def _conditioned_solver(config: Config) -> ConditionedSolver | None:
     """The solver of scheme `age-conditioned`; None where silence outlasts the horizon too often for it."""
     try:
-        return build_conditioned(config)
+        return build_conditioned(config).solver
     except DesignError:
         return None
 

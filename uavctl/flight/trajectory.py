@@ -61,7 +61,7 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Mo
         right.append(dt_s * velocities_mps[:, columns].ravel())
     loops = np.flatnonzero(_of_loops(plant))
     if loops.size:
-        rows.append(_FIRM * sparse.eye_array(n_x, n * n_x, format="csr")[loops])
+        rows.append(sparse.kron(sparse.eye_array(1, n), _FIRM * np.eye(n_x)[loops]))
         right.append(np.zeros(loops.size))
     seen = sparse.vstack(rows)
     now, then = sparse.eye_array(n - 1, n), sparse.eye_array(n - 1, n, k=1)
