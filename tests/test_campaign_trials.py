@@ -38,7 +38,7 @@ rate_hz = [20.0]
 """
 OWN = '[[controller]]\nname = "own loop"\nkind = "own-loop"\ntuned = true\n'
 OURS = '[[controller]]\nname = "ours"\nkind = "smpc"\n'
-REFUSED = '[[controller]]\nname = "too sure"\nkind = "smpc"\nset = ["smpc.delta_x=0.99999999999"]\n'
+REFUSED = '[[controller]]\nname = "too sure"\nkind = "smpc"\nset = ["smpc.horizon=3", "smpc.delta_x=0.99999999999"]\n'
 
 
 def written(folder: Path, text: str) -> Path:
@@ -138,7 +138,7 @@ def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypa
 def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
     told, cells = summarise_trial(flown)
-    assert [cell.place.refused[:12] for cell in cells] == ["", "", "smpc.delta_x"] * 2
+    assert [cell.place.refused[:12] for cell in cells] == ["", "", "smpc.horizon"] * 2
     for cell in cells:
         mine = [row for row in rows if row["cell"] == cell.place.index]
         assert (cell.runs, cell.failed) == (len(mine), 0)

@@ -80,8 +80,8 @@ def arrivals(samples: Iterable[PositionSample]) -> list[tuple[int, int]]:
 def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: AutopilotName) -> None:
     overheard, _, _ = flight_of_own(autopilot, AS_DELIVERED)
     one, sink = cell(OURS, autopilot), Samples()
-    knows, designed = believed(one)
-    World(flown(one, 3, SECONDS), ControlLoop(knows, controller_of(knows, designed), sink, lambda: 0)).run(SECONDS)
+    knows = believed(one)
+    World(flown(one, 3, SECONDS), ControlLoop(knows, controller_of(knows), sink, lambda: 0)).run(SECONDS)
     last_ns = max(received for _, received in arrivals(sink.seen))  # what comes after the last tick nobody uses
     own = [found for found in arrivals(overheard.own.samples) if found[1] <= last_ns]
     assert own == arrivals(sink.seen)

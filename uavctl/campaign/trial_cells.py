@@ -121,7 +121,7 @@ def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...
         library_for: Gives the policy library of a design.
     """
     text = dump_config(load_config(spec.config, spec.set))
-    made: dict[tuple[Config, Config], tuple[str | None, float | None, str]] = {}
+    made: dict[Config, tuple[str | None, float | None, str]] = {}
     axes = (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.link, spec.controller)
     places = []
     for index, (scenario, autopilot, rate_hz, air, link, controller) in enumerate(product(*axes)):
@@ -129,10 +129,10 @@ def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...
         cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, _settings(link), air)
         found: tuple[str | None, float | None, str] = (None, None, "")
         if pilot.own is None:
-            configs = believed(cell)
-            if configs not in made:
-                made[configs] = _designed(*configs, library_for)
-            found = made[configs]
+            config = believed(cell)
+            if config not in made:
+                made[config] = _designed(config, library_for)
+            found = made[config]
         places.append(TrialPlace(index, cell, controller.kind, *found))
     return tuple(places)
 
@@ -148,9 +148,9 @@ def _settings(link: LinkSpec) -> tuple[str, ...]:
     return tuple(link.set)
 
 
-def _designed(knows: Config, designed: Config, library_for: LibraryFor) -> tuple[str | None, float | None, str]:
+def _designed(knows: Config, library_for: LibraryFor) -> tuple[str | None, float | None, str]:
     try:
-        design = design_of(designed)
+        design = design_of(knows)
         stored = library_for(knows, design) if isinstance(design, Design) else None
         build_controller(knows, design, None if stored is None else stored.library)
         return design.design_id, usable_room(knows, design), ""

@@ -16,7 +16,8 @@ _HEAD = """# Configuration
 
 This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
 
-A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`: complete examples in
+A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`, `room-px4`, `room-ardupilot`:
+complete examples in
 `uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides any key, with a value as TOML writes
 it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string needs no quotes.
 Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are refused before anything starts,

@@ -104,21 +104,14 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
     return _with_mission(cell.pilot.load(more), cell.scenario)
 
 
-def believed(cell: TrialCell) -> tuple[Config, Config]:
-    """The configurations that a controller of ours and its design are made from.
-
-    Scheme `age-conditioned` takes no promise of a design's, and flies where there is none for its link: of the design,
-    which is then that of a link without losses, it has names and places alone.
+def believed(cell: TrialCell) -> Config:
+    """The configuration that a controller of ours is made from.
 
     Raises:
         ConfigError: An override is none.
     """
     overrides = (f"sim.autopilot={cell.autopilot}", *(cell.link if cell.pilot.knows_link else ()))
-    knows = _with_mission(cell.pilot.load(overrides), cell.scenario)
-    if not knows.conditioned:
-        return knows, knows
-    replace = msgspec.structs.replace
-    return knows, replace(knows, link=replace(knows.link, model="bernoulli", loss=0.0, probability=()))
+    return _with_mission(cell.pilot.load(overrides), cell.scenario)
 
 
 def blackout_s(seed: int) -> float:

@@ -157,8 +157,8 @@ def fly(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFl
 
 def _fly_ours(cell: TrialCell, config: Config, from_s: float) -> TrialFlight:
     told = FlightTally()
-    knows, designed = believed(cell)
-    watched = WatchedFlyer(ControlLoop(knows, controller_of(knows, designed), told, lambda: 0))
+    knows = believed(cell)
+    watched = WatchedFlyer(ControlLoop(knows, controller_of(knows), told, lambda: 0))
     world = _flown(config, watched)
     begun_s = None if told.begun_ns is None else told.begun_ns * 1e-9
     return _judged(
@@ -208,13 +208,13 @@ def _flown(config: Config, watched: WatchedFlyer, own: OwnLoop | None = None) ->
 
 
 @lru_cache(maxsize=_CONTROLLERS)
-def controller_of(config: Config, designed: Config) -> Controller:
-    """A controller of ours, made from a configuration and the design of another one.
+def controller_of(config: Config) -> Controller:
+    """A controller of ours.
 
     Raises:
         DesignError: There is none.
     """
-    design = design_of(designed)
+    design = design_of(config)
     library = library_for(design).library if config.uses_library and isinstance(design, Design) else None
     return build_controller(config, design, library)
 
