@@ -13,7 +13,16 @@ from uavctl.data import Datagram, Decision, Record, raw_topic
 
 def test_every_recorded_type_has_one_topic() -> None:
     # Not on their own topic: parts of other records, and what never leaves the process.
-    inside = {"Record", "PositionSample", "GaveWay", "Command", "Datagram", "Outgoing", "VehicleMotion"}
+    inside = {
+        "Record",
+        "PositionSample",
+        "GaveWay",
+        "Command",
+        "Datagram",
+        "Outgoing",
+        "VehicleMotion",
+        "InertialSample",
+    }
     types = {
         name
         for name, kind in vars(data).items()
