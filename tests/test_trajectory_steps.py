@@ -24,6 +24,10 @@ def place(times_s: Array) -> Array:
     return np.column_stack([RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), np.full(len(angle), -1.2)])
 
 
+def times(dt_s: float, count: int) -> Array:
+    return np.asarray(dt_s * np.arange(count), dtype=np.float64)
+
+
 def circling(preset: str, *overrides: str) -> Config:
     times_s = np.arange(0.0, LENGTH_S + 1e-9, 0.1)
     motion = f"mission.trajectory={{times_s={times_s.tolist()},positions_m={place(times_s).tolist()}}}"
@@ -39,7 +43,7 @@ def acceleration(times_s: Array) -> Array:
 @pytest.mark.parametrize("dt_s", [0.05, 0.2])
 def test_the_inputs_of_a_motion_are_about_its_acceleration_at_any_step(preset: str, dt_s: float) -> None:
     plant = build_plant(load_config(preset, [f"plant.dt_s={dt_s}"]))
-    t = dt_s * np.arange(round((LENGTH_S + 2.4) / dt_s))
+    t = times(dt_s, round((LENGTH_S + 2.4) / dt_s))
     motion = follow(plant, place(t), None)
     assert np.abs(motion.states[:, list(plant.position_index)] - place(t)).max() < 5e-3
     # Drag and lag ask for some more; steps that ring would ask for many times as much.
@@ -54,7 +58,7 @@ def test_plans_of_short_steps_leave_a_motion_late_and_brake_like_those_of_long_o
     most, off = {}, {}
     for dt_s, horizon in ((0.05, 48), (0.2, 12)):
         plant = build_plant(load_config(preset, [f"plant.dt_s={dt_s}"]))
-        t = dt_s * np.arange(round((LENGTH_S + 4.8) / dt_s))
+        t = times(dt_s, round((LENGTH_S + 4.8) / dt_s))
         motion, rest = follow(plant, place(t), None), 2 * horizon // 3
         path = along(plant, motion, horizon, rest, np.full(3, -9.0), np.full(3, 9.0))
         index = list(plant.position_index)
@@ -76,7 +80,7 @@ def test_plans_of_short_steps_leave_a_motion_late_and_brake_like_those_of_long_o
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_motion_begins_without_what_the_vehicles_own_loops_have_not_done_yet(preset: str) -> None:
     plant = build_plant(load_config(preset))
-    t = plant.dt_s * np.arange(100)
+    t = times(plant.dt_s, 100)
     motion = follow(plant, place(t + 3.0), None)  # it begins under way
     loops = [i for i, (name, _) in enumerate(plant.further) if i > 0 and name]
     for velocity in plant.velocity_index:

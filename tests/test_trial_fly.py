@@ -13,7 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools"))
 
-import flights
+import trials
 
 from uavctl.data import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
 from uavctl.trial.case import AUTOPILOTS, TrialCell, TrialPilot, believed, blackout_s, flown, length_s
@@ -127,7 +127,7 @@ def test_an_eight_is_tracked_along_its_own_time() -> None:
 
 def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--pilots own own-tuned --autopilots px4 --seeds 2 --rates 10 --losses 0.3 --seconds 6 --from 4 --json"
-    assert flights.main(arguments.split()) == 0
+    assert trials.main(arguments.split()) == 0
     cells = json.loads(capsys.readouterr().out)["cells"]
     assert [cell["pilot"]["name"] for cell in cells] == ["own", "own-tuned"]
     for cell in cells:
@@ -139,13 +139,13 @@ def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str])
 
 def test_the_tool_says_why_nobody_flies(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.delta_x=0.999999999"]
-    assert flights.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
+    assert trials.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
     assert "refused" in capsys.readouterr().out
 
 
 def test_variants_and_configurations_are_pilots_of_their_own() -> None:
     arguments = ["--config", "room", "paper", "--pilots", "configured", "own", "--set", "cost.input=[1]"]
-    given = flights._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
-    named = {one.name: one for one in flights.pilots(given, AUTOPILOTS[0])}
+    given = trials._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
+    named = {one.name: one for one in trials.pilots(given, AUTOPILOTS[0])}
     assert list(named) == ["room", "room: deep", "paper", "paper: deep", "own"]
     assert named["room: deep"].overrides == ("cost.input=[1]", "smpc.horizon=16")

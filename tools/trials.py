@@ -1,9 +1,9 @@
 """Flights of the true quadrotor in lockstep, judged on the truth, with the vehicle's own position loop beside ours.
 
-`python tools/flights.py`: preset `room` as it is, both autopilots, cameras at 5 and 50 Hz, 30 and 60 % loss, in gusts:
+`python tools/trials.py`: preset `room` as it is, both autopilots, cameras at 5 and 50 Hz, 30 and 60 % loss, in gusts:
 how well it holds its place. `--scenario eight` is a figure of eight, `--scenario blackout` 4 s without any position.
-`python tools/flights.py --pilots age-conditioned own --set smpc.horizon=16 --seeds 5 --jobs 2`
-`python tools/flights.py --variant "H 16" smpc.horizon=16 cost.input=[0.25,0.25,0.25] --pilots own`
+`python tools/trials.py --pilots age-conditioned own --set smpc.horizon=16 --seeds 5 --jobs 2`
+`python tools/trials.py --variant "H 16" smpc.horizon=16 cost.input=[0.25,0.25,0.25] --pilots own`
 
 Pilots: `hahn-stursberg` and `age-conditioned` are ours with that `smpc.scheme` (the latter designed for the losses that
 it meets, the former for those of its configuration, unless `--design` says otherwise); `configured` flies each
