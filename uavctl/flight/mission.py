@@ -138,6 +138,7 @@ class Mission:
         fences: Moving limits.
         land: Whether to land at the end; else the last place is held.
         lead_ns: Time for which the first motion is that of one horizontal axis alone [ns].
+        dead_ns: From sending an input until it begins to act; rows of the trajectory begin so much later [ns].
     """
 
     waypoints: tuple[Waypoint, ...]
