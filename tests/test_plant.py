@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from uavctl.errors import DesignError
+from uavctl.smpc.digest import digest
 from uavctl.smpc.plant import Plant, drag_lag, steps_to_reach
 from uavctl.smpc.sets import Polytope
 
@@ -274,3 +275,9 @@ def test_box_without_limits_has_no_rows() -> None:
     box = Polytope.from_box([-np.inf, -np.inf], [np.inf, np.inf])
     assert box.c.shape == (0, 2)
     assert box.margin(np.zeros(2)).shape == (0,)
+
+
+def test_what_states_are_called_makes_no_other_design() -> None:
+    plant = drag_lag([0.3], [0.2], [1.0], [0.1], 0.2, ("north",))
+    assert digest(replace(plant, further=(("something", "m"),))) == digest(plant)
+    assert digest(replace(plant, dt_s=0.2000001)) != digest(plant)

@@ -18,8 +18,9 @@ NOW = 1000 * SECOND
 WRAP_MS = 2**32
 
 
-def heard(boot_ms: int = 60_000) -> tuple[Link, Peer]:
-    link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
+def heard(boot_ms: int = 60_000, inertial_std_mps2: float = 0.0) -> tuple[Link, Peer]:
+    estimator = EstimatorConfig(position_std_m=0.005, inertial_std_mps2=inertial_std_mps2)
+    link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05), estimator=estimator), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)
     link.receive(vehicle.local_position(boot_ms), NOW)
     return link, vehicle
@@ -145,7 +146,7 @@ def felt(link: Link, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw
 
 @pytest.mark.parametrize("quaternion", [False, True])
 def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(quaternion: bool) -> None:
-    link, vehicle = heard()
+    link, vehicle = heard(inertial_std_mps2=0.1)
     assert felt(link, vehicle, (1.0, 0.0, -9.0), NOW) == []  # no attitude yet
     turn = Rotation.from_euler("ZYX", (2.0, -0.2, 0.1))
     if quaternion:
@@ -160,6 +161,13 @@ def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(
     assert felt(link, vehicle, force, NOW + TURNED_NS + 1) == []  # the attitude is too old
     assert felt(link, vehicle, (float("nan"), 0.0, 0.0), NOW) == []
     assert felt(link, Peer(1, 100), force, NOW) == felt(link, Peer(9, 1), force, NOW) == []  # a camera, another one
+
+
+def test_a_quaternion_beside_the_angles_counts_only_where_inertial_data_are_used() -> None:
+    for std_mps2, wanted in ((0.0, 0), (0.1, 1)):
+        link, vehicle = heard(inertial_std_mps2=std_mps2)
+        told = link.receive(vehicle.send("attitude_quaternion", 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
+        assert len(told) == wanted
 
 
 def test_raw_inertial_data_have_ardupilots_unit_and_are_taken_from_it_only() -> None:

@@ -87,8 +87,9 @@ class Link:
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
         self._encoder = Encoder(*self._own)
         self._intake = PositionIntake(frame, clock, source, estimator, self._count)
-        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id)
-        self._streams, self._globe = Streams(inertial=estimator.inertial_std_mps2 > 0.0), Globe()
+        feels = estimator.inertial_std_mps2 > 0.0
+        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
+        self._streams, self._globe = Streams(inertial=feels), Globe()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None

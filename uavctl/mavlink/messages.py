@@ -97,6 +97,7 @@ class Attitude(Message, frozen=True, kw_only=True):
     """ATTITUDE or ATTITUDE_QUATERNION: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
 
     angles_rad: Vec3
+    quaternion: bool = False
 
 
 class Inertial(Message, frozen=True, kw_only=True):

@@ -35,7 +35,7 @@ def _attitude_quaternion(raw: Fields) -> Attitude | None:
     turn = unit((raw.q1, raw.q2, raw.q3, raw.q4))
     if turn is None:
         return None
-    return Attitude(system=raw.src_system, component=raw.src_component, angles_rad=to_euler(turn))
+    return Attitude(system=raw.src_system, component=raw.src_component, angles_rad=to_euler(turn), quaternion=True)
 
 
 def _highres_imu(raw: Fields) -> Inertial | None:

@@ -42,7 +42,7 @@ class Streams:
         match message:
             case Position(local_ned=True):
                 self._seen.add(LOCAL_POSITION_NED)
-            case Attitude():
+            case Attitude(quaternion=False):
                 self._seen.add(ATTITUDE)
             case Landed():
                 self._seen.add(EXTENDED_SYS_STATE)

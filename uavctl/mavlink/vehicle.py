@@ -39,10 +39,14 @@ class VehicleWatch:
         bad: counter that heartbeats of other vehicles are added to.
         own: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
+        inertial: its inertial data are used.
     """
 
-    def __init__(self, bad: Callable[[str], None], own: tuple[int, int], system: int = 0) -> None:
+    def __init__(
+        self, bad: Callable[[str], None], own: tuple[int, int], system: int = 0, *, inertial: bool = False
+    ) -> None:
         self._bad = bad
+        self._inertial = inertial
         self._own = own
         self._system = system
         self._landed: bool | None = None
@@ -78,6 +82,9 @@ class VehicleWatch:
             case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
                 return (*self._clock(stamp_us // 1000, at_ns), *self._moves(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
+                # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
+                if message.quaternion and not self._inertial:
+                    return ()
                 return self._moves(at_ns, attitude=angles_rad)
             case Inertial(specific_force_mps2=force, raw=raw) if message.component == self.address[1]:
                 return self._accelerates(force, at_ns) if not raw or self.autopilot == "ardupilot" else ()

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 from uavctl.data import Vec3
 from uavctl.errors import DesignError
+from uavctl.smpc.digest import WORDS
 from uavctl.smpc.sampling import balanced_units, exponential, logarithm
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ class Plant:
     position_index: tuple[int, ...]
     velocity_index: tuple[int, ...]
     accel_per_input: Array
-    further: tuple[tuple[str, str], ...] = ()
+    further: tuple[tuple[str, str], ...] = field(default=(), metadata=WORDS)
     _accel_map: Array = field(init=False, repr=False)
     _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
     _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
