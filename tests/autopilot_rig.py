@@ -20,29 +20,6 @@ from uavctl.data import Vec3
 Name = Literal["px4", "ardupilot"]
 GUIDED, LAND_MODE, STABILIZE = (1, 4), (1, 9), (1, 0)
 OFFBOARD, HOLD = (1, 6, 0), (1, 4, 3)
-EXTERNAL_ONLY = {
-    "px4": {
-        "EKF2_EV_CTRL": 11,
-        "EKF2_HGT_REF": 3,
-        "EKF2_GPS_CTRL": 0,
-        "EKF2_BARO_CTRL": 0,
-        "EKF2_MAG_TYPE": 5,
-        "SYS_HAS_MAG": 0,
-        "SYS_HAS_GPS": 0,
-    },
-    "ardupilot": {
-        "GPS1_TYPE": 0,
-        "VISO_TYPE": 1,
-        "EK3_SRC1_POSXY": 6,
-        "EK3_SRC1_POSZ": 6,
-        "EK3_SRC1_YAW": 6,
-        "EK3_SRC1_VELXY": 0,
-        "EK3_SRC1_VELZ": 0,
-        "COMPASS_USE": 0,
-        "COMPASS_USE2": 0,
-        "COMPASS_USE3": 0,
-    },
-}
 
 
 class Flight:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from autopilot_rig import EXTERNAL_ONLY
 from check_rig import Checked, Hand, S, look
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +18,7 @@ from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.config.preflight import CheckConfig
 from uavctl.loop import make_links
+from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 

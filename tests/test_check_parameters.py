@@ -6,7 +6,6 @@ import re
 from itertools import product
 
 import pytest
-from autopilot_rig import EXTERNAL_ONLY
 from check_rig import Checked, Hand, look
 
 from sim.peers import Peers
@@ -15,6 +14,7 @@ from uavctl.check.parameters import RULES
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
+from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 

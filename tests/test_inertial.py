@@ -384,5 +384,8 @@ def test_a_fallback_that_ends_holds_by_nothing() -> None:
     assert back_mps2(state, tick, controller) == (0.0, 0.0, 0.0)
     recover = msgspec.structs.replace(state, fallback=Fallback(ControlMode.HOLD, START_NS), held_m=(1.0, 0.0, 0.0))
     assert back_mps2(recover, tick, controller)[0] > 0.5
+    told = feel(kalman, history, felt_at(START_NS + TICK_NS, 50.0))  # cannot be, and so carries nothing on
+    lied = msgspec.structs.replace(tick, belief=belief_at(kalman, told, START_NS + 300 * MS))
+    assert back_mps2(recover, lied, controller) == (0.0, 0.0, 0.0)
     later = msgspec.structs.replace(tick, belief=belief_at(kalman, history, START_NS + 300 * MS))
     assert back_mps2(recover, later, controller) == (0.0, 0.0, 0.0)  # the data are too old

@@ -8,7 +8,6 @@ from statistics import median
 from typing import Any
 
 import pytest
-from autopilot_rig import EXTERNAL_ONLY
 from loopback_rig import Memory, make_loop
 from mavlink_rig import MS, SECOND, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -25,6 +24,7 @@ from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.mode import State
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
+from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 NOW = 1_000 * SECOND
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from autopilot_rig import EXTERNAL_ONLY, Flight, Name
+from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import S, quadrotor, run
 
@@ -16,6 +16,7 @@ from sim.personality import PERSONALITIES
 from sim.quadrotor import Quadrotor
 from sim.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, Ask, Setpoint, interpret
 from uavctl.data import Vec3
+from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 HERE: Vec3 = (1.0, 2.0, -3.0)

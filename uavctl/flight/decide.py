@@ -13,7 +13,7 @@ from uavctl.data import ControlMode, Estimate, Plan, PositionSample, SolveStatus
 from uavctl.flight import envelope
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.estimator import History, belief_ahead, belief_at, estimated, felt_ns, newest_capture_ns
+from uavctl.flight.estimator import History, belief_ahead, belief_at, estimated, newest_capture_ns
 from uavctl.flight.fallback import End, Fallback
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
@@ -185,7 +185,7 @@ def _felt_since(state: ControlState, tick: Tick, controller: Controller) -> bool
     """Whether inertial data have come since the plan was made, and the solver counts the age of what it is made of."""
     if state.plan is None or (tick.age_steps or 0) > controller.late_steps:
         return False
-    newest_ns = felt_ns(tick.history)
+    newest_ns = None if tick.belief is None else tick.belief.felt_ns
     return newest_ns is not None and newest_ns > state.plan.base_ns - controller.dead_ns
 
 
@@ -239,9 +239,10 @@ RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estima
 
 def reckons(fallback: Fallback, tick: Tick) -> bool:
     """Whether the vehicle's own inertial data carry an estimate on that nothing speaks against."""
-    newest_ns = felt_ns(tick.history)
-    fresh = newest_ns is not None and tick.belief is not None and tick.belief.at_ns - newest_ns <= RECKONS_NS
-    return fresh and not fallback.final
+    belief = tick.belief
+    if belief is None or belief.felt_ns is None or fallback.final:
+        return False
+    return belief.at_ns - belief.felt_ns <= RECKONS_NS
 
 
 def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, controller: Controller) -> Vec3:

@@ -154,14 +154,6 @@ def _says_something(sample: InertialSample, before: InertialSample | None) -> bo
     return told and (before is None or before.accel_mps2 != sample.accel_mps2)
 
 
-def felt_ns(history: History) -> int | None:
-    """Time of the newest inertial data of the window; None without any."""
-    for entry in reversed(history.entries):
-        if entry.accel_mps2 is not None:
-            return entry.key[0]
-    return None
-
-
 def _known_already(entries: Sequence[Entry], key: Key) -> bool:
     """Whether a source has said something of this capture time, as stamped; near it, as stamps lie near arrivals."""
     first = bisect_left(entries, key[3] - LATEST_STAMP_NS, key=lambda entry: entry.key[0])

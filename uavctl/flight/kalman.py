@@ -99,12 +99,13 @@ class Kalman:
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
-    """Gaussian of z = (x, w) at `at_ns`, with the capture time of the newest sample in it."""
+    """Gaussian of z = (x, w) at `at_ns`, with the times of the newest sample and of the newest inertial data in it."""
 
     at_ns: int
     captured_ns: int
     mean: Array  # (n_x + n_w,)
     cov: Array  # (n_x + n_w, n_x + n_w)
+    felt_ns: int | None = None  # of those that were believed
 
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
@@ -167,7 +168,7 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
             if u is None and kalman.n_bias:
                 _forget_bias(kalman, mean, cov)
         now_ns = stop_ns
-    return Belief(at_ns=now_ns, captured_ns=belief.captured_ns, mean=mean, cov=cov)
+    return Belief(at_ns=now_ns, captured_ns=belief.captured_ns, mean=mean, cov=cov, felt_ns=belief.felt_ns)
 
 
 def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
@@ -214,6 +215,7 @@ def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
         captured_ns=captured_ns(sample),
         mean=belief.mean + gain @ (values - belief.mean[index]),
         cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+        felt_ns=belief.felt_ns,
     )
 
 
@@ -240,6 +242,7 @@ def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> 
         captured_ns=belief.captured_ns,
         mean=belief.mean + gain @ off,
         cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+        felt_ns=belief.at_ns,
     )
 
 
