@@ -12,7 +12,7 @@ from logs.design_view import Floats
 from logs.flight_data import FlightData
 from logs.statistics import Share, autocorrelation, normal_reach, share
 from logs.summary import count
-from uavctl.build_late import build_delayed_link
+from uavctl.build_late import build_ages, build_delayed_link
 from uavctl.build_link import promised
 from uavctl.config import Config
 from uavctl.errors import DesignError
@@ -114,12 +114,16 @@ def _promises(config: Config | None) -> tuple[float | None, tuple[float, ...]]:
     if config is None:
         return None, ()
     try:
-        model = build_delayed_link(config)
+        if config.conditioned:
+            older = np.array([build_ages(config).outage(age) for age in range(_LONG + 1)])
+            ages, least = older - np.append(older[1:], 0.0), 1.0 - float(older[1])
+        else:
+            model = build_delayed_link(config)
+            ages, least = model.age(_LONG)[_LONG], promised(model)
     except DesignError:
         return None, ()
-    ages = model.age(_LONG)[_LONG]
     shown = ages[: np.flatnonzero(ages > _RARE)[-1] + 1].tolist()
-    return promised(model), tuple(float(f"{share:.12g}") for share in shown)  # 0.16, not 0.15999999999999998
+    return least, tuple(float(f"{share:.12g}") for share in shown)  # 0.16, not 0.15999999999999998
 
 
 def _lost(flight: FlightData) -> Share | None:

@@ -109,7 +109,8 @@ def plan_slowly(
     backoff = norm.isf(np.minimum(budgets / sigma.shape[1], 0.5))[:, None] * sigma
     z = -0.5 * linear
     now = room_x - (rows_x[:, :, 1:] @ z)
-    free = (room_u >= of_hard[:, 1:] @ z).all() and (norm.sf(now / sigma).sum(axis=1) <= budgets).all()
+    taken = norm.sf(now / sigma)
+    free = (room_u >= of_hard[:, 1:] @ z).all() and taken.max() <= 0.5 and (taken.sum(axis=1) <= budgets).all()
     for number in range(0 if free else ROUNDS):
         if number:
             binds = now <= backoff + 1e-9 * sigma

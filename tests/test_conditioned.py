@@ -205,6 +205,20 @@ def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> 
     assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.beyond)
 
 
+def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
+    """At 10 % loss, ages of ten steps are all but never met: they take as much risk as rows can, in corners too."""
+    rare = bernoulli(np.array([0.9]))
+    alone, shared = (age_risk(rare, np.linspace(1.0, 6.0, 12), ALLOWED, corner=n) for n in (1, 2))
+    for risk in (alone, shared):
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
+    assert alone.budgets[-1] == pytest.approx(0.5)
+    assert shared.budgets[-1] == pytest.approx(1.0)
+    given = problem("paper")
+    solver = ConditionedSolver(given, rare, ALLOWED)
+    reference = solver.solve(0, PAPER_START, np.array([80.0, 0.0, 40.0, 0.0])).reference
+    assert given.state_set.margin(reference).min() < 2.0  # where each row had a half of one half it was 4 m
+
+
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])
 def test_a_horizon_that_silence_outlasts_is_refused(loss: float, steps: int) -> None:
     with pytest.raises(DesignError, match=rf"smpc.horizon: positions are {steps} steps old or more in"):
@@ -280,7 +294,9 @@ def pilot(given: Problem, loss: float) -> BatchSmpc:
     return BatchSmpc(ConditionedDecider(solver, given.target), given.plant, given.horizon, given.horizon, 0.5)
 
 
-@pytest.mark.parametrize(("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0))])
+@pytest.mark.parametrize(
+    ("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0)), (0.1, (49.0, 19.0))]
+)
 def test_no_step_is_outside_more_often_than_promised(loss: float, target: tuple[float, float]) -> None:
     runs, steps = 300, 40
     at = np.array([target[0], 0.0, target[1], 0.0])

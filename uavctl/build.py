@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build_late import build_delayed_link, late_steps
+from uavctl.build_late import build_ages, build_delayed_link, late_steps
 from uavctl.build_link import promised
 from uavctl.build_mission import build_mission, build_names, build_rests
 from uavctl.config.types import Config
@@ -176,10 +176,10 @@ def build_conditioned(config: Config, *, gated: bool = True) -> ConditionedDesig
         gated: Whether the last gate limits how fast what is planned may change; in a campaign nothing does.
 
     Raises:
-        DesignError: See `build_problem`, `build_delayed_link`, `ConditionedSolver` and `innovations`.
+        DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
-    link, allowed = build_delayed_link(config), 1.0 - config.smpc.delta_x
+    link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
     slew_mps3 = config.limits.slew_mps3 if gated else math.inf
     solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3)
     cov = np.zeros((problem.plant.n_x,) * 2)
@@ -268,6 +268,11 @@ def record_of(design: AnyDesign) -> dict[str, object]:
     return conditioned_record(design) if isinstance(design, ConditionedDesign) else design_record(design)
 
 
+def _promised(config: Config) -> float:
+    """The least probability of news in a step that plans count on."""
+    return 1.0 - build_ages(config).outage(1) if config.conditioned else promised(build_delayed_link(config))
+
+
 def build_estimator(config: Config) -> EstimatorParameters:
     """What the filter believes of its samples."""
     estimator = config.estimator
@@ -342,7 +347,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         solver=build_solver(design, config, library),
         mission=build_mission(config, design, resting(design)),
         names=build_names(design),
-        link=LinkEstimateParameters(promised=promised(build_delayed_link(config))),
+        link=LinkEstimateParameters(promised=_promised(config)),
         late_steps=len(design.late) if isinstance(design, Design) else design.horizon,
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 
-from uavctl.build_link import build_link
+from uavctl.build_link import build_channel, build_link
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
-from uavctl.smpc.link import LatePackets, LinkModel
+from uavctl.smpc.link import AgeModel, LateArrivals, LatePackets, LinkModel, TracedAges
 
 _ROUNDING = 1e-9
 
@@ -43,16 +44,62 @@ def build_delayed_link(config: Config) -> LinkModel:
         raise DesignError(
             key,
             f"{reason}, and delays of a step and more go with independent losses only",
-            "take link.model = `bernoulli` without link.probability, or a longer step",
+            "take link.model = `bernoulli` without link.probability, a longer step, or smpc.scheme = `age-conditioned`",
         )
-    if 0.0 < config.source.rate_hz * dt_s < 1.0 - _ROUNDING:
-        raise DesignError(
-            "source.rate_hz",
-            f"{reason}, and {config.source.rate_hz:g} positions a second are not one a step",
-            f"give at least {1.0 / dt_s:.4g}, or 0 to count on one position a step",
-        )
+    _check_rate(config)
     under_way = np.array([_longer_than(config, i * dt_s) for i in range(late_steps(config) + 1)])
     return LatePackets(link.loss + (1.0 - link.loss) * under_way)
+
+
+def build_ages(config: Config) -> AgeModel:
+    """How old the positions are in the long run: all that scheme `age-conditioned` asks of a link, with any delay.
+
+    Where the losses of each step are known ahead, its budgets are those of the worst of them, for every step.
+
+    Raises:
+        DesignError: See `build_delayed_link`; or a trace has several positions a step, and delays of a step.
+    """
+    link, dt_s = config.link, config.plant.dt_s
+    if link.model == "bernoulli" and link.probability:
+        link = msgspec.structs.replace(link, loss=1.0 - min(link.probability), probability=())
+        config = msgspec.structs.replace(config, link=link)
+    if link.model == "bernoulli" or _longest_s(config) < dt_s:
+        return build_delayed_link(config)
+    _check_rate(config)
+    count = max(1, math.floor(config.source.rate_hz * dt_s + _ROUNDING))
+    if link.model == "trace":
+        return _of_trace(config, count)
+    before_s = np.arange(count)[::-1] / max(config.source.rate_hz, 1.0 / dt_s)
+    spans_s = dt_s * np.arange(late_steps(config) + 1)
+    return LateArrivals(
+        build_channel(config),
+        np.array([[_longer_than(config, float(span_s + s)) for s in before_s] for span_s in spans_s]),
+    )
+
+
+def _of_trace(config: Config, count: int) -> TracedAges:
+    """The ages that a trace leads to, packets that the design does not wait for among the lost ones."""
+    build_channel(config)  # refuses a trace of which it waits for none
+    if count > 1:
+        raise DesignError(
+            "source.rate_hz",
+            f"{count} positions a step with delays of a step and more are not told apart in a trace",
+            "give 0 to count on one position a step, or describe the losses by link.model = `empirical`",
+        )
+    delays = np.array(config.link.trace_s)
+    waited = delays <= _longest_s(config) + _ROUNDING
+    return TracedAges(np.where(waited, np.ceil(delays / config.plant.dt_s - _ROUNDING), np.inf))
+
+
+def _check_rate(config: Config) -> None:
+    rate_hz, dt_s = config.source.rate_hz, config.plant.dt_s
+    if 0.0 < rate_hz * dt_s < 1.0 - _ROUNDING:
+        raise DesignError(
+            "source.rate_hz",
+            f"a position is on its way for up to {_longest_s(config):g} s, the step is {dt_s:g} s, and {rate_hz:g} "
+            "positions a second are not one a step",
+            f"give at least {1.0 / dt_s:.4g}, or 0 to count on one position a step",
+        )
 
 
 def _of_many(config: Config) -> LatePackets:

@@ -34,7 +34,20 @@ def build_link(config: Config) -> Arrivals:
     Raises:
         DesignError: No position can be counted on.
     """
-    link, packets = config.link, packets_per_step(config)
+    return _channel(config, packets_per_step(config))
+
+
+def build_channel(config: Config) -> Arrivals:
+    """The chain of the link's losses for one packet a step, whatever its rate and its delay.
+
+    Raises:
+        DesignError: No packet ever arrives.
+    """
+    return _channel(config, Packets(1, 0))
+
+
+def _channel(config: Config, packets: Packets) -> Arrivals:
+    link = config.link
     if link.model == "gilbert-elliott":
         return gilbert_elliott(
             enter=link.burst_enter,

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from uavctl.errors import DesignError
-from uavctl.smpc.link import LinkModel
+from uavctl.smpc.link import AgeModel
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class AgeRisk:
     Attributes:
         weights: π_t (H,), of information t = 1 … H steps old.
         beyond: Probability that it is older than H: no plan is left then, and all of it counts as outside.
-        budgets: ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK bounds them.
+        budgets: ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK of each row
+            bounds them.
     """
 
     weights: Array
@@ -34,14 +35,18 @@ class AgeRisk:
     budgets: Array
 
 
-def age_risk(link: LinkModel, deviations: Array, allowed: float, price: float = PRICE) -> AgeRisk:
-    """Spread the allowed risk so that Σ_t π_t^h β_t is least for a row with the back-offs β_t = Φ⁻¹(1 - ε̄_t) σ_t.
+def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1) -> AgeRisk:
+    """Spread the allowed risk so that Σ_t π_t^h β_t is least where n rows alike bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
+
+    Were it least for one row, ages that are all but never met would end at LARGEST_RISK with no back-off, and where two
+    rows share that, their back-offs at those ages would be the largest of all: corners would be kept far away from.
 
     Args:
         link: Model of the link.
-        deviations: σ_t (H,) of the row.
+        deviations: σ_t (H,) of the rows.
         allowed: 1 - δ_x.
         price: h.
+        corner: n, rows that may bind at once.
 
     Raises:
         DesignError: Information is older than the horizon more often than is allowed.
@@ -57,14 +62,15 @@ def age_risk(link: LinkModel, deviations: Array, allowed: float, price: float = 
             "may be outside of the limits",
             "take a longer smpc.horizon or a lower smpc.delta_x",
         )
+    most = min(1.0, corner * LARGEST_RISK)
     if not deviations.all():
-        return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), LARGEST_RISK)))
+        return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), most)))
     # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
     scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
 
     def budgets(level: float) -> Array:
         # No younger age has more: a link that is better than its model uses up no more risk.
-        each = ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0)))
+        each = np.minimum(corner * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), most)
         return np.ascontiguousarray(np.minimum.accumulate(each[::-1])[::-1])
 
     def excess(level: float) -> float:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uavctl.data import GaveWay, SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc.age_risk import PRICE, age_risk
+from uavctl.smpc.age_risk import LARGEST_RISK, PRICE, age_risk
 from uavctl.smpc.allocation import binding, quantile, shifted, spent
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import INPUT_TOLERANCE, KEPT, inside
@@ -35,7 +35,7 @@ from uavctl.smpc.baselines.problem import Problem, parts, unseen
 from uavctl.smpc.batch_smpc import Decisions, gathered
 from uavctl.smpc.deviations import Deviations
 from uavctl.smpc.equilibria import equilibria
-from uavctl.smpc.link import LinkModel
+from uavctl.smpc.link import AgeModel
 from uavctl.smpc.lqg_bound import lqr
 from uavctl.smpc.part_program import PartProgram
 from uavctl.smpc.places import Places
@@ -99,7 +99,7 @@ class ConditionedSolver:
     def __init__(
         self,
         problem: Problem,
-        link: LinkModel,
+        link: AgeModel,
         allowed: float,
         price: float = PRICE,
         slew_mps3: float = math.inf,
@@ -135,7 +135,7 @@ class ConditionedSolver:
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
-        self.risk = age_risk(link, self._pacing(), allowed, price)
+        self.risk = age_risk(link, self._pacing(), allowed, price, len(self._parts))
         # By how late the position was: budgets, and quantiles of rows that share them and of one that need not.
         ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
         self._budgets = self.risk.budgets[ages]
@@ -256,7 +256,8 @@ class ConditionedSolver:
             if not np.count_nonzero(over):
                 return _Found((), backoff, room, 0)
             stages = np.flatnonzero(over.any(axis=1))
-            if (spent(room[stages], sigma[stages]).sum(axis=1) <= budgets[stages]).all():
+            within = spent(room[stages], sigma[stages])
+            if within.max() <= LARGEST_RISK and (within.sum(axis=1) <= budgets[stages]).all():
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
         todo = [one for one in self._parts if tight[one.hard].any() or np.count_nonzero(over[:, one.columns])]
         left: dict[PartProgram, Array] = {}

@@ -11,7 +11,7 @@ from uavctl.smpc.baselines.problem import Problem
 from uavctl.smpc.conditioned import METHOD, ConditionedSolver
 from uavctl.smpc.design import Design
 from uavctl.smpc.digest import digest
-from uavctl.smpc.link import LinkModel
+from uavctl.smpc.link import AgeModel
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -68,13 +68,13 @@ class ConditionedDesign:
 AnyDesign = Design | ConditionedDesign  # what a flight is planned with, of either scheme
 
 
-def conditioned_id(problem: Problem, link: LinkModel, allowed: float, slew_mps3: float) -> str:
+def conditioned_id(problem: Problem, link: AgeModel, allowed: float, slew_mps3: float) -> str:
     """Hash of what `ConditionedSolver` is made from."""
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
     return digest((METHOD, anywhere, link, allowed, slew_mps3))
 
 
-def longest_gap(link: LinkModel, allowed: float, most: int) -> int:
+def longest_gap(link: AgeModel, allowed: float, most: int) -> int:
     """Losses in a row, at most `most`, beyond which gaps are rarer than the share of time that is allowed outside."""
     return next((losses for losses in range(most) if link.outage(losses + 1) <= allowed), most)
 

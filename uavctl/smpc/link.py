@@ -21,8 +21,16 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-9
 
 
-class LinkModel(Protocol):
-    """What a design asks of a link."""
+class AgeModel(Protocol):
+    """What risk conditioned on the age asks of a link."""
+
+    def outage(self, steps: int) -> float:
+        """P(a(k) >= `steps`) in the long run."""
+        ...
+
+
+class LinkModel(AgeModel, Protocol):
+    """What a design of scheme `hahn-stursberg` asks of a link."""
 
     def age(self, steps: int) -> Array:
         """Distribution of the age over the steps to come, from an age of 0: (4), (5).
@@ -48,10 +56,6 @@ class LinkModel(Protocol):
         Stage t's is where it feeds back nothing (t < d_t), or the age is below d_t. The product of the stages' own
         probabilities is no more than this if losses are independent.
         """
-        ...
-
-    def outage(self, steps: int) -> float:
-        """P(a(k) >= `steps`) in the long run."""
         ...
 
 
@@ -178,6 +182,49 @@ class LatePackets(_AgeChain):
         """P(D > i) for i = -1 … `count` - 2."""
         known = np.concatenate([[1.0], self.tail])[:count]
         return np.concatenate([known, np.full(count - len(known), self.tail[-1])])
+
+
+@dataclass(frozen=True, eq=False)
+class LateArrivals:
+    """Packets that a channel with a memory loses, and that come late, their delays independent of it and each other.
+
+    a(k) >= t says that of each of the t newest steps nothing has come by k: a product along the chain, oldest first.
+
+    Attributes:
+        channel: The chain of one packet a step.
+        longer: P(a packet that is not lost is on its way for longer than until the end of the step i after its own)
+            (I, n), i = 0 … of a step's packets in the order in which they are sent; none of those that follow.
+    """
+
+    channel: Arrivals
+    longer: Array
+
+    def outage(self, steps: int) -> float:
+        """See `AgeModel`."""
+        lost, arrived = self.channel.lost[-1], self.channel.arrived[-1]
+        mass = _stationary(lost + arrived)
+        for i in reversed(range(steps)):
+            for under_way in self.longer[i] if i < len(self.longer) else np.zeros(self.longer.shape[1]):
+                mass = mass @ (lost + under_way * arrived)
+        return float(mass.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class TracedAges:
+    """The ages on a link that repeats what was recorded, one packet a step, from anywhere in it.
+
+    Attributes:
+        late: Delay of each packet (n,) [steps], infinite if it is lost.
+    """
+
+    late: Array
+
+    def outage(self, steps: int) -> float:
+        """See `AgeModel`."""
+        missing = np.ones(len(self.late), dtype=np.bool_)
+        for i in range(steps):
+            missing &= np.roll(self.late, i) > i
+        return float(missing.mean())
 
 
 def bernoulli(p: Array) -> Arrivals:
