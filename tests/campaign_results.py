@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 
 STEPS = 50
 _COUNTS = ("state_violations", "input_violations", "saturated", "decisions", "infeasible", "slack_used", "fallbacks")
-_TYPES = {"error": pa.string(), "ages": pa.list_(pa.int64()), "cell": pa.int32(), "run": pa.int64()}
+_LISTS = dict.fromkeys(("ages", "outside"), pa.list_(pa.int64()))
+_TYPES = {"error": pa.string(), **_LISTS, "cell": pa.int32(), "run": pa.int64()}
 
 
 def cell(index: int, controller: str, kind: str = "lqg", link: str = "30 %", **told: Any) -> dict[str, Any]:

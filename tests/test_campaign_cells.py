@@ -50,6 +50,12 @@ def test_the_grid_is_the_product_in_the_order_given(tmp_path: Path) -> None:
     assert len({cell.recipe.key for cell in found if cell.recipe}) == 4
 
 
+def test_a_margin_may_be_tuned_for_a_link(tmp_path: Path) -> None:
+    tuning = '[[tuning]]\ncontrollers = ["governor"]\nlinks = ["bad"]\nmargin = 2.25\n'
+    good, bad = cells(tmp_path, controller("governor", "margin = 1.5"), LINKS, tuning)
+    assert [one.recipe.margin for one in (good, bad) if one.recipe] == [1.5, 2.25]
+
+
 def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> None:
     first, weak = cells(tmp_path, controller("lqg", 'link = "good"'), LINKS, table("plant", "b"), WEAK)[2:]
     assert first.recipe is weak.recipe and weak.recipe is not None

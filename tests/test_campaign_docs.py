@@ -26,7 +26,17 @@ REFUSED = {
 
 
 def test_they_are_there() -> None:
-    assert [file.stem for file in EVERY] == ["bursts", "delay", "flights", "loss", "room", "wrong-link", "wrong"]
+    assert [file.stem for file in EVERY] == [
+        "bursts",
+        "corners",
+        "delay",
+        "flights",
+        "loss",
+        "room",
+        "walls",
+        "wrong-link",
+        "wrong",
+    ]
 
 
 def test_the_flights_of_the_quadrotor_can_be_read_and_are_as_many_as_the_file_says() -> None:

@@ -241,7 +241,7 @@ def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 
 def test_the_reason_of_a_refused_cell_is_a_row_over_all_columns(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
-    assert html.count('<tr><td colspan="13">2 far: no design; tau: nothing is fast enough</td></tr>') == 1
+    assert html.count('<tr><td colspan="14">2 far: no design; tau: nothing is fast enough</td></tr>') == 1
     assert "min-width:97" not in html  # no table is set wider than the paper
 
 

@@ -11,7 +11,14 @@ from campaign_results import STEPS, cell, runs, write
 from scipy.optimize import brentq
 from scipy.stats import binom
 
-from uavctl.campaign.intervals import BOOTSTRAP_UP_TO, bootstrap_mean, clopper_pearson, paired_difference, step_rate
+from uavctl.campaign.intervals import (
+    BOOTSTRAP_UP_TO,
+    bootstrap_mean,
+    clopper_pearson,
+    paired_difference,
+    step_rate,
+    worst_step,
+)
 from uavctl.campaign.results import read_results
 from uavctl.campaign.statistics import difference, summarise
 from uavctl.errors import UavctlError, UsageError
@@ -119,6 +126,28 @@ def test_steps_of_a_run_that_come_together_do_not_make_the_interval_narrow() -> 
     steps = clopper_pearson(30 * STEPS, 300 * STEPS)
     assert high - low > 5 * (steps[1] - steps[0])
     assert low < clopper_pearson(30, 300)[0] * 1.1
+
+
+def test_the_worst_step_s_interval_goes_for_all_steps_at_once() -> None:
+    """It misses a rate that all steps have in at most 5 % of all campaigns; the step's own interval does in many."""
+    rng, missed, alone = np.random.default_rng(4), 0, 0
+    for _ in range(400):
+        hits = rng.binomial(300, 0.05, 40)
+        rate, (low, high) = worst_step(hits, 300, 40)
+        assert rate == hits.max() / 300 and low <= rate <= high
+        missed += low > 0.05
+        alone += clopper_pearson(int(hits.max()), 300)[0] > 0.05
+    assert missed <= 0.05 * 400 < 100 < alone
+
+
+def test_the_worst_step_is_that_of_all_runs_together(tmp_path: Path) -> None:
+    rows = runs(0, [1.0, 2.0, 3.0, 4.0], state_violations=[2, 1, 0, 1], outside=[[0, 1, 1], [0, 1], [], [1]])
+    (one,) = summarise(write(tmp_path, [cell(0, "smpc", "smpc")], rows))
+    assert one.worst_step_rate == 0.5
+    assert one.worst_step_ci == pytest.approx(clopper_pearson(2, 4, 1.0 - 0.05 / STEPS))
+    older = runs(0, [1.0, 2.0], state_violations=[2, 1])
+    (unknown,) = summarise(write(tmp_path / "older", [cell(0, "smpc", "smpc")], older))
+    assert unknown.worst_step_rate is None
 
 
 def test_a_folder_by_hand(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def _product(campaign: Campaign) -> list[Which]:
 def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
     """The recipe of a controller for the link that it believes in, or why there is none."""
     try:
-        return recipe_for(campaign.spec.controller[key[0]], campaign.believed[key], campaign.spec, library_for)
+        return recipe_for(campaign.tuned(*key), campaign.believed[key], campaign.spec, library_for)
     except DesignError as error:
         return str(error)
 

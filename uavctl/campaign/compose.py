@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from uavctl.campaign.spec import TRUE, CampaignSpec
+from uavctl.campaign.spec import TRUE, CampaignSpec, ControllerSpec
 from uavctl.config import Config, Source, parse
 from uavctl.config.checks import dimensions
 from uavctl.config.problem import Problem
@@ -45,6 +45,14 @@ class Campaign:
         """Name of the link that a controller believes in when it flies on this one."""
         own = self.spec.controller[controller].link
         return self.spec.link[link].name if own == TRUE else own
+
+    def tuned(self, controller: int, believed: str) -> ControllerSpec:
+        """A controller with its margin for the link of that name, which it believes in; the last tuning wins."""
+        one = self.spec.controller[controller]
+        for tuning in self.spec.tuning:
+            if tuning.margin is not None and one.name in tuning.controllers and believed in tuning.links:
+                one = msgspec.structs.replace(one, margin=tuning.margin)
+        return one
 
 
 class Told:

@@ -58,6 +58,22 @@ def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Pair:
     return exact_interval(hits, trials, 0.5 * (1.0 - level))
 
 
+def worst_step(hits: NDArray[np.int64], runs: int, steps: int, level: float = LEVEL) -> tuple[float, Pair]:
+    """Rate of the step in which something happened most often, with an interval that goes for all steps at once.
+
+    The worst step is chosen by the same runs, so that an interval of its own would say too much: each step has the
+    exact one at the level 1 - (1 - `level`) / T (Bonferroni), and the worst one's is told.
+
+    Args:
+        hits: Runs in which it happened, by step (K,), K <= T; none in those that follow.
+        runs: Independent runs.
+        steps: T.
+        level: Confidence that all T intervals cover their probabilities at least.
+    """
+    most = int(hits.max(initial=0))
+    return most / runs, clopper_pearson(most, runs, 1.0 - (1.0 - level) / steps)
+
+
 def bootstrap_mean(values: Array, level: float = LEVEL, seed: int = 0) -> Pair:
     """Interval of a mean: percentiles of resampled means, the normal approximation beyond `BOOTSTRAP_UP_TO` values.
 

@@ -202,8 +202,8 @@ def _ways_section(view: View) -> Iterator[Section]:
 
 
 _COLUMNS = (
-    "cell", "controller", "cost of a run", "settled, a step", "states outside", "runs with any", "inputs outside",
-    "mean square input", "no plan left", "no plan found", "limits eased", "oldest", "failed",
+    "cell", "controller", "cost of a run", "settled, a step", "states outside", "worst step", "runs with any",
+    "inputs outside", "mean square input", "no plan left", "no plan found", "limits eased", "oldest", "failed",
 )  # fmt: skip
 
 
@@ -215,8 +215,10 @@ def _cells_section(view: View) -> Section:
         body = _table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused)
         tables.append(f"<details><summary>{escape(view.place(group))}</summary>{body}</details>")
     note = (
-        "States and inputs outside: share of steps. Runs with any: share of runs with a state outside. No plan left: "
-        "steps in which the SMPC braked. No plan found, limits eased: decisions. Oldest: largest age in steps."
+        "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
+        "the most, its exact interval for all steps at once (Bonferroni). Runs with any: share of runs with a state "
+        "outside. No plan left: steps in which the SMPC braked. No plan found, limits eased: decisions. Oldest: "
+        "largest age in steps."
     )
     return Section("All figures", note, "".join(tables))
 
@@ -229,6 +231,7 @@ def _row(cell: CellSummary) -> tuple[str, ...]:
         _mean(cell.cost, cell.cost_ci),
         _mean(cell.settled_cost, cell.settled_cost_ci),
         _rate(cell.violation_rate, cell.violation_ci),
+        _rate(cell.worst_step_rate, cell.worst_step_ci),
         _rate(cell.run_violation_rate, cell.run_violation_ci),
         _rate(cell.input_violation_rate, cell.input_violation_ci),
         "–" if cell.mean_square_input is None else f"{cell.mean_square_input:.4g}",

@@ -67,12 +67,15 @@ class Runs:
         index: Indices of the runs (N,).
         figures: A value for each of them (N,), by column of the results.
         ages: Number of steps at each age, over all of them.
+        outside: Runs with a state outside in each step 1, 2 …, up to the last one with any; tables of older versions
+            have none.
         failed: (run, error) of the others.
     """
 
     index: NDArray[np.int64]
     figures: dict[str, Values]
     ages: NDArray[np.int64]
+    outside: NDArray[np.int64]
     failed: tuple[tuple[int, str], ...]
 
     def __getitem__(self, column: str) -> Values:
@@ -159,6 +162,7 @@ def _of_cell(table: pa.Table, index: int) -> Runs:
         index=numbers[good],
         figures={name: _column(rows, name, good) for name in (*_FIGURES, *_SINCE)},
         ages=_histogram(rows["ages"], good),
+        outside=_histogram(rows["outside"], good) if "outside" in rows.column_names else np.zeros(0, dtype=np.int64),
         failed=failed,
     )
 

@@ -92,7 +92,11 @@ class TuningSpec(Section, frozen=True, kw_only=True):
         tuple[str, ...],
         Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[link]]s that they believe in"),
     ]
-    set: Annotated[Overrides, Meta(min_length=1, description="overrides of the design; they win over the controller's")]
+    set: Annotated[Overrides, Meta(description="overrides of the design; they win over the controller's")] = ()
+    margin: Annotated[
+        Annotated[float, Meta(ge=0, le=1000)] | None,
+        Meta(description="their `margin` there; if not given, the controllers' own"),
+    ] = None
 
 
 class CampaignSpec(Section, frozen=True, kw_only=True):

@@ -17,6 +17,7 @@ from uavctl.campaign.intervals import (
     clopper_pearson,
     paired_difference,
     step_rate,
+    worst_step,
 )
 from uavctl.campaign.results import Cell, Results, Runs, read_results
 
@@ -63,6 +64,8 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     hold_rms_m: float | None = None  # distance from it in the second half of a run, median
     beyond_m: float | None = None  # furthest beyond a wall of all runs; negative is the room that was left
     usable_room: float | None = None  # share of it in which a plan may rest
+    worst_step_rate: float | None = None  # share of runs with a state outside, in the step with the most
+    worst_step_ci: Pair | None = None  # for all steps at once, see `intervals.worst_step`
 
 
 def summarise(folder: Path) -> list[CellSummary]:
@@ -83,6 +86,8 @@ def cell_summary(results: Results, cell: Cell) -> CellSummary:
     inputs, _ = _step_and_run_rate(runs["input_violations"], results.steps)
     cost, settled = _mean(runs["cost"]), _mean(runs["settled_cost"])
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
+    counted = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
+    worst = worst_step(runs.outside, n, results.steps) if counted else (None, None)
     (ages,) = np.nonzero(runs.ages)
     return CellSummary(
         controller=cell.controller,
@@ -121,6 +126,8 @@ def cell_summary(results: Results, cell: Cell) -> CellSummary:
         hold_rms_m=_finite(np.median, runs["hold_rms_m"]),
         beyond_m=_finite(np.max, runs["beyond_m"]),
         usable_room=cell.usable_room,
+        worst_step_rate=worst[0],
+        worst_step_ci=worst[1],
     )
 
 

@@ -47,6 +47,7 @@ SCHEMA = pa.schema(
         ("max_age", _I32),
         ("age_sum", _I64),
         ("ages", pa.list_(_I64)),
+        ("outside", pa.list_(_I64)),
         ("largest_gap", _F64),
         ("near_s", _F64),
         ("nearer_s", _F64),
@@ -183,7 +184,8 @@ def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
     arrays = []
     for name in schema.names:
         field, values = schema.field(name), columns[name]
-        arrays.append(_histograms(values) if name == "ages" else pa.array(values, type=field.type, from_pandas=False))
+        counted = name in ("ages", "outside")
+        arrays.append(_histograms(values) if counted else pa.array(values, type=field.type, from_pandas=False))
     return pa.Table.from_arrays(arrays, schema=schema)
 
 

@@ -60,6 +60,15 @@ def _promise(view: View) -> Iterator[str]:
         yield f"{count(len(over), 'cell')} of {len(kept)} broke state limits more often than the design allows."
     if not above:
         yield f"None of the {count(len(kept), 'cell')} with a promise broke state limits more often than it allows."
+    stepped = [c for c in kept if c.worst_step_rate is not None and c.worst_step_ci is not None]
+    if stepped:
+        broke = sum(1 for c in stepped if c.worst_step_ci and c.worst_step_ci[0] > (c.promised_x or 0.0))
+        highest = max(stepped, key=lambda cell: cell.worst_step_rate or 0.0)
+        yield (
+            f"Step by step, {count(broke, 'cell')} of {len(stepped)} left the limits more often than allowed in some "
+            f"step, beyond chance; the worst step of all had {percent(highest.worst_step_rate)} "
+            f"({highest.controller}, {view.place(group_of(highest))})."
+        )
     yield (
         f"The most was {percent(worst.violation_rate)} of steps ({where}), where {percent(worst.promised_x)} are "
         "allowed."

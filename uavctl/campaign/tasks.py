@@ -95,7 +95,7 @@ def fly_task(task: Task) -> Columns:
     """Fly the runs of a task at once; if that raises, one by one, and those that raise have its message.
 
     Returns:
-        Columns as in the results, each with a row a run; `ages` is (runs, steps).
+        Columns as in the results, each with a row a run; `ages` and `outside` are (runs, steps).
     """
     try:
         built(task.recipe)
@@ -136,7 +136,7 @@ def _without_figures(task: Task, first: int, runs: int, error: str) -> Columns:
         "run": np.arange(first, first + runs, dtype=np.int64),
         "error": np.full(runs, error, dtype=object),
         "age_sum": np.zeros(runs, dtype=np.int64),
-        "ages": np.zeros((runs, task.setting.spec.steps), dtype=np.int64),
+        **{name: np.zeros((runs, task.setting.spec.steps), dtype=np.int64) for name in ("ages", "outside")},
     }
     columns.update({name: np.zeros(runs, dtype=np.int32) for name in _WHOLE})
     columns.update({name: np.full(runs, np.nan) for name in _REAL})
@@ -161,6 +161,7 @@ def _figures(task: Task, first: int, runs: int) -> Columns:
             "saturated": _at_limit(task, found).sum(axis=1),
             "max_age": found.age.max(axis=1),
             "age_sum": found.age.sum(axis=1),
+            "outside": found.state_violated,
             "ages": np.stack([np.bincount(row, minlength=steps) for row in found.age]),
             **ways(task.setting.base, found.states),
         }
