@@ -56,7 +56,7 @@ def encode(record: Record) -> bytes:
         # msgspec writes every non-finite float as null: without one, all is said.
         if b"null" not in data or not _may_be_non_finite(record):
             return data
-        return _ENCODER.encode(_spell(msgspec.to_builtins(record, enc_hook=_plain)))
+        return _ENCODER.encode({field: _spelled(getattr(record, field)) for field in record.__struct_fields__})
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
 
@@ -124,17 +124,24 @@ def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
     return msgspec.json.Decoder(kind)
 
 
-def _exact(record: Record) -> bytes | None:
-    """A record's bytes with those of its floats; None if an integer is too large for that."""
+def _exact(value: object) -> bytes | None:
+    """A value's bytes with those of its floats; None if an integer is too large for that."""
     try:
-        return _BINARY.encode(record)
+        return _BINARY.encode(value)
     except OverflowError:
         return None
 
 
-def _may_be_non_finite(record: Record) -> bool:
-    binary = _exact(record)
+def _may_be_non_finite(value: object) -> bool:
+    binary = _exact(value)
     return binary is None or _NON_FINITE_BYTES.search(binary) is not None
+
+
+def _spelled(value: object) -> object:
+    """A record's field with non-finite floats spelled out; the numbers of a plan without any are not gone through."""
+    if isinstance(value, tuple) and not _may_be_non_finite(value):
+        return value
+    return _spell(msgspec.to_builtins(value, enc_hook=_plain))
 
 
 def _spell(value: object) -> object:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from logs.encoding import EncodingError, alike, decode, encode
 from logs.topics import TOPICS, Topic
-from uavctl.data import Datagram, Estimate, Event, Record, Setpoint, SetpointSource, Severity, Truth
+from uavctl.data import Datagram, Estimate, Event, Plan, Record, Setpoint, SetpointSource, Severity, SolveStatus, Truth
 from uavctl.errors import RecordingError
 
 
@@ -93,6 +93,37 @@ def test_spelling_of_non_finite_floats() -> None:
     plain = json.loads(encode(record))
     assert plain["accel_mps2"] == ["NaN", "Infinity", "-Infinity"]
     assert plain["yaw_rad"] is None
+
+
+@given(st.sampled_from(["cost", "gap", "backoff_x"]), st.sampled_from([math.nan, math.inf, -math.inf]))
+def test_fields_beside_a_non_finite_float_are_written_as_without_it(field: str, value: float) -> None:
+    rows = ((0.1, -0.0, 5e-324), (1e300, 1 / 3, 7.0))
+    plan = Plan(
+        seq=1,
+        base_ns=2**60,
+        captured_ns=0xCB7FF8,
+        status=SolveStatus.OPTIMAL,
+        method="NaN",
+        inputs=rows,
+        states=rows,
+        backoff_x=rows,
+        backoff_u=(),
+        reference=rows[0],
+        slack=0.25,
+        offset=-0.0,
+        terminal_miss=0.0,
+        cost=1.5,
+        cost_lower=0.5,
+        gap=2.5,
+        iterations=3,
+        design_id="",
+    )
+    odd = ((value, -0.0, 5e-324), *rows[1:]) if field == "backoff_x" else value
+    written = encode(msgspec.structs.replace(plan, **{field: odd}))
+    spelled = "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    fields = json.loads(encode(plan))
+    fields[field] = [[spelled, -0.0, 5e-324], list(rows[1])] if field == "backoff_x" else spelled
+    assert written == msgspec.json.encode(fields)
 
 
 def test_text_is_left_alone() -> None:
