@@ -14,7 +14,7 @@ from uavctl.smpc.lqg_bound import lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
 Array = NDArray[np.float64]
-ROUNDS = 3
+ROUNDS, MOST_ROUNDS = 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,16 +111,17 @@ def plan_slowly(
     now = room_x - (rows_x[:, :, 1:] @ z)
     taken = norm.sf(now / sigma)
     free = (room_u >= of_hard[:, 1:] @ z).all() and taken.max() <= 0.5 and (taken.sum(axis=1) <= budgets).all()
-    for number in range(0 if free else ROUNDS):
-        if number:
-            binds = now <= backoff + 1e-9 * sigma
-            kept = np.minimum(
-                backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, norm.isf(1e-6) * sigma)
-            )
-            left = budgets - np.where(binds, 0.0, norm.sf(kept / sigma)).sum(axis=1)
-            share = norm.isf(np.minimum(left / np.maximum(binds.sum(axis=1), 1), 0.5))
-            moved = np.where(binds, share[:, None] * sigma, kept)
-            backoff = np.where(binds.any(axis=1)[:, None], moved, backoff)
+    near = np.tile((now < backoff).any(axis=0), (steps, 1))
+    for number in range(0 if free else MOST_ROUNDS):
+        if number >= ROUNDS and (backoff <= now + 1e-7).all():
+            break
+        binds = now <= backoff + 1e-9 * sigma if number else near
+        away = norm.isf(1e-6) if number else norm.isf(np.minimum(0.5 * budgets / sigma.shape[1], 0.5))[:, None]
+        kept = np.minimum(backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, away * sigma))
+        left = budgets - np.where(binds, 0.0, norm.sf(kept / sigma)).sum(axis=1)
+        share = norm.isf(np.minimum(left / np.maximum(binds.sum(axis=1), 1), 0.5))
+        moved = np.where(binds, share[:, None] * sigma, kept)
+        backoff = np.where(binds.any(axis=1)[:, None], moved, backoff)
         z = solved(backoff)
         now = room_x - (rows_x[:, :, 1:] @ z)
     slack = 0.0 if free else float(np.maximum(backoff - now, 0.0).sum())

@@ -13,6 +13,7 @@ Flags = NDArray[np.bool_]
 
 _KEEPS = 0.5  # of the room between a row that does not bind and its back-off: what it keeps
 _AWAY = -float(ndtri(1e-6))  # deviations beyond which a row that does not bind keeps no more
+DISTANT = 0.5  # of a budget: what rows share, before there is a plan, that the regulator's is not near
 _BINDS = 1e-9  # of a row's standard deviation: nearer than this to its back-off, it binds
 
 
@@ -34,7 +35,9 @@ def binding(backoff: Array, room: Array, sigma: Array) -> Flags:
     return np.asarray(room <= backoff + _BINDS * sigma)
 
 
-def shifted(backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Flags) -> Array:
+def shifted(
+    backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Flags, away: Array | float = _AWAY
+) -> Array:
     """Back-offs after risk has gone from the rows that do not bind to those that do, in stages where some do.
 
     What does not bind keeps half of its room, so the plan at hand keeps all of them.
@@ -45,8 +48,9 @@ def shifted(backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Fl
         sigma: Standard deviations (S, m).
         budgets: ε̄ of the stages (S,).
         binds: Which rows bind (S, m).
+        away: Standard deviations (S, 1) beyond which a row that does not bind keeps no more.
     """
-    farthest = np.maximum(backoff, _AWAY * sigma)
+    farthest = np.maximum(backoff, away * sigma)
     kept = np.minimum(backoff + _KEEPS * np.maximum(room - backoff, 0.0), farthest)
     count = binds.sum(axis=1)
     left = budgets - np.where(binds, 0.0, spent(kept, sigma)).sum(axis=1)

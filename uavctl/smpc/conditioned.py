@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from uavctl.data import GaveWay, SolveStatus
 from uavctl.errors import DesignError
 from uavctl.smpc.age_risk import LARGEST_RISK, PRICE, age_risk
-from uavctl.smpc.allocation import binding, quantile, shifted, spent
+from uavctl.smpc.allocation import DISTANT, binding, quantile, shifted, spent
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import INPUT_TOLERANCE, KEPT, inside
 from uavctl.smpc.baselines.problem import Problem, parts, unseen
@@ -46,7 +46,8 @@ from uavctl.smpc.slew import SlewRows
 Array = NDArray[np.float64]
 
 METHOD = "age-conditioned"
-ROUNDS = 3  # programs of an allocation that has to be shifted
+ROUNDS = 2  # programs of an allocation
+MOST_ROUNDS = 3  # of one whose plan does not keep its back-offs
 MOST_SHIFTING = 300  # iterations of all programs so far, above which no more risk is shifted
 _OPEN = np.array([OPEN])
 
@@ -59,12 +60,14 @@ class _Margins:
         sigma: Standard deviations (H, m).
         budgets: ε̄ of the stages (H,).
         backoff: Back-offs (H, m) of rows that share the budgets equally.
+        distant: Standard deviations (H, 1) that rows keep at first which the regulator's plan is not near.
         rest: What a plan that rests keeps from the rows that an equilibrium may be at, each budget to itself.
     """
 
     sigma: Array
     budgets: Array
     backoff: Array
+    distant: Array
     rest: Array
 
 
@@ -140,6 +143,7 @@ class ConditionedSolver:
         ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
         self._budgets = self.risk.budgets[ages]
         self._shared = quantile(self._budgets / max(1, width))[:, :, None]
+        self._distant = quantile(DISTANT * self._budgets / max(1, width))[:, :, None]
         self._whole = quantile(self._budgets)[:, :, None]
         self._last: tuple[tuple[int, bytes], _Margins] | None = None
 
@@ -215,7 +219,8 @@ class ConditionedSolver:
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
             rest = (self._whole[late] * sigma[:, self._resting]).max(axis=0)
-            self._last = key, _Margins(sigma, self._budgets[late], self._shared[late] * sigma, rest)
+            shared = self._shared[late] * sigma
+            self._last = key, _Margins(sigma, self._budgets[late], shared, self._distant[late], rest)
         return self._last[1]
 
     def _reference(self, target: Array, limits: Array, margins: _Margins) -> Array:
@@ -241,9 +246,10 @@ class ConditionedSolver:
     def _spread(self, room: Array, hard: Array, margins: _Margins) -> _Found | None:
         """Plans of all parts, the budgets spread over the rows of all of them in a few rounds.
 
-        Each row begins with an equal share. Rows that do not bind keep a share that still leaves half of their room,
-        and those that bind get the rest. The plan of one round keeps the limits of the next, so that no round costs
-        more, and a part of which no state row binds keeps its plan.
+        Rows that do not bind keep a share that still leaves half of their room, and those that bind get the rest. The
+        plan of one round keeps the limits of the next, so that no round costs more, and a part of which no state row
+        binds keeps its plan. Before the first one it is by the regulator's plan: a row that it leaves too little room
+        for an equal share in any stage counts as binding in all of them, and the others share half of a budget.
 
         Args:
             room: Room of the state rows where z = 0 (H, m).
@@ -259,12 +265,18 @@ class ConditionedSolver:
             within = spent(room[stages], sigma[stages])
             if within.max() <= LARGEST_RISK and (within.sum(axis=1) <= budgets[stages]).all():
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
+        near = over.any(axis=0)
+        if np.count_nonzero(near):
+            backoff = shifted(backoff, room, sigma, budgets, np.broadcast_to(near, over.shape), margins.distant)
+            over = room < backoff
         todo = [one for one in self._parts if tight[one.hard].any() or np.count_nonzero(over[:, one.columns])]
         left: dict[PartProgram, Array] = {}
         found, now = None, room
         iterations = 0
-        for number in range(ROUNDS):
+        for number in range(MOST_ROUNDS):
             if number:
+                if number >= ROUNDS and (backoff - now).max() <= KEPT:
+                    break
                 binds = binding(backoff, now, sigma)
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
