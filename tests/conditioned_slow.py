@@ -111,13 +111,15 @@ def plan_slowly(
     now = room_x - (rows_x[:, :, 1:] @ z)
     taken = norm.sf(now / sigma)
     free = (room_u >= of_hard[:, 1:] @ z).all() and taken.max() <= 0.5 and (taken.sum(axis=1) <= budgets).all()
-    near = np.tile((now < backoff).any(axis=0), (steps, 1))
+    near = np.logical_or.reduce(now < backoff) & np.ones(now.shape, dtype=bool)
     for number in range(0 if free else MOST_ROUNDS):
-        if number >= ROUNDS and (backoff <= now + 1e-7).all():
+        if number >= ROUNDS and (backoff <= now + 1e-6).all():
             break
         binds = now <= backoff + 1e-9 * sigma if number else near
-        away = norm.isf(1e-6) if number else norm.isf(np.minimum(0.5 * budgets / sigma.shape[1], 0.5))[:, None]
-        kept = np.minimum(backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, away * sigma))
+        away = np.full(steps, 1e-6) if number else np.minimum(0.5 * budgets / sigma.shape[1], 0.5)
+        kept = np.minimum(
+            backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, norm.isf(away)[:, None] * sigma)
+        )
         left = budgets - np.where(binds, 0.0, norm.sf(kept / sigma)).sum(axis=1)
         share = norm.isf(np.minimum(left / np.maximum(binds.sum(axis=1), 1), 0.5))
         moved = np.where(binds, share[:, None] * sigma, kept)
