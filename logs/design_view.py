@@ -82,6 +82,12 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             position[AXIS_NUMBER[axis]] = float(state[index])
         return (position[0], position[1], position[2])
 
+    def positions_of(self, states: Matrix | Floats) -> Floats:
+        """The same of many states (n, n_x): (n, 3)."""
+        positions = np.zeros((len(states), 3))
+        positions[:, [AXIS_NUMBER[axis] for axis in self.axes]] = np.asarray(states)[:, self.position_index]
+        return positions
+
     def state_name(self, index: int) -> str:
         """Name of a state for people, e.g. "north position"."""
         if self.state_names:

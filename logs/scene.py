@@ -1,6 +1,7 @@
 """3D scenes of a flight in Foxglove's messages. All of it is local NED; viewers turn it (topic /view/frames).
 
 The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each depth.
+Those of which there is one a stage are filled in (`Many`).
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 
 from logs.design_view import AXIS_NUMBER, DesignView, Floats
+from logs.many import Many
 from logs.plot_records import tightened
-from uavctl.data import ControlMode, Decision, Estimate, Event, Plan, Severity, Vec3
+from uavctl.data import ControlMode, Decision, Estimate, Event, Matrix, Plan, Severity, Vec3
 from uavctl.frames import axes_turn, from_axes
 
 Fields = dict[str, Any]  # of a message within another
@@ -82,9 +85,11 @@ def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
     return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
 
 
-def poses_in_frame(at_ns: int, places_m: Iterable[Vec3]) -> PosesInFrame:
-    """Places in local NED [m], in order."""
-    return _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED, poses=[pose(one) for one in places_m])
+def poses_in_frame(at_ns: int, places_m: Floats) -> PosesInFrame:
+    """Places in local NED [m] (n, 3), in order."""
+    message = _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED)
+    message.MergeFromString(_POSES.of(places_m))
+    return message
 
 
 def frames(at_ns: int) -> FrameTransforms:
@@ -131,17 +136,20 @@ def plan_scene(at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | 
     A stage's ellipsoid has the back-offs of the position limits as semi-axes: what the plan keeps
     from them so that they hold with the promised probability. The estimate's is from its covariance.
     """
-    places = [design.position_of(state) for state in plan.states]
+    places = design.positions_of(plan.states)
+    spread = np.concatenate([places, 2.0 * _reach(design, plan.backoff_x)], axis=1)
     lower, upper = _sides(design, *tightened(design, design.state_box, plan.backoff_x, -1))
-    stages = [_sphere(pose(at_m), _reach(design, row)) for at_m, row in zip(places, plan.backoff_x, strict=True)]
     entities = [
-        _entity(at_ns, "predicted path", lines=[_line(places, _PLANNED, 3.0)]),
-        _entity(at_ns, "predicted spread", spheres=stages),
+        _entity(at_ns, "predicted path", lines=[_line((), _PLANNED, 3.0)]),
+        _entity(at_ns, "predicted spread"),
         _entity(at_ns, "limits less back-offs", lines=[_box(lower, upper, _TIGHT)]),
     ]
     if estimate is not None:
         entities.append(_entity(at_ns, "estimate, 95 %", spheres=[_estimate_sphere(design, estimate)]))
-    return _update(*entities)
+    scene = _update(*entities)
+    scene.entities[0].lines[0].MergeFromString(_POINTS.of(places))
+    scene.entities[1].MergeFromString(_SPHERES.of(spread))
+    return scene
 
 
 def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
@@ -217,12 +225,13 @@ def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3
     )
 
 
-def _reach(design: DesignView, backoff: Sequence[float]) -> Vec3:
-    """Semi-axes of a stage's ellipsoid (3,) [m]; 0 in an axis without limits."""
-    reach = [0.0] * len(design.target)
+def _reach(design: DesignView, backoff: Matrix) -> Floats:
+    """Semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
+    rows = np.array(backoff)
+    reach = np.zeros((len(rows), len(design.target)))
     for state, row, size in design.position_rows:
-        reach[state] = max(reach[state], backoff[row] / size)
-    return design.position_of(reach)
+        np.maximum(reach[:, state], rows[:, row] / size, out=reach[:, state])
+    return design.positions_of(reach)
 
 
 def _sphere(at: Fields, semi_axes_m: Sequence[float]) -> Fields:
@@ -238,3 +247,10 @@ def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
     turn = quaternion(from_axes(directions.T.tolist()))
     return _sphere(pose(design.position_of(estimate.mean), turn), semi_axes_m.tolist())
+
+
+_POSES = Many(lambda at_m: _made(PosesInFrame, poses=[pose(at_m)]), 3)
+_POINTS = Many(lambda at_m: _made(LinePrimitive, points=[vector(at_m)]), 3)
+_SPHERES = Many(
+    lambda of: _made(SceneEntity, spheres=[{"pose": pose(of[:3]), "size": vector(of[3:]), "color": _SPREAD}]), 6
+)
