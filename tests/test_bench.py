@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
 
 from uavctl.bench import BenchResult, Sizes, run, run_bench
+from uavctl.bench.decisions import questions, time_decisions
 from uavctl.bench.frozen_qp import FrozenProgram, time_frozen_qp
 from uavctl.bench.growth import copies, few_policies, growth_with_axes, lengthened
 from uavctl.bench.in_flight import InFlight
@@ -120,6 +121,33 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
     assert len(covs) == 9
     assert all((one != other).any() for one, other in pairwise(covs))
     assert all(one.sent is given.u_target for one in asked)
+
+
+def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> None:
+    solver = build_conditioned(load_config("room", ["smpc.scheme=age-conditioned"])).solver
+    asked = [*questions(solver, 30, 4)]
+    low, high = solver.problem.state_set.bounds
+    assert all((low <= x).all() and (x <= high).all() for x, _, _ in asked)
+    assert all((low <= target).all() and (target <= high).all() for _, target, _ in asked)
+    assert len({outlook.cov[0, 0] for _, _, outlook in asked if outlook.cov is not None}) == 30
+    told: list[int] = []
+    found = time_decisions(solver, 30, 4, told.append)
+    answers = [solver.solve(i, *one) for i, one in enumerate(asked)]
+    assert told == list(range(1, 31))
+    assert found.iterations.max == max(answer.iterations for answer in answers) > 0
+    assert found.gave_way == pytest.approx(sum(answer.slack > 0.0 for answer in answers) / 30)
+    assert found.without == sum(answer.status is not SolveStatus.OPTIMAL for answer in answers)
+    assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max
+
+
+def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--set", "smpc.scheme=age-conditioned", "--states", "5"]
+    assert command(["bench", *options, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["states"] == 5 and set(document["iterations"]) == {"p50", "p99", "max"}
+    assert command(["bench", *options]) == 0
+    assert f"at most {document['iterations']['max']:.0f}." in capsys.readouterr().out
+    assert command(["bench", *options, "--plot", "x.svg"]) == 2
 
 
 def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -11,6 +13,12 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
     p50: float
     p99: float
     max: float
+
+    @staticmethod
+    def of(values: NDArray[np.float64]) -> Quantiles:
+        """Of values (n,)."""
+        p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
+        return Quantiles(p50=p50, p99=p99, max=most)
 
 
 class Shares(msgspec.Struct, frozen=True, kw_only=True):

@@ -123,7 +123,7 @@ def run_bench(
     memory.append(_peak_mb())
 
     components = len(decompose(design))
-    library_us, gaps = _quantiles(by_library.us), np.array([answer.gap for answer in by_library.answers])
+    library_us, gaps = Quantiles.of(by_library.us), np.array([answer.gap for answer in by_library.answers])
     exact_ms, axes_ms, joint_ms = (float(np.median(found.us)) / 1e3 for found in (exact, axes, joint))
     endings = [answer.status for answer in joint.answers]
     parts = [part for variant in library.variants for part in variant]
@@ -150,7 +150,7 @@ def run_bench(
         ratio_exact_library=exact_ms * 1e3 / library_us.p50,
         conditioned=_conditioned(ours[0], axes_ms) if ours else None,
         shares=_shares(by_library),
-        gap=_quantiles(gaps),
+        gap=Quantiles.of(gaps),
         certificate_excess=_excess(by_library.answers, exact.answers),
         cost_difference=None if design.estimate_cov.any() else _cost_difference(axes.answers, exact.answers),
         library_s=library_s,
@@ -167,10 +167,10 @@ def run_bench(
 
 
 def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
-    us = _quantiles(found.us)
+    us = Quantiles.of(found.us)
     return ConditionedTimes(
         us=us,
-        iterations=_quantiles(np.array([answer.iterations for answer in found.answers])),
+        iterations=Quantiles.of(np.array([answer.iterations for answer in found.answers])),
         left_alone=sum(answer.iterations == 0 for answer in found.answers) / len(found.answers),
         ratio_cvxpy=axes_ms * 1e3 / us.p50,
     )
@@ -201,11 +201,6 @@ def _each(told: Callable[[int], None]) -> Callable[[], None]:
 def _peak_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / _MEGABYTE if sys.platform == "darwin" else peak * 1024 / _MEGABYTE
-
-
-def _quantiles(values: Array) -> Quantiles:
-    p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0])
-    return Quantiles(p50=float(p50), p99=float(p99), max=float(most))
 
 
 def _shares(found: Timed) -> Shares:
