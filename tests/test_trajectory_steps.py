@@ -48,7 +48,7 @@ def test_the_inputs_of_a_motion_are_about_its_acceleration_at_any_step(preset: s
     assert np.abs(motion.states[:, list(plant.position_index)] - place(t)).max() < 5e-3
     # Drag and lag ask for some more; steps that ring would ask for many times as much.
     largest = np.abs(acceleration(t)).max()
-    assert largest < np.abs(motion.inputs).max() < 1.5 * largest
+    assert 0.95 * largest < np.abs(motion.inputs).max() < 1.5 * largest
     over = motion.states[1:] - motion.states[:-1] @ plant.a.T - motion.inputs[:-1] @ plant.b.T
     assert np.abs(over).max() < 1e-9
 

@@ -32,7 +32,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from uavctl.errors import UavctlError
-from uavctl.trial.case import AUTOPILOTS, SCENARIOS, Scenario, TrialCell, TrialPilot
+from uavctl.trial.case import AIRS, AUTOPILOTS, SCENARIOS, Scenario, TrialCell, TrialPilot
 from uavctl.trial.figures import SHOWN
 from uavctl.trial.fly import TrialFlight, fly
 from uavctl.trial.own_loop import TUNED, OwnTuning
@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--rates", nargs="+", type=float, default=[5.0, 50.0], help="of the cameras [Hz]")
     parser.add_argument("--losses", nargs="+", type=float, default=[0.3, 0.6])
-    parser.add_argument("--air", nargs="+", choices=("gusts", "calm"), default=["gusts"])
+    parser.add_argument("--air", nargs="+", choices=AIRS, default=["gusts"])
     parser.add_argument("--seconds", type=float, default=40.0, help="length of a flight [s]; an eight has its own")
     parser.add_argument("--from", dest="from_s", type=float, default=10.0, help="from when on it is to hold [s]")
     parser.add_argument("--own-gain", action="append", default=[], metavar="NAME=VALUE", help="of own-tuned")

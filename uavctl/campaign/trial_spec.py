@@ -73,7 +73,9 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     air: Annotated[
         tuple[Air, ...],
         Meta(
-            min_length=1, max_length=2, description="`calm`, or `gusts`: 0.7 m/s of wind with gusts (gust_wind_mps 3)"
+            min_length=1,
+            max_length=3,
+            description="`calm`, or 0.7 m/s of wind with `gusts` (gust_wind_mps 3) or `strong-gusts` (gust_wind_mps 8)",
         ),
     ] = ("gusts",)
     controller: Annotated[

@@ -16,12 +16,13 @@ from uavctl.trial.own_loop import OwnTuning
 
 Scenario = Literal["hold", "eight", "blackout"]
 AutopilotName = Literal["px4", "ardupilot"]
-Air = Literal["calm", "gusts"]
+Air = Literal["calm", "gusts", "strong-gusts"]
 
 SCENARIOS: tuple[Scenario, ...] = ("hold", "eight", "blackout")
 AUTOPILOTS: tuple[AutopilotName, ...] = ("px4", "ardupilot")
-WIND_MPS: Vec3 = (0.6, -0.36, 0.0)  # 0.7 m/s
-GUST_WIND_MPS = 3.0
+AIRS: tuple[Air, ...] = ("calm", "gusts", "strong-gusts")
+WIND_MPS: Vec3 = (0.6, -0.36, 0.0)  # 0.7 m/s, wherever there are gusts
+GUST_WIND_MPS: dict[Air, float] = {"calm": 0.0, "gusts": 3.0, "strong-gusts": 8.0}
 BLACKOUT_S = 4.0
 BLACKOUT_BEGINS_S = (1.0, 6.0)  # the way of preset `room` takes about as long
 _MOMENT = 1  # child of a flight's seed that draws when a blackout begins
@@ -69,7 +70,7 @@ class TrialCell:
         rate_hz: Of the cameras.
         link_name: What the link is called.
         link: Overrides that make it.
-        air: Calm, or wind and gusts.
+        air: Calm, or wind with gusts (`GUST_WIND_MPS`).
     """
 
     pilot: TrialPilot
@@ -87,7 +88,7 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
     Raises:
         ConfigError: An override is none.
     """
-    wind, gusts = (WIND_MPS, GUST_WIND_MPS) if cell.air == "gusts" else ((0.0, 0.0, 0.0), 0.0)
+    wind = (0.0, 0.0, 0.0) if cell.air == "calm" else WIND_MPS
     more = [
         f"duration_s={seconds}",
         "sim.plant=quadrotor",
@@ -95,7 +96,7 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
         f"sim.seed={seed}",
         f"sim.camera.rate_hz={cell.rate_hz}",
         f"sim.wind.velocity_mps={list(wind)}",
-        f"sim.wind.gust_wind_mps={gusts}",
+        f"sim.wind.gust_wind_mps={GUST_WIND_MPS[cell.air]}",
         *cell.link,
     ]
     if cell.scenario == "blackout":
