@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from mavlink_rig import OFFBOARD, SECOND, Peer, events, make_link, read, statuses
@@ -15,6 +17,7 @@ from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS
 
 NOW = 1000 * SECOND
+MS = 1_000_000
 WRAP_MS = 2**32
 
 
@@ -140,7 +143,7 @@ PX4, ARDUPILOT = 12, 3
 
 def felt(link: Link, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw: bool = False) -> list[InertialSample]:
     name, rest = ("raw_imu", (0,) * 6) if raw else ("highres_imu", (*(0.0,) * 10, 0))
-    items = link.receive(vehicle.send(name, 0, *force, *rest), at_ns)
+    items = link.receive(vehicle.send(name, at_ns // 1000, *force, *rest), at_ns)
     return [item for item in items if isinstance(item, InertialSample)]
 
 
@@ -151,30 +154,79 @@ def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(
     turn = Rotation.from_euler("ZYX", (2.0, -0.2, 0.1))
     if quaternion:
         w, x, y, z = turn.as_quat(scalar_first=True)
-        link.receive(vehicle.send("attitude_quaternion", 0, w, x, y, z, 0.0, 0.0, 0.0), NOW)
+        link.receive(vehicle.send("attitude_quaternion", NOW // MS, w, x, y, z, 0.0, 0.0, 0.0), NOW)
     else:
-        link.receive(vehicle.send("attitude", 0, 0.1, -0.2, 2.0, 0.0, 0.0, 0.0), NOW)
+        link.receive(vehicle.send("attitude", NOW // MS, 0.1, -0.2, 2.0, 0.0, 0.0, 0.0), NOW)
     force = (0.5, -0.25, -9.5)
     (sample,) = felt(link, vehicle, force, NOW + TURNED_NS)
     assert sample.at_ns == NOW + TURNED_NS
     assert sample.accel_mps2 == pytest.approx(turn.apply(force) + np.array([0.0, 0.0, 9.80665]), abs=1e-6)
-    assert felt(link, vehicle, force, NOW + TURNED_NS + 1) == []  # the attitude is too old
+    assert felt(link, vehicle, (0.5, -0.25, -9.4), NOW + TURNED_NS + 1_000) == []  # the attitude is too old
     assert felt(link, vehicle, (float("nan"), 0.0, 0.0), NOW) == []
     assert felt(link, Peer(1, 100), force, NOW) == felt(link, Peer(9, 1), force, NOW) == []  # a camera, another one
+
+
+def stream(lies: Callable[[int], tuple[int, int, bool, bool]], count: int = 300) -> list[int]:
+    """Which of a stream of 50 Hz give an acceleration, each with an attitude.
+
+    Args:
+        lies: of message i, what its arrival and its stamp are late [ns], and whether force and attitude are frozen.
+        count: of messages.
+    """
+    link, vehicle = heard(inertial_std_mps2=0.1)
+    taken = []
+    for i in range(count):
+        late_ns, behind_ns, frozen, stiff = lies(i)
+        at_ns, stamp_ns = NOW + i * 20 * MS + late_ns, NOW + i * 20 * MS - behind_ns
+        roll, north = 0.0 if stiff else 1e-4 * (i % 7), 0.1 if frozen else 0.01 * (i % 11)
+        link.receive(vehicle.send("attitude", stamp_ns // MS, roll, 0.0, 0.0, 0.0, 0.0, 0.0), at_ns)
+        items = link.receive(vehicle.send("highres_imu", stamp_ns // 1000, north, 0.0, -9.8, *(0.0,) * 10, 0), at_ns)
+        taken += [i for item in items if isinstance(item, InertialSample)]
+    return taken
+
+
+def test_inertial_data_that_are_of_now_are_all_taken_whatever_the_clocks() -> None:
+    assert stream(lambda i: (0, 0, False, False)) == list(range(300))
+    assert stream(lambda i: (3 * MS * (i % 5), 0, False, False)) == list(range(300))  # jitter
+    drifting = stream(lambda i: (0, -i * 1_000, False, False))  # 50 ppm
+    assert drifting == list(range(300))
+    assert stream(lambda i: (0, i * 1_000, False, False)) == list(range(300))
+
+
+@pytest.mark.parametrize(
+    "lies",
+    [
+        lambda i: (500 * MS if i >= 100 else 0, 0, False, False),
+        lambda i: (0, 100 * MS if i >= 100 else 0, False, False),
+        lambda i: (0, 0, i >= 100, False),
+        lambda i: (0, 0, False, i >= 100),
+    ],
+    ids=["late", "old stamps", "frozen force", "frozen attitude"],
+)
+def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tuple[int, int, bool, bool]]) -> None:
+    taken = stream(lies, count=190)
+    assert taken[:100] == list(range(100))
+    assert len(taken[100:]) <= 1 + TURNED_NS // (20 * MS)  # as long as the last attitude turns them
+
+
+@pytest.mark.parametrize("jump_s", [-900, 900])
+def test_another_clock_of_the_same_vehicle_is_taken_up_at_once(jump_s: int) -> None:
+    assert stream(lambda i: (0, 0 if i < 50 else jump_s * SECOND, False, False)) == list(range(300))
 
 
 def test_a_quaternion_beside_the_angles_counts_only_where_inertial_data_are_used() -> None:
     for std_mps2, wanted in ((0.0, 0), (0.1, 1)):
         link, vehicle = heard(inertial_std_mps2=std_mps2)
-        told = link.receive(vehicle.send("attitude_quaternion", 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
+        told = link.receive(vehicle.send("attitude_quaternion", NOW // MS, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
         assert len(told) == wanted
 
 
 def test_raw_inertial_data_have_ardupilots_unit_and_are_taken_from_it_only() -> None:
     for autopilot in (PX4, ARDUPILOT):
-        link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
+        estimator = EstimatorConfig(position_std_m=0.005, inertial_std_mps2=0.1)
+        link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05), estimator=estimator), Peer(1, 1)
         link.receive(vehicle.heartbeat(autopilot=autopilot), NOW)
-        link.receive(vehicle.send("attitude", 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
+        link.receive(vehicle.send("attitude", NOW // MS, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
         told = felt(link, vehicle, (100, -200, -1000), NOW, raw=True)
         accels = [sample.accel_mps2 for sample in told]
         wanted = [pytest.approx((0.980665, -1.96133, 0.0), abs=1e-9)] if autopilot == ARDUPILOT else []

@@ -185,6 +185,8 @@ def _felt_since(state: ControlState, tick: Tick, controller: Controller) -> bool
     """Whether inertial data have come since the plan was made, and the solver counts the age of what it is made of."""
     if state.plan is None or (tick.age_steps or 0) > controller.late_steps:
         return False
+    if tick.belief is not None and tick.boundary_ns - tick.belief.captured_ns > PLANNED_NS:
+        return False
     newest_ns = None if tick.belief is None else tick.belief.felt_ns
     return newest_ns is not None and newest_ns > state.plan.base_ns - controller.dead_ns
 
@@ -227,28 +229,31 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
         math.hypot(*moving),
         state.accel_mps2,
         controller.fallback,
-        held_mps2(state, fallback, tick, controller),
+        held_mps2(state, fallback, controller),
         measured=measured,
         blind=not (measured or reckons(fallback, tick))
         and (tick.age_steps is None or tick.age_steps >= controller.horizon),
     )
 
 
+# Behind a position that is older no plans are made by inertial data: nothing would tell that they err, and the plan
+# would follow them. Of positions five times a second of which 60 % are lost one in ten is older.
+PLANNED_NS = 1_000_000_000
 RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 
 
 def reckons(fallback: Fallback, tick: Tick) -> bool:
     """Whether the vehicle's own inertial data carry an estimate on that nothing speaks against."""
     belief = tick.belief
-    if belief is None or belief.felt_ns is None or fallback.final:
+    if belief is None or belief.felt_ns is None or belief.doubted_ns is not None or fallback.final:
         return False
     return belief.at_ns - belief.felt_ns <= RECKONS_NS
 
 
-def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, controller: Controller) -> Vec3:
+def held_mps2(state: ControlState, fallback: Fallback, controller: Controller) -> Vec3:
     """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
-    felt = tick.estimate is not None and reckons(fallback, tick)
-    bias = tick.estimate.bias if tick.estimate is not None and felt else fb.learnt(state.biases)
+    # A bias of while no position came may be an error of the inertial data, and would be flown for seconds.
+    bias = fb.learnt(state.biases)
     # What the vehicle keeps when nothing more is sent is zero itself.
     if not bias or (fallback.final and fallback.mode is ControlMode.HOLD) or fallback.end is End.LET_GO:
         return ZERO

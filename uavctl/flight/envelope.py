@@ -253,6 +253,14 @@ def misled(watching: Watching, seen: Observation, age_s: float, parameters: Enve
     return velocity is not None and not _near(velocity, seen.velocity_mps, within_mps)
 
 
+def contradicts(watching: Watching, seen: Observation, parameters: EnvelopeParameters) -> bool:
+    """Whether a velocity that inertial data have carried on is not the vehicle's own, for which positions spoke."""
+    if watching.contradicted or watching.apart_mps is None:
+        return False
+    velocity = own_words(seen.motion, seen.at_ns)
+    return velocity is not None and not _near(velocity, seen.velocity_mps, parameters.disagreement_mps)
+
+
 def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
     """Whether no axis is further apart, of those that are known."""
     pairs = zip(velocity, known, strict=True)

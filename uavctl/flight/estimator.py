@@ -149,6 +149,20 @@ def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) ->
     return _inserted(kalman, history, new, None)
 
 
+def doubted(kalman: Kalman, history: History, at_ns: int) -> History:
+    """The state without the inertial data since the newest position, and with more of them doubted."""
+    newest = max((place for place, entry in enumerate(history.entries) if entry.sample is not None), default=-1)
+    node, kept = history.anchor, []
+    for place, entry in enumerate(history.entries):
+        if place > newest and entry.accel_mps2 is not None:
+            continue
+        node = _after(kalman, history.origin_ns, node, entry)
+        if place >= newest and node.belief is not None:
+            node = replace(node, belief=replace(node.belief, doubted_ns=node.belief.doubted_ns or at_ns))
+        kept.append(replace(entry, after=node))
+    return replace(history, entries=tuple(kept))
+
+
 def _says_something(sample: InertialSample, before: InertialSample | None) -> bool:
     told = all(map(math.isfinite, sample.accel_mps2))
     return told and (before is None or before.accel_mps2 != sample.accel_mps2)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.data import PositionSample, Vec3
@@ -27,8 +28,14 @@ from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
 
-# Inertial data further from the prediction than this many standard deviations, in any axis, are not believed.
-FELT_SIGMA = 6.0
+# Inertial data further from the prediction than this many standard deviations, in any axis, are not believed: twenty
+# come in a second, so one that is left out for nothing costs next to nothing.
+FELT_SIGMA = 3.0
+# So many of them in a row, or a position so far from where they carried the estimate (squared distance by covariance,
+# three axes: chance 1e-8), and they are doubted, until positions agree again and for this time at least.
+REFUSED, CONTRADICTED = 3, 40.0
+DOUBTED_NS = 3_000_000_000
+RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
 
 
 @dataclass(frozen=True)
@@ -99,13 +106,25 @@ class Kalman:
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
-    """Gaussian of z = (x, w) at `at_ns`, with the times of the newest sample and of the newest inertial data in it."""
+    """Gaussian of z = (x, w) at `at_ns`, and what went into it.
+
+    Attributes:
+        at_ns: Time [ns].
+        captured_ns: Capture time of the newest sample in it [ns].
+        mean: (n_x + n_w,).
+        cov: (n_x + n_w, n_x + n_w).
+        felt_ns: Time of the newest inertial data in it [ns]; None without any.
+        refused: Inertial data in a row that were not believed.
+        doubted_ns: Since when inertial data are doubted, and not used [ns]; None where they are not.
+    """
 
     at_ns: int
     captured_ns: int
-    mean: Array  # (n_x + n_w,)
-    cov: Array  # (n_x + n_w, n_x + n_w)
-    felt_ns: int | None = None  # of those that were believed
+    mean: Array
+    cov: Array
+    felt_ns: int | None = None
+    refused: int = 0
+    doubted_ns: int | None = None
 
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
@@ -168,7 +187,7 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
             if u is None and kalman.n_bias:
                 _forget_bias(kalman, mean, cov)
         now_ns = stop_ns
-    return Belief(at_ns=now_ns, captured_ns=belief.captured_ns, mean=mean, cov=cov, felt_ns=belief.felt_ns)
+    return replace(belief, at_ns=now_ns, mean=mean, cov=cov)
 
 
 def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
@@ -206,27 +225,52 @@ def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
     values, variances = shown_by(kalman, sample)
     index = kalman.shown[: len(values)]
     noise = np.diag(variances)
+    if kalman.n_felt:
+        belief = _confronted(kalman, belief, values, noise)
     ph = belief.cov[:, index]
     gain = np.linalg.solve(ph[index] + noise, ph.T).T
     keep = np.eye(len(belief.mean))
     keep[:, index] -= gain
-    return Belief(
-        at_ns=belief.at_ns,
+    return replace(
+        belief,
         captured_ns=captured_ns(sample),
         mean=belief.mean + gain @ (values - belief.mean[index]),
         cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
-        felt_ns=belief.felt_ns,
     )
 
 
+def _confronted(kalman: Kalman, belief: Belief, values: Array, noise: Array) -> Belief:
+    """The belief before an update, with its inertial data doubted, or not any more, by what a sample shows."""
+    index = kalman.shown[: len(values)]
+    off = values - belief.mean[index]
+    contradicted = float(off @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, off)) > CONTRADICTED
+    if belief.doubted_ns is not None:
+        ended = not contradicted and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
+        return replace(belief, refused=0, doubted_ns=None) if ended else belief
+    if not contradicted or belief.felt_ns is None:
+        return belief
+    cov = belief.cov.copy()
+    _widen(cov, kalman.shown[len(kalman.axes) :], RELEARNT_MPS**2)
+    if kalman.n_bias:
+        _widen(cov, np.arange(kalman.bias.start, kalman.bias.stop), (0.25 * kalman.parameters.bias_max) ** 2)
+    return replace(belief, cov=cov, doubted_ns=belief.at_ns)
+
+
+def _widen(cov: Array, index: NDArray[np.intp], variance: float) -> None:
+    """Add to variances, in place."""
+    cov[index, index] += variance
+
+
 def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> Belief:
-    """Kalman update with an acceleration (n_felt,) under an input (n_u,); the belief itself where it cannot be so.
+    """Kalman update with an acceleration (n_felt,) under an input (n_u,); without it where it cannot be so.
 
     Raises:
         ValueError: The filter uses no inertial data.
     """
     if not kalman.n_felt:
         raise ValueError("this filter uses no inertial data")
+    if belief.doubted_ns is not None:
+        return belief
     of_z, noise = kalman.felt_z, np.eye(kalman.n_felt) * kalman.parameters.inertial_std_mps2**2
     off = accel_mps2 - of_z @ belief.mean
     if u is not None:
@@ -234,15 +278,16 @@ def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> 
     ph = belief.cov @ of_z.T
     shown = of_z @ ph + noise
     if not bool((np.square(off) <= FELT_SIGMA**2 * np.diagonal(shown)).all()):
-        return belief
+        refused = belief.refused + 1
+        return replace(belief, refused=refused, doubted_ns=belief.at_ns if refused >= REFUSED else None)
     gain = np.linalg.solve(shown, ph.T).T
     keep = np.eye(len(belief.mean)) - gain @ of_z
-    return Belief(
-        at_ns=belief.at_ns,
-        captured_ns=belief.captured_ns,
+    return replace(
+        belief,
         mean=belief.mean + gain @ off,
         cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
         felt_ns=belief.at_ns,
+        refused=0,
     )
 
 

@@ -29,10 +29,10 @@ from uavctl.data import (
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, moving_mps, place, seen_of
-from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, is_outside, watch
-from uavctl.flight.estimator import act, begin, feel, set_input, without
+from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
+from uavctl.flight.estimator import act, begin, doubted, feel, set_input, without
 from uavctl.flight.fallback import End
-from uavctl.flight.kalman import Array, captured_ns
+from uavctl.flight.kalman import Array, Belief, captured_ns
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
@@ -106,6 +106,10 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     if inp.inertial:
         intake = replace(intake, history=feel(controller.kalman, intake.history, inp.inertial))
     tick = place(state, inp, intake.history, controller)
+    lies = _lies(state, tick, inp, controller)
+    if lies:
+        intake = replace(intake, history=doubted(controller.kalman, intake.history, inp.at_ns))
+        tick = place(state, inp, intake.history, controller)
     recalled = _recalled(state, tick, inp, controller)
     watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
     if before is ControlMode.WAIT and intake.absurd and _is_ours(inp.vehicle) and controller.envelope is not None:
@@ -122,7 +126,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)
-    taken_back = state.taken_back if clean_ns is None else tick.number
+    taken_back = state.taken_back if clean_ns is None and not lies else tick.number
     afresh = tick.boundary and taken_back is not None and 0 < tick.number - taken_back <= AFRESH_STEPS
     begun = replace(
         ordered,
@@ -190,6 +194,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
             *(() if breach is None else (_breached(inp.at_ns, breach),)),
             *_events(before, mode, choice, inp, tuple(why for _, why in intake.refused), controller.names),
             *_link_events(alarms, state.link_alarms, link),
+            *_inertial_events(state, tick, inp, controller),
         ),
         refused=tuple(sample for sample, _ in intake.refused),
         link=link,
@@ -209,6 +214,17 @@ def _recalled(state: ControlState, tick: Tick, inp: StepInput, controller: Contr
         return False
     flown = inp.vehicle is not None and not unready(inp.vehicle)
     return not flown or is_outside(seen_of(tick, inp, state.accel_mps2, controller.plant), controller.envelope)
+
+
+def _lies(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
+    """Whether the vehicle's own velocity contradicts what inertial data have carried on without a position."""
+    belief, estimate = tick.belief, tick.estimate
+    if belief is None or estimate is None or controller.envelope is None or inp.motion is None:
+        return False
+    if belief.doubted_ns is not None or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
+        return False
+    seen = seen_of(tick, inp, state.accel_mps2, controller.plant)
+    return contradicts(state.watching, seen, controller.envelope)
 
 
 def _watched(
@@ -300,6 +316,39 @@ def _link_events(alarms: tuple[str, ...], told: tuple[str, ...], link: LinkEstim
     )
 
 
+_INERTIAL = {
+    "inertial-doubted": (
+        Severity.WARNING,
+        "the vehicle's inertial data contradict its positions, its own velocity or its model: they are not used",
+    ),
+    "inertial-silent": (Severity.WARNING, "no inertial data of the vehicle that are of now: flown by its model alone"),
+    "inertial-used": (Severity.INFO, "the vehicle's inertial data are used"),
+}
+SILENT_NS = 1_000_000_000  # without inertial data
+
+
+def _inertial_events(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> tuple[Event, ...]:
+    """What has become of the vehicle's inertial data since the tick before, while we fly."""
+    if not controller.kalman.n_felt or state.history is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
+        return ()
+    before = _inertial(state.history.newest.belief, inp.at_ns - controller.tick_ns)
+    now = _inertial(tick.history.newest.belief, inp.at_ns)
+    if now == before or now is None or before is None:
+        return ()
+    severity, text = _INERTIAL[now]
+    return (Event(at_ns=inp.at_ns, severity=severity, code=now, text=text),)
+
+
+def _inertial(belief: Belief | None, at_ns: int) -> str | None:
+    """The event's code for how it is with inertial data; None before the first position."""
+    if belief is None:
+        return None
+    if belief.doubted_ns is not None:
+        return "inertial-doubted"
+    silent = belief.felt_ns is None or at_ns - belief.felt_ns > SILENT_NS
+    return "inertial-silent" if silent else "inertial-used"
+
+
 def _setpoint(
     state: ControlState, mode: ControlMode, tick: Tick, inp: StepInput, controller: Controller
 ) -> tuple[Setpoint | None, Array | None]:
@@ -311,7 +360,7 @@ def _setpoint(
     if state.fallback is not None:
         moving, _ = moving_mps(state, tick, inp, controller)
         brake = fb.acceleration(state.fallback, inp.at_ns, moving, controller.fallback)
-        held = held_mps2(state, state.fallback, tick, controller)
+        held = held_mps2(state, state.fallback, controller)
         back = back_mps2(state, tick, controller)
         want = (brake[0] + held[0] + back[0], brake[1] + held[1] + back[1], brake[2] + held[2] + back[2])
     elif state.plan is not None:

@@ -94,10 +94,17 @@ class Origin(Message, frozen=True, kw_only=True):
 
 
 class Attitude(Message, frozen=True, kw_only=True):
-    """ATTITUDE or ATTITUDE_QUATERNION: roll, pitch, yaw of body axes forward, right, down in NED [rad]."""
+    """ATTITUDE or ATTITUDE_QUATERNION.
+
+    Attributes:
+        angles_rad: roll, pitch, yaw of body axes forward, right, down in NED.
+        quaternion: it is ATTITUDE_QUATERNION.
+        stamp_us: by the sender's clock, since boot; 0: it does not tell.
+    """
 
     angles_rad: Vec3
     quaternion: bool = False
+    stamp_us: int = 0
 
 
 class Inertial(Message, frozen=True, kw_only=True):
@@ -106,10 +113,12 @@ class Inertial(Message, frozen=True, kw_only=True):
     Attributes:
         specific_force_mps2: that; (0, 0, -g) at rest.
         raw: it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g.
+        stamp_us: by the sender's clock, since boot or of an epoch; 0: it does not tell.
     """
 
     specific_force_mps2: Vec3
     raw: bool = False
+    stamp_us: int = 0
 
 
 class ParamValue(Message, frozen=True, kw_only=True):

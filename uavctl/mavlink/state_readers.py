@@ -28,14 +28,25 @@ def _attitude(raw: Fields) -> Attitude | None:
     angles = (raw.roll, raw.pitch, raw.yaw)
     if not all(map(math.isfinite, angles)):
         return None
-    return Attitude(system=raw.src_system, component=raw.src_component, angles_rad=angles)
+    return Attitude(
+        system=raw.src_system,
+        component=raw.src_component,
+        angles_rad=angles,
+        stamp_us=1000 * raw.time_boot_ms,
+    )
 
 
 def _attitude_quaternion(raw: Fields) -> Attitude | None:
     turn = unit((raw.q1, raw.q2, raw.q3, raw.q4))
     if turn is None:
         return None
-    return Attitude(system=raw.src_system, component=raw.src_component, angles_rad=to_euler(turn), quaternion=True)
+    return Attitude(
+        system=raw.src_system,
+        component=raw.src_component,
+        angles_rad=to_euler(turn),
+        quaternion=True,
+        stamp_us=1000 * raw.time_boot_ms,
+    )
 
 
 def _highres_imu(raw: Fields) -> Inertial | None:
@@ -55,6 +66,7 @@ def _inertial(raw: Fields, unit_mps2: float) -> Inertial | None:
         component=raw.src_component,
         specific_force_mps2=force,
         raw=unit_mps2 != 1.0,
+        stamp_us=raw.time_usec,
     )
 
 

@@ -11,8 +11,10 @@ from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, Ve
 from uavctl.frames import from_euler, rotate
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
+from uavctl.mavlink.punctual import Punctual
 
 SECOND_VEHICLE = "second-vehicle"
+UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BACK_MS = 1000  # its clock goes back by more than this: it has started anew
@@ -58,6 +60,8 @@ class VehicleWatch:
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
+        self._punctual: dict[str, Punctual] = {}  # by stream
+        self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
         self.boots = 0
         self.address: tuple[int, int] | None = None  # system, component
 
@@ -85,9 +89,10 @@ class VehicleWatch:
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
                 if message.quaternion and not self._inertial:
                     return ()
+                self._turns(message, at_ns)
                 return self._moves(at_ns, attitude=angles_rad)
-            case Inertial(specific_force_mps2=force, raw=raw) if message.component == self.address[1]:
-                return self._accelerates(force, at_ns) if not raw or self.autopilot == "ardupilot" else ()
+            case Inertial(raw=raw) if message.component == self.address[1]:
+                return self._accelerates(message, at_ns) if not raw or self.autopilot == "ardupilot" else ()
             case Text(severity=severity, text=text):
                 return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
             case Ack() if self._is_ours(message):
@@ -129,13 +134,28 @@ class VehicleWatch:
             self._motion = msgspec.structs.replace(self._motion, attitude_rad=attitude, attitude_ns=at_ns)
         return (self._motion,)
 
-    def _accelerates(self, force_mps2: Vec3, at_ns: int) -> tuple[InertialSample, ...]:
-        """Its acceleration by a specific force and its newest attitude; nothing where that is old or unknown."""
-        angles, told_ns = self._motion.attitude_rad, self._motion.attitude_ns
-        if angles is None or told_ns is None or at_ns - told_ns > TURNED_NS:
+    def _turns(self, message: Attitude, at_ns: int) -> None:
+        """Remember the attitude that specific forces are turned by, if it is of now."""
+        if not self._inertial:
+            return
+        kind = "quaternion" if message.quaternion else "angles"
+        if self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.angles_rad, at_ns):
+            self._turned = message.angles_rad, at_ns
+        else:
+            self._bad(UNPUNCTUAL)
+
+    def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
+        """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
+        if not self._inertial:
             return ()
-        attitude = from_euler(angles)
-        turned = None if attitude is None else rotate(attitude, force_mps2)
+        kind = "raw" if message.raw else "highres"
+        if not self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.specific_force_mps2, at_ns):
+            self._bad(UNPUNCTUAL)
+            return ()
+        if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
+            return ()
+        attitude = from_euler(self._turned[0])
+        turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
         if turned is None:
             return ()
         north, east, down = turned
@@ -143,6 +163,7 @@ class VehicleWatch:
 
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
+        self._punctual, self._turned = {}, None
         self._started = False
         self._landed = None
         if self._status is None:

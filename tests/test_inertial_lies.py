@@ -1,0 +1,95 @@
+"""Flights of the true quadrotor whose inertial data lie while no position comes: it goes no further than without."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from sim.inertial import InertialMeasurement
+from sim.world import World
+from uavctl.config import load_config
+from uavctl.data import Event, Record, Vec3
+from uavctl.loop import ControlLoop
+from uavctl.trial.fly import WatchedFlyer, controller_of
+from uavctl.trial.metrics import beyond_m
+from uavctl.trial.room import room_of
+
+BLACKOUT_S = (5.0, 9.0)
+LANDS_S = 9.0  # from then on it may land: the floor is no wall
+GUSTS = ("sim.wind.velocity_mps=[0.6, -0.36, 0.0]", "sim.wind.gust_wind_mps=3.0")
+
+
+class Told:
+    """A sink that keeps the codes of events."""
+
+    def __init__(self) -> None:
+        self.codes: set[str] = set()
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        del topic, at_ns
+        if isinstance(record, Event):
+            self.codes.add(record.code)
+
+
+@lru_cache
+def furthest_m(autopilot: str, lie: str, seed: int) -> tuple[float, frozenset[str]]:
+    """How far the true vehicle came beyond a wall from the blackout on [m], and what was told.
+
+    Args:
+        autopilot: whose preset flies.
+        lie: what its inertial data do from the blackout's begin on; "none": they are not used.
+        seed: of gusts, noise and losses.
+    """
+    design = ("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()
+    flown = load_config(
+        f"room-{autopilot}",
+        [*design, *GUSTS, "duration_s=12.0", f"sim.seed={seed}", f"link.blackout=[[{BLACKOUT_S[0]}, {BLACKOUT_S[1]}]]"],
+    )
+    told = Told()
+    believed = load_config(f"room-{autopilot}", design)
+    watched = WatchedFlyer(ControlLoop(believed, controller_of(believed), told, lambda: 0))
+    world = World(flown, watched)
+    vehicle, sensors = world.peers.vehicle, world.peers.autopilot.inertial
+    watched.where = lambda: vehicle.position_m
+    measure, kept = sensors.measure, []
+
+    def lying(unit: int) -> InertialMeasurement:
+        true = measure(unit)
+        since_s = (watched.times_s[-1] if watched.times_s else 0.0) - BLACKOUT_S[0]
+        if since_s < 0.0:
+            return true
+        kept.append(true)
+        forces: dict[str, Vec3] = {
+            "frozen": kept[0].force_mps2,
+            "step": (true.force_mps2[0] - 1.5, *true.force_mps2[1:]),
+            "small": (true.force_mps2[0] - 0.3, *true.force_mps2[1:]),
+            "ramp": (true.force_mps2[0] - min(2.0 * since_s, 2.0), *true.force_mps2[1:]),
+        }
+        return true._replace(force_mps2=forces.get(lie, true.force_mps2))
+
+    sensors.measure = lying  # type: ignore[method-assign]
+    world.run(flown.duration_s)
+    times, where = np.array(watched.times_s), np.array(watched.positions_m)
+    beyond = beyond_m(where, *room_of(flown))
+    return float(beyond[(times >= BLACKOUT_S[0]) & (times <= LANDS_S)].max()), frozenset(told.codes)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("lie", ["frozen", "step", "small", "ramp"])
+def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(autopilot: str, lie: str) -> None:
+    for seed in (3, 11):
+        lied_m, told = furthest_m(autopilot, lie, seed)
+        without_m, _ = furthest_m(autopilot, "none", seed)
+        assert lied_m < 0.0 and lied_m < without_m + 0.2
+        assert told & {"inertial-doubted", "inertial-silent"}
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_what_does_not_lie_is_not_doubted_and_keeps_further_from_walls(autopilot: str) -> None:
+    for seed in (3, 11):
+        healthy_m, told = furthest_m(autopilot, "", seed)
+        without_m, told_without = furthest_m(autopilot, "none", seed)
+        assert healthy_m < without_m + 0.1
+        assert not (told | told_without) & {"inertial-doubted", "inertial-silent"}
