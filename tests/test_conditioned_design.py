@@ -97,11 +97,6 @@ def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
     assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
 
 
-def test_bench_says_that_it_is_of_the_other_scheme(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--config", "room", "--set", SCHEME]) == 2
-    assert "--set smpc.scheme=hahn-stursberg" in capsys.readouterr().err
-
-
 def test_the_name_is_of_what_the_answers_depend_on() -> None:
     def name(*overrides: str) -> str:
         return design_of(load_config("room", [SCHEME, *overrides])).design_id
