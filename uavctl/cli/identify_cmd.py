@@ -23,10 +23,9 @@ from uavctl.cli.common import DEFAULTS, Common, can_be_read, messages, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
-from uavctl.identify.fit import FITS
 from uavctl.identify.page import write_page
 from uavctl.identify.recorded import History, from_records, from_tlog
-from uavctl.identify.result import Identification, identify
+from uavctl.identify.result import Identification, fits_of, identify
 
 
 def identify_command(
@@ -46,7 +45,7 @@ def identify_command(
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
     spare_recording(target)
-    with _progress(len(config.plant.axes) * FITS) as advance:
+    with _progress(fits_of(history, config)) as advance:
         found = identify(history, config, advance)
     doubts = (*found.result.warnings, *_design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
@@ -103,7 +102,6 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
         "drag [1/s]",
         "gain",
         "wind [m/s²]",
-        "dead time + lag [s]",
         "residual [mm]",
         "R²",
     ):
@@ -113,12 +111,18 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
             one.axis,
             f"{one.lag_s:.3f}",
             f"{one.drag_1ps:.3f}",
-            f"{one.gain:.3f}",
+            "–" if one.gain is None else f"{one.gain:.3f}",
             f"{one.wind_std_mps2:.3f}",
-            f"{one.dead_time_s:.2f} + {one.dead_time_lag_s:.2f}",
             f"{1e3 * one.residual_std_m:.1f}",
             f"{one.r2:.3f}",
         )
+    kinds = Table(title="motion of the halves not fitted to")
+    for column in ("plant", "dead time [s]", "alike [s]", "error [mm]"):
+        kinds.add_column(escape(column), justify="left" if column == "plant" else "right")
+    for kind in result.candidates:
+        low_s, high_s = kind.dead_time_alike_s
+        alike = f"{low_s:.2f} to {high_s:.2f}"
+        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", alike, f"{1e3 * kind.error_m:.1f}")
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{found.link.rate_hz:.4g} Hz"),
@@ -127,4 +131,4 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
     ):
         link.add_row(name, value)
     told = [f"[yellow]{escape(text)}[/]" for text in result.warnings]
-    return Group(plant, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}")
+    return Group(plant, kinds, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}")

@@ -11,7 +11,7 @@ from logs.page import Section, folded, grid, page, table
 from logs.svg import Drawing, canvas, colour, dots
 from uavctl.config.load import dump_config
 from uavctl.identify.history import Seen
-from uavctl.identify.prediction import AHEAD_S, LAGS, Prediction
+from uavctl.identify.prediction import LAGS, SHOWN_S, Prediction
 from uavctl.identify.result import Identification
 
 _HEIGHT_IN = 2.6
@@ -32,7 +32,7 @@ def write_page(found: Identification, seen: Seen, source: str) -> str:
         f"{result.flown_s:.0f} s were flown under setpoints; {found.link.received} positions came, {found.link.lost} "
         f"did not ({100 * found.link.loss:.1f} %), {'in bursts' if found.link.bursts else 'each by itself'}.",
         *(
-            f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {AHEAD_S:g} s is predicted."
+            f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {SHOWN_S:g} s is predicted."
             for one in result.response
             if not _is_told(one.axis, result.warnings)
         ),
@@ -49,8 +49,9 @@ def _is_told(axis: str, warnings: Sequence[str]) -> bool:
 def _sections(found: Identification, seen: Seen) -> Iterator[Section]:
     names = [one.axis for one in found.result.response]
     yield Section("Response", _RESPONSE, table(_COLUMNS, _rows(found), frozenset(range(1, len(_COLUMNS)))))
+    yield Section("Dead time and plant", _DEAD, _candidates(found) + grid([_curves(found)]))
     drawings = [_moved(name, one) for name, one in zip(names, found.predictions, strict=True)]
-    yield Section(f"Motion of the next {AHEAD_S:g} s", _MOVED, grid(drawings))
+    yield Section(f"Motion of the next {SHOWN_S:g} s", _MOVED, grid(drawings))
     rest = [_innovations(name, one) for name, one in zip(names, found.predictions, strict=True)]
     white = [_whiteness(name, one) for name, one in zip(names, found.predictions, strict=True)]
     yield Section(
@@ -60,10 +61,14 @@ def _sections(found: Identification, seen: Seen) -> Iterator[Section]:
     yield Section("Configuration", "", folded("TOML with what was identified", dump_config(found.config)))
 
 
-_COLUMNS = ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "noise [mm]", "dead time + lag", "R²")
+_COLUMNS = ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "noise [mm]", "R²")
 _RESPONSE = (
-    "The controller's model has a lag and no dead time; beside it, the most likely split into both. ± is the standard "
-    "error. The wind is the standard deviation of an acceleration that is constant over a step."
+    "With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the standard "
+    "deviation of an acceleration that is constant over a step."
+)
+_DEAD = (
+    "Fitted to one half of the flight and judged by the other, blocks of 8 s in turn: rms error of the motion of the "
+    "next seconds, from each position on, with the setpoints as sent. The curve is their geometric mean."
 )
 _REST = (
     "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
@@ -79,12 +84,39 @@ def _rows(found: Identification) -> Iterator[tuple[str, ...]]:
             one.axis,
             _with_error(one.lag_s, one.lag_std_s),
             _with_error(one.drag_1ps, one.drag_std_1ps),
-            _with_error(one.gain, one.gain_std),
+            "–" if one.gain is None else _with_error(one.gain, one.gain_std),
             f"{one.wind_std_mps2:.3f}",
             f"{one.position_std_m * 1e3:.1f}",
-            f"{one.dead_time_s:.2f} + {one.dead_time_lag_s:.2f}",
             f"{one.r2:.3f}",
         )
+
+
+def _candidates(found: Identification) -> str:
+    candidates = found.result.candidates
+    ahead = [f"{time_s:g} s ahead [mm]" for time_s in candidates[0].ahead_s]
+    rows = [
+        (
+            one.model,
+            f"{one.dead_time_s:.2f} ({one.dead_time_alike_s[0]:.2f} to {one.dead_time_alike_s[1]:.2f} alike)",
+            response.axis,
+            f"{lag_s:.3f}",
+            *(f"{1e3 * value:.1f}" for value in errors),
+        )
+        for one in candidates
+        for response, lag_s, errors in zip(found.result.response, one.lag_s, one.rms_m, strict=True)
+    ]
+    columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
+    return table(columns, rows, frozenset(range(3, len(columns))))
+
+
+def _curves(found: Identification) -> Drawing:
+    with canvas("dead-time", _HEIGHT_IN) as drawn:
+        ax = drawn.axes("Error over the dead time", "dead time [s]", "error [mm]", _LEFT_IN)
+        for one, name in zip(found.result.candidates, ("estimate", "lost"), strict=False):
+            curve = np.array(one.curve)
+            ax.plot(curve[:, 0], 1e3 * curve[:, 1], color=colour(name), marker="o", markersize=3, label=one.model)
+        ax.legend()
+    return Drawing("dead-time", drawn.svg, "prediction error of each plant over the dead time")
 
 
 def _with_error(value: float, error: float | None) -> str:

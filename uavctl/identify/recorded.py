@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +24,7 @@ _NO_POSITION_NO_VELOCITY = 0x03F  # bits of type_mask: ignored
 _MASK = 0x3FF  # of position, velocity, acceleration, and of acceleration as a force; whatever yaw does
 _LOCAL_NED = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_OFFSET_NED)
 
+_AUTOPILOTS = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
 _SHORTEST = 10  # bytes of the longer head
 _REMEMBERED = 64  # messages among which the newest is looked for: one may be overtaken by others
 
@@ -38,11 +39,35 @@ class History:
         asked: Setpoints.
         seen: Positions.
         gaps: Messages lost after each one that came from the positions' sender, by the numbers that MAVLink gives them.
+        autopilot: Whose software flew, "px4" or "ardupilot"; empty where nobody said so.
+        parameters: The vehicle's own that begin with PSC_, by name, as far as they were asked for.
     """
 
     asked: Asked
     seen: Seen
     gaps: NDArray[np.int64]
+    autopilot: str = ""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+class Told:
+    """What the vehicle says of itself: whose software it flies, and its parameters of the position loops."""
+
+    def __init__(self) -> None:
+        self.autopilot = ""
+        self.parameters: dict[str, float] = {}
+        self._parser = mavlink.MAVLink(None)
+
+    def take(self, data: bytes) -> None:
+        """Read what a datagram, or a packet, holds."""
+        for frame in scan(data, final=True).frames:
+            if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+                kind = self._parser.decode(bytearray(frame.data)).autopilot
+                self.autopilot = _AUTOPILOTS.get(kind, self.autopilot)
+            elif frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
+                message = self._parser.decode(bytearray(frame.data))
+                if message.param_id.startswith("PSC_") and math.isfinite(message.param_value):
+                    self.parameters[message.param_id] = float(message.param_value)
 
 
 class Numbers:
@@ -91,17 +116,18 @@ def from_records(records: Iterable[tuple[str, int, Record]], config: Config) -> 
     """
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers = Numbers(config.source.messages)
+    numbers, told = Numbers(config.source.messages), Told()
     flown = False
     for _, _, record in records:
         if isinstance(record, Datagram) and not record.outgoing:
             numbers.take(record.data)
+            told.take(record.data)
         elif isinstance(record, StepInput):
             samples.extend(record.samples)
             flown = record.vehicle is not None and record.vehicle.armed and record.vehicle.external
         elif isinstance(record, Setpoint):
             sent.append((record.at_ns, record.accel_mps2, flown))
-    return _history(sent, samples, numbers)
+    return _history(sent, samples, numbers, told)
 
 
 def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
@@ -118,18 +144,22 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
     link = links.get(MOCAP) or next(iter(links.values()))
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers = Numbers(config.source.messages)
+    numbers, told = Numbers(config.source.messages), Told()
     for packet in packets:
         if packet.outgoing:
             sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data))
         else:
             numbers.take(packet.data)
+            told.take(packet.data)
             samples.extend(item for item in link.receive(packet.data, packet.at_ns) if isinstance(item, PositionSample))
-    return _history(sent, samples, numbers)
+    return _history(sent, samples, numbers, told)
 
 
 def _history(
-    sent: list[tuple[int, tuple[float, float, float], bool]], samples: list[PositionSample], numbers: Numbers
+    sent: list[tuple[int, tuple[float, float, float], bool]],
+    samples: list[PositionSample],
+    numbers: Numbers,
+    told: Told,
 ) -> History:
     if not samples or not sent:
         missing = "no position" if not samples else "no acceleration setpoint"
@@ -145,7 +175,7 @@ def _history(
         accel_mps2=np.array([accel for _, accel, _ in sent]),
         flown=np.array([flown for _, _, flown in sent]),
     )
-    return History(asked, seen_from(rows), numbers.gaps())
+    return History(asked, seen_from(rows), numbers.gaps(), told.autopilot, told.parameters)
 
 
 def _accelerations(data: bytes) -> Iterable[tuple[tuple[float, float, float], bool]]:

@@ -1,27 +1,30 @@
-"""How likely a recorded axis is under p' = v, v' = a - c v + b + w, T a' = g u(t - d) - a.
+"""How likely a recorded axis is under one of the plants: the innovations of a Kalman filter.
 
-b is constant in a stretch, w is white; positions are seen with white noise. The likelihood is that of the innovations
-of a Kalman filter, for several sets of parameters at once, so that a gradient costs one pass over the data.
+The motion is linear, so what the inputs do is one sum from the stretch's begin on, and the filter follows the rest: it
+steps from position to position, however many inputs lie between. All times are counted in instants of half a
+millisecond, so few different lengths occur, and each is a product of powers of one instant's motion. Several parameter
+vectors go through at once: a gradient costs one pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.identify.axis_model import AxisModel, Motion
 from uavctl.identify.history import Stretch
 
 Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
 
-# A parameter vector (5,) of an axis is log T, c, g, log of the wind's density, log of the noise of a position.
 OUTLIER = 5.0  # standard deviations beyond which an innovation counts by its size and not by its square (Huber)
-_BIAS_STD_MPS2 = 0.5
-_START_STD = (10.0, 2.0, 2.0)  # of position, velocity and acceleration where a stretch begins
-_ORDER, _HALVINGS = 10, 6
-_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(4)
+INSTANT_S = 5e-4  # a vehicle at 1.5 m/s goes 0.4 mm in half of it, less than the noise of any camera
+_ORDER = 8  # of the series of one instant, in which no lag is shorter than twenty
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,121 +32,170 @@ class Timeline:
     """An axis' stretch cut where the input changes or a position was captured.
 
     Attributes:
-        lengths_s: (n,) of the parts [s].
+        lengths: (n,) of the parts [instants].
         inputs_mps2: (n,), held in each [m/s²].
-        measured_m: (n,), position at the end of each; NaN where there is none [m].
+        measured: (m,), the part at whose end each position was captured.
+        positions_m: (m,) [m].
     """
 
-    lengths_s: Array
+    lengths: Counts
     inputs_mps2: Array
-    measured_m: Array
+    measured: Counts
+    positions_m: Array
+
+    @property
+    def captured(self) -> Counts:
+        """Time of capture of each position, from the first one on (m,) [instants]."""
+        return np.cumsum(self.lengths)[self.measured]
+
+
+class Advance(NamedTuple):
+    """Motion over different lengths, for k parameter vectors.
+
+    Attributes:
+        move: (lengths, k, n, n).
+        push: (lengths, k, n), by a held input of one.
+        spread: Covariance that the noise makes (lengths, k, n, n).
+    """
+
+    move: Array
+    push: Array
+    spread: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What the filter made of a timeline.
+    """What the filter made of a timeline, under one parameter vector.
 
     Attributes:
-        states: (n, 4): p, v, a, b at the end of each part, with the position there.
+        driven: (m, n), what the inputs alone have done since the begin.
+        rest: (m, n), the state without that, with the position there.
         innovations_m: (m,): position minus what was predicted of it, in the order of capture [m].
         stds_m: (m,), standard deviation that the filter gives each [m].
     """
 
-    states: Array
+    driven: Array
+    rest: Array
     innovations_m: Array
     stds_m: Array
 
 
 def timeline(stretch: Stretch, axis: int, dead_time_s: float) -> Timeline:
     """Cut a stretch for one axis, its inputs acting `dead_time_s` after they were sent."""
-    changes_s = stretch.input_times_s + dead_time_s
-    begin = stretch.times_s[0]
-    cuts = np.unique(
-        np.concatenate([changes_s[(changes_s > begin) & (changes_s < stretch.times_s[-1])], stretch.times_s])
+    captured, positions_m = _instants(stretch.times_s), stretch.positions_m[:, axis]
+    captured, first = np.unique(captured, return_index=True)
+    changes = _instants(stretch.input_times_s + dead_time_s)
+    begin, end = captured[0], captured[-1]
+    cuts = np.unique(np.concatenate([changes[(changes > begin) & (changes < end)], captured]))
+    held = np.clip(np.searchsorted(changes, cuts[:-1], side="right") - 1, 0, None)
+    return Timeline(
+        lengths=np.concatenate([[0], np.diff(cuts)]),
+        inputs_mps2=np.concatenate([[0.0], stretch.inputs_mps2[held, axis]]),
+        measured=np.searchsorted(cuts, captured),
+        positions_m=positions_m[first],
     )
-    held = np.clip(np.searchsorted(changes_s, cuts[:-1], side="right") - 1, 0, None)
-    measured = np.full(len(cuts), np.nan)
-    measured[np.searchsorted(cuts, stretch.times_s)] = stretch.positions_m[:, axis]
-    lengths = np.concatenate([[0.0], np.diff(cuts)])
-    inputs = np.concatenate([[0.0], stretch.inputs_mps2[held, axis]])
-    return Timeline(lengths, inputs, measured)
 
 
-def deviance(parts: Sequence[Timeline], parameters: Array) -> Array:
-    """-2 log likelihood of all parts of an axis, up to a constant, for each of k parameter vectors (k, 5)."""
+def deviance(parts: Sequence[Timeline], model: AxisModel, parameters: Array) -> Array:
+    """-2 log likelihood of all parts of an axis, up to a constant, for each of k parameter vectors (k, m)."""
     total = np.zeros(len(parameters))
+    motion = model.motion(parameters)
     for part in parts:
-        total += _pass(part, parameters)[0]
+        total += _pass(part, model, motion, parameters)[0]
     return total
 
 
-def filtered(part: Timeline, parameters: Array) -> Filtered:
-    """States and innovations of one part under one parameter vector (5,)."""
-    _, states, innovations, variances = _pass(part, parameters[None])
-    return Filtered(states[:, 0], innovations[:, 0], np.sqrt(variances[:, 0]))
+def filtered(part: Timeline, model: AxisModel, parameters: Array) -> Filtered:
+    """States and innovations of one part under one parameter vector (m,)."""
+    _, driven, rest, innovations, variances = _pass(part, model, model.motion(parameters[None]), parameters[None])
+    return Filtered(driven[:, 0], rest[:, 0], innovations[:, 0], np.sqrt(variances[:, 0]))
 
 
-def transition(lengths_s: Array, parameters: Array) -> tuple[Array, Array]:
-    """Transition (n, k, 4, 4) of p, v, a, b, and effect (n, k, 4) of a held input, over n lengths for k parameters."""
-    generator = np.zeros((len(parameters), 5, 5))
-    lag_s = np.exp(parameters[:, 0])
-    generator[:, 0, 1] = 1.0
-    generator[:, 1, 1] = -parameters[:, 1]
-    generator[:, 1, 2] = generator[:, 1, 3] = 1.0
-    generator[:, 2, 2] = -1.0 / lag_s
-    generator[:, 2, 4] = parameters[:, 2] / lag_s
-    different_s, which = np.unique(lengths_s, return_inverse=True)  # few: ticks are equally long
-    scaled = different_s[:, None, None, None] * generator / 2**_HALVINGS
-    term = np.broadcast_to(np.eye(5), scaled.shape)
-    power = term.copy()
+def advance(motion: Motion, lengths: Counts) -> Advance:
+    """Motion over some lengths (n,) [instants], by the binary digits of each."""
+    move, push, spread = _instant(motion)
+    count, size = len(lengths), move.shape[-1]
+    moves = np.tile(np.eye(size), (count, len(move), 1, 1))
+    pushes, spreads = np.zeros((count, *push.shape)), np.zeros((count, *spread.shape))
+    for digit in range(int(lengths.max(initial=0)).bit_length()):
+        chosen = (lengths >> digit) & 1 == 1
+        moves[chosen] = move @ moves[chosen]
+        pushes[chosen] = push + (move @ pushes[chosen][..., None])[..., 0]
+        spreads[chosen] = spread + move @ spreads[chosen] @ move.swapaxes(1, 2)
+        push = push + (move @ push[..., None])[..., 0]
+        spread = spread + move @ spread @ move.swapaxes(1, 2)
+        move = move @ move
+    return Advance(moves, pushes, spreads)
+
+
+def _instants(times_s: Array) -> Counts:
+    return np.rint(times_s / INSTANT_S).astype(np.int64)
+
+
+def _instant(motion: Motion) -> tuple[Array, Array, Array]:
+    """Transition, effect of a held input, and covariance of the noise, of one instant."""
+    move, integral = _series(motion.a, INSTANT_S)
+    spread = np.zeros_like(motion.noise)
+    for node, weight in zip(_GAUSS_X, _GAUSS_W, strict=True):
+        left, _ = _series(motion.a, INSTANT_S * (1.0 + float(node)) / 2.0)
+        spread += INSTANT_S * float(weight) / 2.0 * (left @ motion.noise @ left.swapaxes(1, 2))
+    return move, (integral @ motion.b[..., None])[..., 0], spread
+
+
+def _series(slope: Array, time_s: float) -> tuple[Array, Array]:
+    """exp(A t) and its integral from 0 to t, (k, n, n) each."""
+    term = np.broadcast_to(np.eye(slope.shape[-1]), slope.shape)
+    power, integral = term.copy(), time_s * term
     for order in range(1, _ORDER + 1):
-        term = term @ scaled / order
+        term = term @ slope * (time_s / order)
         power += term
-    for _ in range(_HALVINGS):
-        power = power @ power
-    return power[which, :, :4, :4], power[which, :, :4, 4]
+        integral = integral + term * (time_s / (order + 1))
+    return power, integral
 
 
-def disturbance(lengths_s: Array, parameters: Array) -> Array:
-    """Covariance (n, k, 2, 2) of p and v that white acceleration noise makes in n lengths, for k parameters."""
-    drag = parameters[:, 1]
-    ago_s = lengths_s[:, None] * (1.0 + _GAUSS_X) / 2.0  # (n, points)
-    fall = np.exp(-drag[:, None] * ago_s[:, None, :])  # velocity that is left of a kick, (n, k, points)
-    ratio = drag[:, None] * ago_s[:, None, :]
-    way = ago_s[:, None, :] * np.where(np.abs(ratio) < 1e-6, 1.0, -np.expm1(-ratio) / np.where(ratio == 0, 1, ratio))
-    kicks = np.stack([way, fall], axis=-1)
-    weights = lengths_s[:, None, None] * _GAUSS_W / 2.0 * np.exp(2.0 * parameters[:, 3])[:, None]
-    return np.asarray(np.einsum("nkg,nkgi,nkgj->nkij", weights, kicks, kicks))
-
-
-def _pass(part: Timeline, parameters: Array) -> tuple[Array, Array, Array, Array]:
-    """Deviance (k,), states (n, k, 4), innovations and their variances (m, k)."""
-    move, push = transition(part.lengths_s, parameters)
-    noise = disturbance(part.lengths_s, parameters)
-    seen_var = np.exp(2.0 * parameters[:, 4])
+def _pass(
+    part: Timeline, model: AxisModel, motion: Motion, parameters: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Deviance (k,), driven and other states (m, k, n), innovations and their variances (m, k)."""
+    driven = _driven(part, motion)
+    different, which = np.unique(np.diff(part.captured), return_inverse=True)
+    moves, _, spreads = advance(motion, different)
+    noise = [one.name for one in model.free].index("noise_m")
+    seen_var = np.exp(2.0 * parameters[:, noise])
     count = len(parameters)
-    state = np.zeros((count, 4))
-    state[:, 0] = part.measured_m[0]
-    cov = np.tile(np.diag(np.square([*_START_STD, _BIAS_STD_MPS2])), (count, 1, 1))
+    state = np.zeros((count, len(model.start_std)))
+    state[:, 0] = part.positions_m[0]
+    cov = np.tile(np.diag(np.square(model.start_std)), (count, 1, 1))
     total = np.zeros(count)
     states, innovations, variances = [], [], []
-    for index, (length, pushed, measured) in enumerate(
-        zip(part.lengths_s, part.inputs_mps2, part.measured_m, strict=True)
-    ):
-        if length > 0.0:
-            state = (move[index] @ state[:, :, None])[:, :, 0] + push[index] * pushed
-            cov = move[index] @ cov @ move[index].transpose(0, 2, 1)
-            cov[:, :2, :2] += noise[index]
-        if np.isfinite(measured):
-            variance = cov[:, 0, 0] + seen_var
-            innovation = measured - state[:, 0]
-            size = np.abs(innovation) / np.sqrt(variance)
-            trust = OUTLIER / np.maximum(size, OUTLIER)
-            total += np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)) + np.log(variance)
-            gain = cov[:, :, 0] / variance[:, None]
-            state = state + gain * (trust * innovation)[:, None]
-            cov = cov - gain[:, :, None] * cov[:, None, 0, :]
-            innovations.append(innovation)
-            variances.append(variance)
+    for index, position_m in enumerate(part.positions_m):
+        if index:
+            move = moves[which[index - 1]]
+            state = (move @ state[:, :, None])[:, :, 0]
+            cov = move @ cov @ move.swapaxes(1, 2) + spreads[which[index - 1]]
+        variance = cov[:, 0, 0] + seen_var
+        innovation = position_m - driven[index, :, 0] - state[:, 0]
+        size = np.abs(innovation) / np.sqrt(variance)
+        trust = OUTLIER / np.maximum(size, OUTLIER)
+        total += np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)) + np.log(variance)
+        gain = cov[:, :, 0] / variance[:, None]
+        state = state + gain * (trust * innovation)[:, None]
+        cov = cov - gain[:, :, None] * cov[:, None, 0, :]
+        innovations.append(innovation)
+        variances.append(variance)
         states.append(state)
-    return total, np.array(states), np.array(innovations), np.array(variances)
+    return total, driven, np.array(states), np.array(innovations), np.array(variances)
+
+
+def _driven(part: Timeline, motion: Motion) -> Array:
+    """What the inputs alone have done at each position (m, k, n)."""
+    different, which = np.unique(part.lengths, return_inverse=True)
+    moves, pushes, _ = advance(motion, different)
+    state = np.zeros((*motion.b.shape, 1))
+    pushed = pushes[which] * part.inputs_mps2[:, None, None]
+    states = np.empty((len(which), *motion.b.shape))
+    for index, kind in enumerate(which):
+        state = moves[kind] @ state
+        state[:, :, 0] += pushed[index]
+        states[index] = state[:, :, 0]
+    return states[part.measured]

@@ -10,37 +10,53 @@ import msgspec
 
 from uavctl.config import Config
 from uavctl.errors import RecordingError
-from uavctl.identify.fit import AxisFit, fit_axis, scan_dead_time, standard_errors
+from uavctl.identify.axis_model import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis
+from uavctl.identify.dead_time import TRIES, Chosen, choose_dead_time, is_worse
+from uavctl.identify.fit import AxisFit, standard_errors
 from uavctl.identify.history import Stretch, stretches, thinned
 from uavctl.identify.link_fit import LinkFit, fit_link
-from uavctl.identify.prediction import Prediction, predict
+from uavctl.identify.prediction import AHEAD_S, Prediction, predict
 from uavctl.identify.recorded import History
 
 AXES = ("north", "east", "down")
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
 _DIGITS = 4
+_AS_SHIPPED = {"XY": (1.0, 2.0, 1.0), "Z": (1.0, 5.0, 1.0)}  # position, velocity, integral
 _OF_OTHER_MODELS = (
     *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
-    *("position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "force_drift_mps2_rts"),
+    *("gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "force_drift_mps2_rts"),
 )
 
 
 class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
-    """Response of one axis, as the controller models it and with a dead time."""
+    """Response of one axis, with the dead time that all axes have; None where the plant has no such number."""
 
     axis: str
     lag_s: float
     drag_1ps: float
-    gain: float
+    gain: float | None
     wind_std_mps2: float
+    input_std_mps2: float | None
+    force_drift_mps2_rts: float | None
     position_std_m: float
     lag_std_s: float | None
     drag_std_1ps: float | None
     gain_std: float | None
-    dead_time_s: float  # of the model with a dead time, and its lag
-    dead_time_lag_s: float
     residual_std_m: float
     r2: float
+
+
+class Candidate(msgspec.Struct, frozen=True, kw_only=True):
+    """One kind of plant, and what it predicts of the halves that it was not fitted to."""
+
+    model: str
+    dead_time_s: float
+    dead_time_alike_s: tuple[float, float]
+    lag_s: tuple[float, ...]
+    error_m: float
+    ahead_s: tuple[float, ...]
+    rms_m: tuple[tuple[float, ...], ...]  # each axis, each time ahead
+    curve: tuple[tuple[float, float], ...]  # dead time [s], error [m]
 
 
 class Identified(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,6 +65,7 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
     flown_s: float
     positions: int
     plant: dict[str, object]
+    candidates: tuple[Candidate, ...]
     response: tuple[AxisResponse, ...]
     residual_std: tuple[float, ...]
     r2: tuple[float, ...]
@@ -66,45 +83,98 @@ class Identification:
     predictions: tuple[Prediction, ...]
 
 
+def fits_of(history: History, config: Config) -> int:
+    """How often `identify` advances."""
+    return TRIES * len(_kinds(history, config))
+
+
 def identify(history: History, config: Config, advance: Callable[[], None]) -> Identification:
     """Identify plant and link.
 
     Args:
         history: The flight.
-        config: What the result is put into; its axes and Δt are kept.
-        advance: Called after each fit (`fit.FITS` an axis).
+        config: What the result is put into; its kind of plant, axes and Δt are kept.
+        advance: Called as often as `fits_of` says.
 
     Raises:
         RecordingError: The flight does not show enough.
     """
     dt_s = config.plant.dt_s
     flown = tuple(thinned(stretch, dt_s * (1.0 - 1e-6)) for stretch in stretches(history.asked, history.seen))
-    plain, delayed, predictions = [], [], []
-    for name in config.plant.axes:
-        axis = AXES.index(name)
+    axes = [AXES.index(name) for name in config.plant.axes]
+    for axis in axes:
         _check_moved(flown, axis)
-        fit = fit_axis(flown, axis, 0.0)
-        advance()
-        plain.append(fit)
-        delayed.append(scan_dead_time(flown, axis, fit, advance))
-        predictions.append(predict(flown, axis, fit))
+    kinds = _kinds(history, config)
+    candidates = [choose_dead_time(flown, axes, kind, advance) for kind in kinds]
+    chosen = candidates[0]
+    predictions = [predict(flown, axis, fit) for axis, fit in zip(axes, chosen.fits, strict=True)]
     responses = tuple(
-        _response(name, flown, fit, late, prediction, dt_s)
-        for name, fit, late, prediction in zip(config.plant.axes, plain, delayed, predictions, strict=True)
+        _response(name, flown, fit, prediction, dt_s)
+        for name, fit, prediction in zip(config.plant.axes, chosen.fits, predictions, strict=True)
     )
     link = fit_link(history.seen, history.gaps)
-    made = _config(config, responses, link)
+    made = _config(config, chosen, responses, link)
     result = Identified(
         flown_s=sum(stretch.length_s for stretch in flown),
         positions=link.received,
         plant=_plant_section(made),
+        candidates=tuple(_candidate(one) for one in candidates),
         response=responses,
         residual_std=tuple(one.residual_std_m for one in responses),
         r2=tuple(one.r2 for one in responses),
         link=_link_section(link),
-        warnings=tuple(_doubts(responses)),
+        warnings=(*_doubts(responses), *_better(chosen, candidates[1:])),
     )
     return Identification(result, made, link, tuple(predictions))
+
+
+def _kinds(history: History, config: Config) -> list[tuple[AxisModel, ...]]:
+    """The plants to fit, each axis; the configuration's own first."""
+    plant = config.plant
+    own = plant.model == VELOCITY_REFERENCE
+    drifts = own or config.estimator.bias_drift > 0.0
+    kinds: list[tuple[AxisModel, ...]] = [tuple(DragLagAxis(drifts) for _ in plant.axes)]
+    if own or history.autopilot == "ardupilot":
+        kinds.append(tuple(ReferenceAxis(*gains) for gains in _gains(history, config)))
+    return kinds[::-1] if own else kinds
+
+
+def _gains(history: History, config: Config) -> list[tuple[float, float, float]]:
+    """Loop gains of each axis: as the vehicle told them, else as configured, else ArduPilot's own defaults.
+
+    The plant has no loop without an integral (PSC_VELZ_I is 0 as shipped): there the acceleration loop's does its work.
+    """
+    plant, found = config.plant, []
+    for place, name in enumerate(config.plant.axes):
+        side = "Z" if name == "down" else "XY"
+        own = (plant.position_1ps, plant.velocity_1ps, plant.integral_1ps2)
+        given = [one[place] for one in own] if plant.model == VELOCITY_REFERENCE else _AS_SHIPPED[side]
+        told = (history.parameters.get(key.format(side), 0.0) for key in ("PSC_POS{}_P", "PSC_VEL{}_P", "PSC_VEL{}_I"))
+        kp, kv, ki = (value if value > 0.0 else other for value, other in zip(told, given, strict=True))
+        found.append((kp, kv, ki))
+    return found
+
+
+def _candidate(one: Chosen) -> Candidate:
+    return Candidate(
+        model=one.name,
+        dead_time_s=one.best.dead_time_s,
+        dead_time_alike_s=one.alike_s,
+        lag_s=tuple(fit.value("lag_s") for fit in one.fits),
+        error_m=one.best.error_m,
+        ahead_s=AHEAD_S,
+        rms_m=tuple(tuple(row) for row in one.best.rms_m.tolist()),
+        curve=tuple((judged.dead_time_s, judged.error_m) for judged in one.curve),
+    )
+
+
+def _better(chosen: Chosen, others: Sequence[Chosen]) -> list[str]:
+    return [
+        f'plant.model "{other.name}" predicts better: error {1e3 * other.best.error_m:.1f} mm instead of '
+        f"{1e3 * chosen.best.error_m:.1f} mm; start from a configuration that has it"
+        for other in others
+        if is_worse(chosen.best, other.best)
+    ]
 
 
 def _check_moved(flown: Sequence[Stretch], axis: int) -> None:
@@ -116,22 +186,21 @@ def _check_moved(flown: Sequence[Stretch], axis: int) -> None:
         )
 
 
-def _response(
-    name: str, flown: Sequence[Stretch], fit: AxisFit, late: AxisFit, prediction: Prediction, dt_s: float
-) -> AxisResponse:
-    lag_std, drag_std, gain_std = standard_errors(flown, AXES.index(name), fit)
+def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Prediction, dt_s: float) -> AxisResponse:
+    errors = standard_errors(flown, AXES.index(name), fit)
+    reference = isinstance(fit.model, ReferenceAxis)
     return AxisResponse(
         axis=name,
-        lag_s=fit.lag_s,
-        drag_1ps=max(fit.drag_1ps, 0.0),
-        gain=fit.gain,
-        wind_std_mps2=fit.wind_mps2_rts / math.sqrt(dt_s),
-        position_std_m=fit.noise_m,
-        lag_std_s=_finite(lag_std),
-        drag_std_1ps=_finite(drag_std),
-        gain_std=_finite(gain_std),
-        dead_time_s=late.dead_time_s,
-        dead_time_lag_s=late.lag_s,
+        lag_s=fit.value("lag_s"),
+        drag_1ps=max(fit.value("drag_1ps"), 0.0),
+        gain=None if reference else fit.value("gain"),
+        wind_std_mps2=fit.value("wind_mps2_rts") / math.sqrt(dt_s),
+        input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if reference else None,
+        force_drift_mps2_rts=fit.value("drift_mps2_rts") if reference else None,
+        position_std_m=fit.value("noise_m"),
+        lag_std_s=_finite(errors["lag_s"]),
+        drag_std_1ps=_finite(errors["drag_1ps"]),
+        gain_std=_finite(errors.get("gain", math.inf)),
         residual_std_m=prediction.residual_std_m,
         r2=prediction.r2,
     )
@@ -147,16 +216,16 @@ def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
     return found
 
 
-def _config(config: Config, responses: Sequence[AxisResponse], link: LinkFit) -> Config:
+def _config(config: Config, chosen: Chosen, responses: Sequence[AxisResponse], link: LinkFit) -> Config:
     """The configuration with what was identified."""
     plant = msgspec.structs.replace(
         config.plant,
-        model="drag-lag",
-        **dict.fromkeys(_OF_OTHER_MODELS, ()),
+        model=chosen.name,
+        dead_time_s=chosen.best.dead_time_s,
         drag_1ps=_rounded(one.drag_1ps for one in responses),
         lag_s=_rounded(one.lag_s for one in responses),
-        gain=_rounded(one.gain for one in responses),
         wind_std_mps2=_rounded(one.wind_std_mps2 for one in responses),
+        **{**dict.fromkeys(_OF_OTHER_MODELS, ()), **_of_model(chosen, responses)},
     )
     estimator = msgspec.structs.replace(
         config.estimator, position_std_m=round(max(one.position_std_m for one in responses), 6)
@@ -174,9 +243,24 @@ def _config(config: Config, responses: Sequence[AxisResponse], link: LinkFit) ->
     )
 
 
+def _of_model(chosen: Chosen, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
+    """Keys of `[plant]` that only one kind of plant has."""
+    if chosen.name == DRAG_LAG:
+        return {"gain": _rounded(one.gain or 0.0 for one in responses)}
+    models = [fit.model for fit in chosen.fits if isinstance(fit.model, ReferenceAxis)]
+    return {
+        **{
+            key: tuple(getattr(model, key) for model in models)
+            for key in ("position_1ps", "velocity_1ps", "integral_1ps2")
+        },
+        "input_std_mps2": _rounded(one.input_std_mps2 or 0.0 for one in responses),
+        "force_drift_mps2_rts": _rounded(one.force_drift_mps2_rts or 0.0 for one in responses),
+    }
+
+
 def _plant_section(config: Config) -> dict[str, object]:
-    plant = config.plant
-    return {key: getattr(plant, key) for key in ("model", "dt_s", "axes", "drag_1ps", "lag_s", "gain", "wind_std_mps2")}
+    keys = ("model", "dt_s", "axes", "dead_time_s", "drag_1ps", "lag_s", "wind_std_mps2", *_OF_OTHER_MODELS)
+    return {key: value for key in keys if (value := getattr(config.plant, key)) != ()}
 
 
 def _link_section(link: LinkFit) -> dict[str, object]:
