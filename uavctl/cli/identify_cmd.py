@@ -116,13 +116,13 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
             f"{1e3 * one.residual_std_m:.1f}",
             f"{one.r2:.3f}",
         )
-    kinds = Table(title="motion of the halves not fitted to")
-    for column in ("plant", "dead time [s]", "alike [s]", "error [mm]"):
+    kinds = Table(title="dead time, and error on the halves not fitted to")
+    for column in ("plant", "dead time [s]", "range [s]", "error [mm]"):
         kinds.add_column(escape(column), justify="left" if column == "plant" else "right")
     for kind in result.candidates:
-        low_s, high_s = kind.dead_time_alike_s
-        alike = f"{low_s:.2f} to {high_s:.2f}"
-        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", alike, f"{1e3 * kind.error_m:.1f}")
+        low_s, high_s = kind.dead_time_range_s
+        within = f"{low_s:.2f} to {high_s:.2f}"
+        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", within, f"{1e3 * kind.error_m:.1f}")
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{found.link.rate_hz:.4g} Hz"),

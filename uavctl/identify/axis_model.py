@@ -48,7 +48,7 @@ class Free(NamedTuple):
         return math.exp(place) if self.logarithmic else place
 
 
-class Motion(NamedTuple):
+class LinearMotion(NamedTuple):
     """x' = A x + B u + white noise of intensity S, for k parameter vectors.
 
     Attributes:
@@ -63,25 +63,25 @@ class Motion(NamedTuple):
 
 
 class AxisModel(Protocol):
-    """A plant of an axis; position is the first state, velocity the second.
-
-    Attributes:
-        name: As `plant.model` has it.
-        free: What is fitted.
-        start_std: Standard deviation of each state where a stretch begins.
-        starts: Values to begin the search with, by name.
-    """
+    """A plant of an axis; position is the first state, velocity the second."""
 
     @property
-    def name(self) -> str: ...
-    @property
-    def free(self) -> tuple[Free, ...]: ...
-    @property
-    def start_std(self) -> tuple[float, ...]: ...
-    @property
-    def starts(self) -> tuple[dict[str, float], ...]: ...
+    def name(self) -> str:
+        """Name as `plant.model` has it."""
 
-    def motion(self, parameters: Array) -> Motion:
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """Parameters that are fitted."""
+
+    @property
+    def start_std(self) -> tuple[float, ...]:
+        """Standard deviation of each state where a stretch begins."""
+
+    @property
+    def starts(self) -> tuple[dict[str, float], ...]:
+        """Values to begin the search with, by name."""
+
+    def motion(self, parameters: Array) -> LinearMotion:
         """Motion for k parameter vectors (k, len(free))."""
 
 
@@ -119,7 +119,7 @@ class DragLagAxis:
         rest = {"lag_s": 0.2, "gain": 1.0, "wind_mps2_rts": 0.05, "noise_m": 0.01, "drift_mps2_rts": 0.05}
         return tuple({**rest, "drag_1ps": drag} for drag in (0.1, 1.0))
 
-    def motion(self, parameters: Array) -> Motion:
+    def motion(self, parameters: Array) -> LinearMotion:
         """States (p, v, a, b)."""
         count, lag_s = len(parameters), np.exp(parameters[:, 0])
         a, b, noise = np.zeros((count, 4, 4)), np.zeros((count, 4)), np.zeros((count, 4, 4))
@@ -130,7 +130,7 @@ class DragLagAxis:
         noise[:, 1, 1] = np.exp(2.0 * parameters[:, 3])
         if self.drifts:
             noise[:, 3, 3] = np.exp(2.0 * parameters[:, 5])
-        return Motion(a, b, noise)
+        return LinearMotion(a, b, noise)
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class ReferenceAxis:
         },
     )
 
-    def motion(self, parameters: Array) -> Motion:
+    def motion(self, parameters: Array) -> LinearMotion:
         """States (p, v, a, q, s, i)."""
         count, rate_1ps = len(parameters), np.exp(-parameters[:, 0])
         kp, kv, ki = self.position_1ps, self.velocity_1ps, self.integral_1ps2
@@ -178,7 +178,7 @@ class ReferenceAxis:
         for push, place in zip(along, (2, 4, 5), strict=True):
             pushed = np.exp(parameters[:, place])[:, None] * push
             noise += pushed[:, :, None] * pushed[:, None, :]
-        return Motion(a, b, noise)
+        return LinearMotion(a, b, noise)
 
 
 def places(model: AxisModel, values: dict[str, float]) -> Array:

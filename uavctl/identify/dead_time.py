@@ -1,7 +1,9 @@
-"""The dead time of a plant by what it predicts: fitted to one half of a flight, judged by the other.
+"""The dead time of a plant by its likelihood, and what a plant predicts of the half of a flight it was not fitted to.
 
-Halves are blocks in turn, so that each has something of every manoeuvre. Judged is the motion of the next 0.25 to 2 s;
-the figure is the geometric mean of its rms errors over these times and the axes, in which each counts alike.
+The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
+and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
+in turn so that each has something of every manoeuvre, on the motion of the next 0.25 to 2 s; the figure is the
+geometric mean of the rms errors over these times and the axes, in which each counts alike.
 """
 
 from __future__ import annotations
@@ -17,29 +19,28 @@ from uavctl.errors import RecordingError
 from uavctl.identify.axis_model import AxisModel
 from uavctl.identify.fit import AxisFit, fit_axis
 from uavctl.identify.history import LEAST_SAMPLES, Stretch
-from uavctl.identify.prediction import predict_ahead
+from uavctl.identify.prediction import AHEAD_S, predict_ahead
 
 Array = NDArray[np.float64]
 
-COARSE_S = tuple(round(0.04 * i, 2) for i in range(8))
+COARSE_S = tuple(round(0.04 * i, 2) for i in range(9))
 FINE_S = 0.02
-TRIES = len(COARSE_S) + 3  # the coarse grid, two neighbours of its best, and the whole flight
+TRIES = len(COARSE_S) + 3  # the coarse grid, two neighbours of its best, and the halves
+_RISE = 4.0  # of the deviance: two standard errors
 BLOCK_S = 8.0
 _GROUP_S = 4.0  # errors nearer to each other in time are not independent
 _CERTAIN = 2.0  # standard errors
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What one dead time predicts of the halves that it was not fitted to.
+class HeldOutError:
+    """What a plant predicts of the halves that it was not fitted to.
 
     Attributes:
-        dead_time_s: d [s].
         squares: Sums of squared errors by group of time, axis and time ahead (groups, axes, ahead) [m²].
         counts: How many they are, alike.
     """
 
-    dead_time_s: float
     squares: Array
     counts: Array
 
@@ -61,20 +62,22 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
-    """One kind of plant with the dead time that predicts best.
+class ChosenPlant:
+    """One kind of plant with its likeliest dead time.
 
     Attributes:
-        curve: Every dead time that was tried, in order.
-        best: The one with the least error.
-        alike_s: Least and largest dead time whose error is not larger beyond two standard errors [s].
-        fits: Each axis, fitted to the whole flight with the best one.
+        curve: Dead times that were tried [s], in order, and the deviance of each above the least.
+        dead_time_s: The one with the least deviance [s].
+        range_s: Where the deviance is less than 4 above it, between tried ones by straight lines [s].
+        fits: Each axis, fitted to the whole flight with it.
+        judged: What it predicts of the halves.
     """
 
-    curve: tuple[Judged, ...]
-    best: Judged
-    alike_s: tuple[float, float]
+    curve: tuple[tuple[float, float], ...]
+    dead_time_s: float
+    range_s: tuple[float, float]
     fits: tuple[AxisFit, ...]
+    judged: HeldOutError
 
     @property
     def name(self) -> str:
@@ -84,7 +87,7 @@ class Chosen:
 
 def choose_dead_time(
     flown: Sequence[Stretch], axes: Sequence[int], models: Sequence[AxisModel], advance: Callable[[], None]
-) -> Chosen:
+) -> ChosenPlant:
     """One dead time for all axes.
 
     Args:
@@ -97,35 +100,52 @@ def choose_dead_time(
         RecordingError: The flight is too short for two halves.
     """
     both = halves(flown)
-    starts = [
-        tuple(fit_axis(half, axis, model, 0.1).parameters for half in both)
-        for axis, model in zip(axes, models, strict=True)
-    ]
-    tried: dict[float, Judged] = {}
+    tried: dict[float, tuple[AxisFit, ...]] = {}
 
-    def judge(dead_time_s: float) -> None:
+    def fit(dead_time_s: float) -> None:
         dead_time_s = round(dead_time_s, 3)
         if dead_time_s >= 0.0 and dead_time_s not in tried:
-            tried[dead_time_s] = _judged(both, axes, models, starts, dead_time_s)
+            near = min(tried, key=lambda one: abs(one - dead_time_s), default=None)
+            starts = [None] * len(axes) if near is None else [one.parameters for one in tried[near]]
+            tried[dead_time_s] = tuple(
+                fit_axis(flown, axis, model, dead_time_s, start)
+                for axis, model, start in zip(axes, models, starts, strict=True)
+            )
         advance()
 
+    def least() -> float:
+        return min(tried, key=lambda one: _total(tried[one]))
+
     for dead_time_s in COARSE_S:
-        judge(dead_time_s)
-    near_s = min(tried.values(), key=lambda one: one.error_m).dead_time_s
+        fit(dead_time_s)
+    near_s = least()
     for dead_time_s in (near_s - FINE_S, near_s + FINE_S):
-        judge(dead_time_s)
-    curve = tuple(tried[key] for key in sorted(tried))
-    best = min(curve, key=lambda one: one.error_m)
-    alike = [one.dead_time_s for one in curve if not is_worse(one, best)]
-    fits = tuple(
-        fit_axis(flown, axis, model, best.dead_time_s, start[0])
-        for axis, model, start in zip(axes, models, starts, strict=True)
-    )
+        fit(dead_time_s)
+    best_s = least()
+    curve = tuple((key, _total(tried[key]) - _total(tried[best_s])) for key in sorted(tried))
+    judged = _judged(both, axes, tried[best_s])
     advance()
-    return Chosen(curve, best, (min(alike), max(alike)), fits)
+    return ChosenPlant(curve, best_s, _range_s(curve, best_s), tried[best_s], judged)
 
 
-def is_worse(one: Judged, other: Judged) -> bool:
+def _total(fits: Sequence[AxisFit]) -> float:
+    return sum(fit.deviance for fit in fits)
+
+
+def _range_s(curve: Sequence[tuple[float, float]], best_s: float) -> tuple[float, float]:
+    """Where the deviance crosses 4 on either side of its least; the end of the curve where it does not."""
+    ends = []
+    for side in ([one for one in curve if one[0] <= best_s][::-1], [one for one in curve if one[0] >= best_s]):
+        end_s = side[-1][0]
+        for (near_s, low), (far_s, high) in pairwise(side):
+            if high >= _RISE:
+                end_s = near_s + (far_s - near_s) * (_RISE - low) / (high - low)
+                break
+        ends.append(end_s)
+    return ends[0], ends[1]
+
+
+def is_worse(one: HeldOutError, other: HeldOutError) -> bool:
     """Whether an error is larger beyond two standard errors of the difference (jackknife over groups of 4 s)."""
     difference = one.scores() - other.scores()
     without, whole = difference[:-1], difference[-1]
@@ -157,32 +177,16 @@ def halves(flown: Sequence[Stretch]) -> tuple[tuple[Stretch, ...], tuple[Stretch
 
 
 def _judged(
-    both: tuple[tuple[Stretch, ...], tuple[Stretch, ...]],
-    axes: Sequence[int],
-    models: Sequence[AxisModel],
-    starts: list[tuple[tuple[float, ...], ...]],
-    dead_time_s: float,
-) -> Judged:
-    sums = []
-    for place, (axis, model) in enumerate(zip(axes, models, strict=True)):
-        fits = [
-            fit_axis(half, axis, model, dead_time_s, start) for half, start in zip(both, starts[place], strict=True)
-        ]
-        starts[place] = tuple(fit.parameters for fit in fits)
-        found = [predict_ahead(other, axis, fit) for fit, other in zip(fits, both[::-1], strict=True)]
-        sums.append(
-            [
-                (np.concatenate([a.times_s, b.times_s]), np.concatenate([a.errors_m, b.errors_m]))
-                for a, b in zip(*found, strict=True)
-            ]
-        )
+    both: tuple[tuple[Stretch, ...], tuple[Stretch, ...]], axes: Sequence[int], fits: Sequence[AxisFit]
+) -> HeldOutError:
     begin = min(block.times_s[0] for half in both for block in half)
     groups = 1 + int((max(block.times_s[-1] for half in both for block in half) - begin) / _GROUP_S)
-    squares, counts = np.zeros((groups, len(axes), len(sums[0]))), np.zeros((groups, len(axes), len(sums[0])))
-    for i, of_axis in enumerate(sums):
-        for j, (times_s, errors_m) in enumerate(of_axis):
-            group = ((times_s - begin) / _GROUP_S).astype(np.int64)
-            squares[:, i, j] = np.bincount(group, weights=errors_m**2, minlength=groups)
-            counts[:, i, j] = np.bincount(group, minlength=groups)
-    flown = counts.sum(axis=(1, 2)) > 0
-    return Judged(dead_time_s, squares[flown], counts[flown])
+    squares, counts = np.zeros((groups, len(axes), len(AHEAD_S))), np.zeros((groups, len(axes), len(AHEAD_S)))
+    for i, (axis, whole) in enumerate(zip(axes, fits, strict=True)):
+        for half, other in (both, both[::-1]):
+            fit = fit_axis(half, axis, whole.model, whole.dead_time_s, whole.parameters)
+            for j, one in enumerate(predict_ahead(other, axis, fit)):
+                group = ((one.times_s - begin) / _GROUP_S).astype(np.int64)
+                squares[:, i, j] += np.bincount(group, weights=one.errors_m**2, minlength=groups)
+                counts[:, i, j] += np.bincount(group, minlength=groups)
+    return HeldOutError(squares, counts)

@@ -67,8 +67,9 @@ _RESPONSE = (
     "deviation of an acceleration that is constant over a step."
 )
 _DEAD = (
-    "Fitted to one half of the flight and judged by the other, blocks of 8 s in turn: rms error of the motion of the "
-    "next seconds, from each position on, with the setpoints as sent. The curve is their geometric mean."
+    "The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less than 4 "
+    "above its least. The errors compare plants: fitted to one half of the flight and judged by the other, blocks of "
+    "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints as sent."
 )
 _REST = (
     "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
@@ -97,7 +98,7 @@ def _candidates(found: Identification) -> str:
     rows = [
         (
             one.model,
-            f"{one.dead_time_s:.2f} ({one.dead_time_alike_s[0]:.2f} to {one.dead_time_alike_s[1]:.2f} alike)",
+            f"{one.dead_time_s:.2f} ({one.dead_time_range_s[0]:.2f} to {one.dead_time_range_s[1]:.2f})",
             response.axis,
             f"{lag_s:.3f}",
             *(f"{1e3 * value:.1f}" for value in errors),
@@ -111,12 +112,12 @@ def _candidates(found: Identification) -> str:
 
 def _curves(found: Identification) -> Drawing:
     with canvas("dead-time", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Error over the dead time", "dead time [s]", "error [mm]", _LEFT_IN)
+        ax = drawn.axes("Deviance over the dead time", "dead time [s]", "rise of the deviance", _LEFT_IN)
         for one, name in zip(found.result.candidates, ("estimate", "lost"), strict=False):
             curve = np.array(one.curve)
-            ax.plot(curve[:, 0], 1e3 * curve[:, 1], color=colour(name), marker="o", markersize=3, label=one.model)
+            ax.plot(curve[:, 0], curve[:, 1], color=colour(name), marker="o", markersize=3, label=one.model)
         ax.legend()
-    return Drawing("dead-time", drawn.svg, "prediction error of each plant over the dead time")
+    return Drawing("dead-time", drawn.svg, "rise of the deviance of each plant over the dead time")
 
 
 def _with_error(value: float, error: float | None) -> str:

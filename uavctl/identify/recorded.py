@@ -50,7 +50,7 @@ class History:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
 
-class Told:
+class VehicleWords:
     """What the vehicle says of itself: whose software it flies, and its parameters of the position loops."""
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ def from_records(records: Iterable[tuple[str, int, Record]], config: Config) -> 
     """
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers, told = Numbers(config.source.messages), Told()
+    numbers, told = Numbers(config.source.messages), VehicleWords()
     flown = False
     for _, _, record in records:
         if isinstance(record, Datagram) and not record.outgoing:
@@ -144,7 +144,7 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
     link = links.get(MOCAP) or next(iter(links.values()))
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers, told = Numbers(config.source.messages), Told()
+    numbers, told = Numbers(config.source.messages), VehicleWords()
     for packet in packets:
         if packet.outgoing:
             sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data))
@@ -159,7 +159,7 @@ def _history(
     sent: list[tuple[int, tuple[float, float, float], bool]],
     samples: list[PositionSample],
     numbers: Numbers,
-    told: Told,
+    told: VehicleWords,
 ) -> History:
     if not samples or not sent:
         missing = "no position" if not samples else "no acceleration setpoint"

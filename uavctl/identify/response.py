@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.identify.axis_model import AxisModel, Motion
+from uavctl.identify.axis_model import AxisModel, LinearMotion
 from uavctl.identify.history import Stretch
 
 Array = NDArray[np.float64]
@@ -111,7 +111,7 @@ def filtered(part: Timeline, model: AxisModel, parameters: Array) -> Filtered:
     return Filtered(driven[:, 0], rest[:, 0], innovations[:, 0], np.sqrt(variances[:, 0]))
 
 
-def advance(motion: Motion, lengths: Counts) -> Advance:
+def advance(motion: LinearMotion, lengths: Counts) -> Advance:
     """Motion over some lengths (n,) [instants], by the binary digits of each."""
     move, push, spread = _instant(motion)
     count, size = len(lengths), move.shape[-1]
@@ -132,7 +132,7 @@ def _instants(times_s: Array) -> Counts:
     return np.rint(times_s / INSTANT_S).astype(np.int64)
 
 
-def _instant(motion: Motion) -> tuple[Array, Array, Array]:
+def _instant(motion: LinearMotion) -> tuple[Array, Array, Array]:
     """Transition, effect of a held input, and covariance of the noise, of one instant."""
     move, integral = _series(motion.a, INSTANT_S)
     spread = np.zeros_like(motion.noise)
@@ -154,7 +154,7 @@ def _series(slope: Array, time_s: float) -> tuple[Array, Array]:
 
 
 def _pass(
-    part: Timeline, model: AxisModel, motion: Motion, parameters: Array
+    part: Timeline, model: AxisModel, motion: LinearMotion, parameters: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Deviance (k,), driven and other states (m, k, n), innovations and their variances (m, k)."""
     driven = _driven(part, motion)
@@ -187,7 +187,7 @@ def _pass(
     return total, driven, np.array(states), np.array(innovations), np.array(variances)
 
 
-def _driven(part: Timeline, motion: Motion) -> Array:
+def _driven(part: Timeline, motion: LinearMotion) -> Array:
     """What the inputs alone have done at each position (m, k, n)."""
     different, which = np.unique(part.lengths, return_inverse=True)
     moves, pushes, _ = advance(motion, different)

@@ -11,7 +11,7 @@ import msgspec
 from uavctl.config import Config
 from uavctl.errors import RecordingError
 from uavctl.identify.axis_model import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis
-from uavctl.identify.dead_time import TRIES, Chosen, choose_dead_time, is_worse
+from uavctl.identify.dead_time import TRIES, ChosenPlant, choose_dead_time, is_worse
 from uavctl.identify.fit import AxisFit, standard_errors
 from uavctl.identify.history import Stretch, stretches, thinned
 from uavctl.identify.link_fit import LinkFit, fit_link
@@ -51,12 +51,12 @@ class Candidate(msgspec.Struct, frozen=True, kw_only=True):
 
     model: str
     dead_time_s: float
-    dead_time_alike_s: tuple[float, float]
+    dead_time_range_s: tuple[float, float]
     lag_s: tuple[float, ...]
     error_m: float
     ahead_s: tuple[float, ...]
     rms_m: tuple[tuple[float, ...], ...]  # each axis, each time ahead
-    curve: tuple[tuple[float, float], ...]  # dead time [s], error [m]
+    curve: tuple[tuple[float, float], ...]  # dead time [s], rise of the deviance
 
 
 class Identified(msgspec.Struct, frozen=True, kw_only=True):
@@ -155,25 +155,25 @@ def _gains(history: History, config: Config) -> list[tuple[float, float, float]]
     return found
 
 
-def _candidate(one: Chosen) -> Candidate:
+def _candidate(one: ChosenPlant) -> Candidate:
     return Candidate(
         model=one.name,
-        dead_time_s=one.best.dead_time_s,
-        dead_time_alike_s=one.alike_s,
+        dead_time_s=one.dead_time_s,
+        dead_time_range_s=one.range_s,
         lag_s=tuple(fit.value("lag_s") for fit in one.fits),
-        error_m=one.best.error_m,
+        error_m=one.judged.error_m,
         ahead_s=AHEAD_S,
-        rms_m=tuple(tuple(row) for row in one.best.rms_m.tolist()),
-        curve=tuple((judged.dead_time_s, judged.error_m) for judged in one.curve),
+        rms_m=tuple(tuple(row) for row in one.judged.rms_m.tolist()),
+        curve=one.curve,
     )
 
 
-def _better(chosen: Chosen, others: Sequence[Chosen]) -> list[str]:
+def _better(chosen: ChosenPlant, others: Sequence[ChosenPlant]) -> list[str]:
     return [
-        f'plant.model "{other.name}" predicts better: error {1e3 * other.best.error_m:.1f} mm instead of '
-        f"{1e3 * chosen.best.error_m:.1f} mm; start from a configuration that has it"
+        f'plant.model "{other.name}" predicts better: error {1e3 * other.judged.error_m:.1f} mm instead of '
+        f"{1e3 * chosen.judged.error_m:.1f} mm; start from a configuration that has it"
         for other in others
-        if is_worse(chosen.best, other.best)
+        if is_worse(chosen.judged, other.judged)
     ]
 
 
@@ -216,12 +216,12 @@ def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
     return found
 
 
-def _config(config: Config, chosen: Chosen, responses: Sequence[AxisResponse], link: LinkFit) -> Config:
+def _config(config: Config, chosen: ChosenPlant, responses: Sequence[AxisResponse], link: LinkFit) -> Config:
     """The configuration with what was identified."""
     plant = msgspec.structs.replace(
         config.plant,
         model=chosen.name,
-        dead_time_s=chosen.best.dead_time_s,
+        dead_time_s=chosen.dead_time_s,
         drag_1ps=_rounded(one.drag_1ps for one in responses),
         lag_s=_rounded(one.lag_s for one in responses),
         wind_std_mps2=_rounded(one.wind_std_mps2 for one in responses),
@@ -243,7 +243,7 @@ def _config(config: Config, chosen: Chosen, responses: Sequence[AxisResponse], l
     )
 
 
-def _of_model(chosen: Chosen, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
+def _of_model(chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
     """Keys of `[plant]` that only one kind of plant has."""
     if chosen.name == DRAG_LAG:
         return {"gain": _rounded(one.gain or 0.0 for one in responses)}
