@@ -41,6 +41,7 @@ from uavctl.flight.estimator import (
     begin,
     belief_ahead,
     belief_at,
+    doubted,
     estimate,
     feel,
     set_input,
@@ -253,6 +254,33 @@ def test_one_that_cannot_be_is_left_out_and_no_reason_for_doubt() -> None:
     beliefs = followed(make(), 6.0, lambda tick: 3.0 if tick % 10 == 5 else 0.0)
     assert all(belief.doubted_ns is None for belief in beliefs)
     assert max(abs(float(belief.mean[1])) for belief in beliefs) < 0.05
+
+
+def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_so() -> None:
+    kalman = make()
+
+    def told(*, lies: bool, late: bool) -> Belief:
+        history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+        for tick in range(20):
+            at_ns = START_NS + tick * TICK_NS
+            samples = [sample(at_ns)] if tick % 4 == 0 and tick <= 8 else []
+            history, _, _ = absorb(kalman, history, at_ns, samples)
+            if tick < 8 or (lies and tick > 8):
+                history = feel(kalman, history, felt_at(at_ns + MS, 0.1 if tick > 8 else 0.0))
+        history = doubted(kalman, history, at_ns + 2 * MS) if lies else history
+        at_ns += TICK_NS
+        if late:
+            history, taken, _ = absorb(kalman, history, at_ns, [sample(START_NS + 6 * TICK_NS, at_ns)])
+            assert taken
+        belief = belief_at(kalman, feel(kalman, history, felt_at(at_ns, 0.1) if lies else ()), at_ns)
+        assert belief is not None
+        return belief
+
+    for late in (False, True):
+        lied, silent = told(lies=True, late=late), told(lies=False, late=late)
+        assert lied.doubted_ns is not None and silent.doubted_ns is None
+        np.testing.assert_allclose(lied.mean, silent.mean, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(lied.cov, silent.cov, rtol=0, atol=1e-12)
 
 
 def test_positions_that_contradict_what_is_felt_make_it_doubted() -> None:

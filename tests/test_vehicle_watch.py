@@ -14,6 +14,7 @@ from uavctl.config.types import EstimatorConfig
 from uavctl.data import InertialSample, VehicleStatus
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.punctual import Punctual
 from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS
 
 NOW = 1000 * SECOND
@@ -207,6 +208,15 @@ def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tup
     taken = stream(lies, count=190)
     assert taken[:100] == list(range(100))
     assert len(taken[100:]) <= 1 + TURNED_NS // (20 * MS)  # as long as the last attitude turns them
+
+
+@pytest.mark.parametrize("ppm", [-500, 500])
+def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None:
+    stream_of_now = Punctual()
+    for second in range(1800):
+        at_ns = NOW + second * SECOND
+        stamp_us = (at_ns + second * ppm * 1000) // 1000
+        assert stream_of_now.takes(stamp_us, (0.01 * (second % 3), 0.0, 0.0), at_ns), second
 
 
 @pytest.mark.parametrize("jump_s", [-900, 900])

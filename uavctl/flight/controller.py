@@ -99,6 +99,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         order: What the operator ordered of the mission and no decision has taken up yet.
         link: What the boundaries so far have shown of the link.
         link_alarms: What was told of the link and still holds, by event code.
+        inertial: How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly.
         watching: What the envelope knows of this flight.
         breach: What it found that cannot be; None for nothing.
         recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
@@ -119,6 +120,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     order: Command | None = None
     link: LinkBelief = NOTHING_SEEN
     link_alarms: tuple[str, ...] = ()
+    inertial: str = ""
     watching: Watching = NOT_WATCHING
     breach: Breach | None = None
     recalled: bool = False

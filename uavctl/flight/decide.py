@@ -135,7 +135,7 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
         return _fall(state, landing, tick, inp, controller, MISSION_OVER)
-    choice = _replan(state, mission, base, tick, controller)
+    choice = _replan(state, mission, base, tick, inp, controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
@@ -152,10 +152,12 @@ def _base(state: ControlState, tick: Tick, inp: StepInput, controller: Controlle
     return None if belief is None else estimated(kalman, belief)
 
 
-def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Tick, controller: Controller) -> Choice:
+def _replan(
+    state: ControlState, mission: MissionState, base: Estimate, tick: Tick, inp: StepInput, controller: Controller
+) -> Choice:
     """Ask for a plan if there is news, as ordered; else, or if that fails, the old one plays out."""
     news = state.plan is None or base.captured_ns > state.plan.captured_ns
-    if not news and not _felt_since(state, tick, controller):
+    if not news and not _felt_since(state, tick, inp, controller):
         return Choice(state, "no news: the plan plays out")
     reason = "news: a new plan" if news else "inertial data: a new plan"
     if state.order is not None:
@@ -181,11 +183,12 @@ def _replan(state: ControlState, mission: MissionState, base: Estimate, tick: Ti
     return Choice(replace(state, plan=asked.plan, fallback=None), reason, news, asked.status, asked.plan)
 
 
-def _felt_since(state: ControlState, tick: Tick, controller: Controller) -> bool:
+def _felt_since(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
     """Whether inertial data have come since the plan was made, and the solver counts the age of what it is made of."""
     if state.plan is None or (tick.age_steps or 0) > controller.late_steps:
         return False
-    if tick.belief is not None and tick.boundary_ns - tick.belief.captured_ns > PLANNED_NS:
+    alone = envelope.witness(state.watching, inp.motion, inp.at_ns) is None
+    if alone and tick.belief is not None and tick.boundary_ns - tick.belief.captured_ns > PLANNED_NS:
         return False
     newest_ns = None if tick.belief is None else tick.belief.felt_ns
     return newest_ns is not None and newest_ns > state.plan.base_ns - controller.dead_ns
@@ -236,8 +239,8 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
     )
 
 
-# Behind a position that is older no plans are made by inertial data: nothing would tell that they err, and the plan
-# would follow them. Of positions five times a second of which 60 % are lost one in ten is older.
+# Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
+# nothing would tell that they err. Of positions five times a second of which 60 % are lost one in ten is older.
 PLANNED_NS = 1_000_000_000
 RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 

@@ -255,10 +255,13 @@ def misled(watching: Watching, seen: Observation, age_s: float, parameters: Enve
 
 def contradicts(watching: Watching, seen: Observation, parameters: EnvelopeParameters) -> bool:
     """Whether a velocity that inertial data have carried on is not the vehicle's own, for which positions spoke."""
-    if watching.contradicted or watching.apart_mps is None:
-        return False
-    velocity = own_words(seen.motion, seen.at_ns)
+    velocity = witness(watching, seen.motion, seen.at_ns)
     return velocity is not None and not _near(velocity, seen.velocity_mps, parameters.disagreement_mps)
+
+
+def witness(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
+    """The vehicle's own velocity, where positions have agreed with it of late; else None."""
+    return None if watching.contradicted or watching.apart_mps is None else own_words(motion, at_ns)
 
 
 def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:

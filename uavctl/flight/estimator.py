@@ -52,6 +52,7 @@ class Entry(msgspec.Struct, frozen=True, eq=False):
     input: Array | None  # of an input change; None: others fly from here on
     after: Node
     accel_mps2: Array | None = None  # of inertial data: what they show of each axis of the plant
+    doubted: bool = False  # inertial data are doubted from here on
 
 
 class History(msgspec.Struct, frozen=True, eq=False):
@@ -150,17 +151,17 @@ def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) ->
 
 
 def doubted(kalman: Kalman, history: History, at_ns: int) -> History:
-    """The state without the inertial data since the newest position, and with more of them doubted."""
+    """The state without the inertial data since the newest position of the window, and with more of them doubted."""
     newest = max((place for place, entry in enumerate(history.entries) if entry.sample is not None), default=-1)
     node, kept = history.anchor, []
     for place, entry in enumerate(history.entries):
         if place > newest and entry.accel_mps2 is not None:
             continue
         node = _after(kalman, history.origin_ns, node, entry)
-        if place >= newest and node.belief is not None:
-            node = replace(node, belief=replace(node.belief, doubted_ns=node.belief.doubted_ns or at_ns))
         kept.append(replace(entry, after=node))
-    return replace(history, entries=tuple(kept))
+    history = replace(history, entries=tuple(kept))
+    mark = Entry(key=(at_ns, _MARK, "doubted", at_ns), sample=None, input=None, after=node, doubted=True)
+    return _inserted(kalman, history, mark, None)
 
 
 def _says_something(sample: InertialSample, before: InertialSample | None) -> bool:
@@ -323,4 +324,6 @@ def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry, belief: Bel
         belief = first_belief(kalman, entry.sample) if belief is None else updated(kalman, belief, entry.sample)
     elif entry.accel_mps2 is not None and belief is not None:
         belief = felt(kalman, belief, entry.accel_mps2, node.input)
+    if entry.doubted and belief is not None and belief.doubted_ns is None:
+        belief = replace(belief, doubted_ns=entry.key[0])
     return Node(belief=belief, input=entry.input if entry.key[1] == _INPUT else node.input)

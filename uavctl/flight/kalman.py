@@ -35,6 +35,7 @@ FELT_SIGMA = 3.0
 # three axes: chance 1e-8), and they are doubted, until positions agree again and for this time at least.
 REFUSED, CONTRADICTED = 3, 40.0
 DOUBTED_NS = 3_000_000_000
+AGREES_NS = 1_000_000_000  # after the position before, a position that agrees says something
 RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
 
 
@@ -245,9 +246,10 @@ def _confronted(kalman: Kalman, belief: Belief, values: Array, noise: Array) -> 
     off = values - belief.mean[index]
     contradicted = float(off @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, off)) > CONTRADICTED
     if belief.doubted_ns is not None:
-        ended = not contradicted and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
+        knows = belief.at_ns - belief.captured_ns <= AGREES_NS  # with whatever came, nearly all agrees after a silence
+        ended = knows and not contradicted and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
         return replace(belief, refused=0, doubted_ns=None) if ended else belief
-    if not contradicted or belief.felt_ns is None:
+    if not contradicted or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
         return belief
     cov = belief.cov.copy()
     _widen(cov, kalman.shown[len(kalman.axes) :], RELEARNT_MPS**2)

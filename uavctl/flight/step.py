@@ -32,7 +32,7 @@ from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, mov
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
 from uavctl.flight.estimator import act, begin, doubted, feel, set_input, without
 from uavctl.flight.fallback import End
-from uavctl.flight.kalman import Array, Belief, captured_ns
+from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
@@ -127,7 +127,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)
     taken_back = state.taken_back if clean_ns is None and not lies else tick.number
-    afresh = tick.boundary and taken_back is not None and 0 < tick.number - taken_back <= AFRESH_STEPS
+    since = None if taken_back is None else tick.number - taken_back
+    afresh = tick.boundary and since is not None and (0 < since <= AFRESH_STEPS or lies)
     begun = replace(
         ordered,
         history=intake.history,
@@ -151,8 +152,10 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         history, coming = intake.history, (*coming, (inp.at_ns + controller.dead_ns, acting))
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
+    inertial = _inertial(state, tick, inp, controller)
     after = replace(
         choice.state,
+        inertial=inertial,
         link=belief,
         link_alarms=alarms,
         history=history,
@@ -194,7 +197,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
             *(() if breach is None else (_breached(inp.at_ns, breach),)),
             *_events(before, mode, choice, inp, tuple(why for _, why in intake.refused), controller.names),
             *_link_events(alarms, state.link_alarms, link),
-            *_inertial_events(state, tick, inp, controller),
+            *_inertial_events(state.inertial, inertial, inp.at_ns),
         ),
         refused=tuple(sample for sample, _ in intake.refused),
         link=link,
@@ -325,28 +328,26 @@ _INERTIAL = {
     "inertial-used": (Severity.INFO, "the vehicle's inertial data are used"),
 }
 SILENT_NS = 1_000_000_000  # without inertial data
+ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for and begin
 
 
-def _inertial_events(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> tuple[Event, ...]:
-    """What has become of the vehicle's inertial data since the tick before, while we fly."""
-    if not controller.kalman.n_felt or state.history is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
-        return ()
-    before = _inertial(state.history.newest.belief, inp.at_ns - controller.tick_ns)
-    now = _inertial(tick.history.newest.belief, inp.at_ns)
-    if now == before or now is None or before is None:
-        return ()
-    severity, text = _INERTIAL[now]
-    return (Event(at_ns=inp.at_ns, severity=severity, code=now, text=text),)
-
-
-def _inertial(belief: Belief | None, at_ns: int) -> str | None:
-    """The event's code for how it is with inertial data; None before the first position."""
-    if belief is None:
-        return None
+def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> str:
+    """How it is with the vehicle's inertial data, as an event's code; empty where that is nothing to us."""
+    belief, flown = tick.history.newest.belief, state.mode not in _NOT_FLOWN and _is_ours(inp.vehicle)
+    if not controller.kalman.n_felt or belief is None or not flown:
+        return ""
     if belief.doubted_ns is not None:
         return "inertial-doubted"
-    silent = belief.felt_ns is None or at_ns - belief.felt_ns > SILENT_NS
-    return "inertial-silent" if silent else "inertial-used"
+    newest_ns = belief.felt_ns or tick.history.origin_ns + ASKED_NS
+    return "inertial-silent" if inp.at_ns - newest_ns > SILENT_NS else "inertial-used"
+
+
+def _inertial_events(before: str, now: str, at_ns: int) -> tuple[Event, ...]:
+    """What has become of the vehicle's inertial data; that they are used is told only where they were not."""
+    if now in ("", before) or (now == "inertial-used" and not before):
+        return ()
+    severity, text = _INERTIAL[now]
+    return (Event(at_ns=at_ns, severity=severity, code=now, text=text),)
 
 
 def _setpoint(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from uavctl.data import Vec3
 
 LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
-CREEP = 1e-4  # by which two clocks may drift apart
+CREEP = 1e-3  # by which two clocks may drift apart: ten times what bad oscillators do
 BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
 
 
