@@ -283,6 +283,7 @@ def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_s
         np.testing.assert_allclose(lied.cov, silent.cov, rtol=0, atol=1e-12)
 
 
+@pytest.mark.fault(59)
 def test_positions_that_contradict_what_is_felt_make_it_doubted() -> None:
     kalman = make()
     beliefs = followed(kalman, 10.0, lambda tick: min(max(tick - 80, 0) * 0.02, 1.5), every=16)

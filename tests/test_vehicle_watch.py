@@ -204,6 +204,7 @@ def test_inertial_data_that_are_of_now_are_all_taken_whatever_the_clocks() -> No
     ],
     ids=["late", "old stamps", "frozen force", "frozen attitude"],
 )
+@pytest.mark.fault(58)
 def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tuple[int, int, bool, bool]]) -> None:
     taken = stream(lies, count=190)
     assert taken[:100] == list(range(100))
