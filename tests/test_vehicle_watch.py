@@ -14,8 +14,7 @@ from uavctl.config.types import EstimatorConfig
 from uavctl.data import InertialSample, VehicleStatus
 from uavctl.mavlink.link import Link
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.punctual import Punctual
-from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS
+from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS, Punctual
 
 NOW = 1000 * SECOND
 MS = 1_000_000

@@ -11,7 +11,6 @@ from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, Ve
 from uavctl.frames import from_euler, rotate
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
-from uavctl.mavlink.punctual import Punctual
 
 SECOND_VEHICLE = "second-vehicle"
 UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
@@ -21,6 +20,9 @@ BACK_MS = 1000  # its clock goes back by more than this: it has started anew
 _WRAP_MS = 2**32
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
+LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
+CREEP = 1e-3  # by which two clocks may drift apart: ten times what bad oscillators do
+BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 _STARTING = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
@@ -30,6 +32,39 @@ _GROUND_STATION = int(mavlink.MAV_TYPE_GCS)
 def is_vehicle(heartbeat: Heartbeat) -> bool:
     """Whether a heartbeat is an autopilot's: not a ground station's, a camera's or a gimbal's."""
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type != _GROUND_STATION
+
+
+class Punctual:
+    """Tells what is late, or says again what has been said, in one stream of one sender.
+
+    A message's delay is told against that of the quickest before it: clocks need not agree.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns: int | None = None  # arrival less stamp
+        self._heard_ns = 0  # the last that was taken
+        self._stamp_us = 0  # of that
+        self._values: Vec3 | None = None
+
+    def takes(self, stamp_us: int, values: Vec3, at_ns: int) -> bool:
+        """Whether a message is of now.
+
+        Args:
+            stamp_us: when it was measured, by the sender's clock.
+            values: what was measured; the same to the last bit is no measurement.
+            at_ns: its arrival.
+        """
+        if stamp_us < self._stamp_us - BACK_US:
+            self._least_ns, self._stamp_us = None, 0
+        behind_ns = at_ns - 1000 * stamp_us
+        least_ns = behind_ns
+        if self._least_ns is not None:
+            least_ns = min(behind_ns, self._least_ns + round(CREEP * (at_ns - self._heard_ns)))
+        if stamp_us <= self._stamp_us or values == self._values or behind_ns - least_ns > LATE_NS:
+            return False
+        self._least_ns, self._heard_ns = least_ns, at_ns
+        self._stamp_us, self._values = stamp_us, values
+        return True
 
 
 class VehicleWatch:
