@@ -16,11 +16,11 @@ from uavctl.config import load_config
 from uavctl.errors import RecordingError
 from uavctl.identify.axis_model import DragLagAxis, LinearMotion, ReferenceAxis, places, values
 from uavctl.identify.dead_time import FINE_S, TRIES, choose_dead_time, is_worse
-from uavctl.identify.fit import fit_axis, standard_errors
+from uavctl.identify.fit import AxisFit, fit_axis, standard_errors
 from uavctl.identify.history import Asked, Seen, Stretch, seen_from, stretches, thinned
 from uavctl.identify.link_fit import fit_link
-from uavctl.identify.prediction import predict
-from uavctl.identify.recorded import History, Numbers, from_tlog
+from uavctl.identify.prediction import predict, predict_ahead
+from uavctl.identify.recorded import History, Senders, from_tlog
 from uavctl.identify.response import INSTANT_S, advance
 from uavctl.identify.result import identify
 from uavctl.smpc.plant import Plant, drag_lag
@@ -100,14 +100,37 @@ def flown_by_reference(seed: int) -> Stretch:
     return Stretch(TICK_S * np.arange(len(asked), dtype=np.float64), inputs, np.array(times), np.array(rows))
 
 
+def missed(flown: Stretch, fit: AxisFit) -> NDArray[np.float64]:
+    """Rms errors of the motion of the next times [m]."""
+    return np.array([np.sqrt(np.mean(one.errors_m**2)) for one in predict_ahead((flown,), 0, fit)])
+
+
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_plant_with_a_reference_is_found_and_likelier(seed: int) -> None:
-    flown = (flown_by_reference(seed),)
+def test_the_plant_with_a_reference_is_found_and_predicts_another_flight(seed: int) -> None:
+    flown, other = (flown_by_reference(seed),), flown_by_reference(20 + seed)
     right, wrong = (choose_dead_time(flown, (0,), (kind,), lambda: None) for kind in (HELD, DragLagAxis(drifts=True)))
-    assert right.dead_time_s == pytest.approx(0.1, abs=0.03)
-    assert right.dead_time_s + right.fits[0].value("lag_s") == pytest.approx(0.2, abs=0.03)
-    assert right.fits[0].deviance < wrong.fits[0].deviance - 20.0  # 22 000 times as likely
+    fit = right.fits[0]
+    assert right.dead_time_s == pytest.approx(0.1, abs=FINE_S + 1e-9)
+    assert right.dead_time_s + fit.value("lag_s") == pytest.approx(0.2, abs=0.01)
+    assert fit.value("drag_1ps") == pytest.approx(0.25, abs=3.0 * standard_errors(flown, 0, fit)["drag_1ps"])
+    assert fit.value("input_mps2_rts") == pytest.approx(0.1 * np.sqrt(TICK_S), rel=0.4)
+    assert fit.value("noise_m") == pytest.approx(NOISE_M, rel=0.1)
+    assert fit.deviance < wrong.fits[0].deviance - 20.0  # 22 000 times as likely
+    # On the halves not fitted to, and on a flight that neither has seen: there it is as good as the truth.
+    assert right.judged.error_m < 0.9 * wrong.judged.error_m
     assert not is_worse(right.judged, wrong.judged)
+    true = {
+        "lag_s": 0.1,
+        "drag_1ps": 0.25,
+        "wind_mps2_rts": 0.03 * np.sqrt(TICK_S),
+        "noise_m": NOISE_M,
+        "input_mps2_rts": 0.1 * np.sqrt(TICK_S),
+        "drift_mps2_rts": 0.05,
+    }
+    truth = AxisFit(HELD, 0.1, tuple(places(HELD, true).tolist()), 0.0)
+    assert np.all(missed(other, fit) < 1.1 * missed(other, truth))
+    assert np.all(missed(other, fit) < missed(other, wrong.fits[0]))
+    assert missed(other, fit)[-1] < 0.7 * missed(other, wrong.fits[0])[-1]  # 2 s ahead
 
 
 def test_a_right_model_leaves_white_innovations_and_a_wrong_one_does_not() -> None:
@@ -227,19 +250,64 @@ def test_bursts_are_told_from_independent_losses() -> None:
     assert sum(link.runs[4:]) > 2.0 * link.loss**4
 
 
-def test_numbers_of_messages_wrap_and_overtake() -> None:
+def camera(number: int, stamp_us: int) -> bytes:
+    """A position from system 17, component 18."""
     encoder = mavlink.MAVLink(None, srcSystem=17, srcComponent=18)
-    numbers = Numbers(["VISION_POSITION_ESTIMATE"])
+    encoder.seq = number % 256
+    message = mavlink.MAVLink_vision_position_estimate_message(stamp_us, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return bytes(message.pack(encoder))
+
+
+def test_numbers_of_messages_wrap_and_overtake() -> None:
+    senders = Senders()
+    stamps_us = np.cumsum(np.random.default_rng(1).integers(1_000, 90_000, 500)).tolist()  # tell nothing
     order = [*range(200), 203, 202, 204, *range(210, 500)]  # 200, 201, 205 ... 209 are lost, 202 is overtaken
     for number in order:
-        message = mavlink.MAVLink_vision_position_estimate_message(number, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        encoder.seq = number % 256
-        numbers.take(message.pack(encoder))
+        senders.take(camera(number, stamps_us[number]), 0)
         if number == 100:  # an id that the dialect has not, of the same sender, has a number of its own
-            numbers.take(bytes((0xFD, 1, 0, 0, 205, 17, 18, 0x9A, 0x01, 0x00, 7, 0, 0)))
-    gaps = numbers.gaps()
+            senders.take(bytes((0xFD, 1, 0, 0, 205, 17, 18, 0x9A, 0x01, 0x00, 7, 0, 0)), 0)
+    gaps = senders.gaps((17, 18))
     assert gaps.sum() == 6
     assert sorted(gaps[gaps > 0]) == [2, 4]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
+    rng = np.random.default_rng(5)
+    senders, came = Senders(), np.flatnonzero(rng.random(2000) >= share)
+    for number, frame in enumerate(came.tolist()):
+        stamp_us = 1_000_000_000 + 25_000 * frame + round(rng.normal(0.0, 1_200.0))
+        senders.take(camera(number, stamp_us), 1000 * stamp_us + round(rng.uniform(10e6, 40e6)))
+    np.testing.assert_array_equal(senders.gaps((17, 18)), np.diff(came) - 1)
+    shortest_s = senders.shortest_delay_s((17, 18))
+    assert shortest_s is not None
+    assert shortest_s == pytest.approx(0.010, abs=0.001)
+
+
+def test_a_stamp_of_another_clock_tells_no_delay() -> None:
+    for ahead_us in (-30_000_000, 500_000):
+        senders = Senders()
+        for number in range(100):
+            senders.take(camera(number, 25_000 * number + 60_000_000), 1000 * (25_000 * number + 60_000_000 - ahead_us))
+        assert senders.shortest_delay_s((17, 18)) is None
+
+
+def test_the_cameras_of_a_recorded_px4_are_not_mistaken_for_its_own_odometry() -> None:
+    """The rig stamped 40 positions a second by the recorder's clock, lost 30 %, and let the rest wait 10 to 40 ms.
+
+    It numbered part of what it then lost, and PX4 sends ODOMETRY of its own at 30 Hz without a loss.
+    """
+    for name in ("room-px4", "room"):
+        history = from_tlog(read_tlog(DATA / "px4-relay.tlog").packets, load_config(name))
+        link = fit_link(history.seen, history.gaps)
+        sent = 1.0 + 40.0 * (history.seen.times_s[-1] - history.seen.times_s[0])
+        assert link.loss == pytest.approx(1.0 - link.received / sent, abs=0.01)
+        assert link.loss == pytest.approx(0.3, abs=0.02)
+        assert link.bursts
+        assert link.rate_hz == pytest.approx(40.0, rel=0.01)
+        assert history.latency_s == pytest.approx(0.010, abs=0.002)
+        assert link.delay_s == pytest.approx(0.010, abs=0.002)
+        assert link.delay_s + link.jitter_s == pytest.approx(0.040, abs=0.005)
 
 
 def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
@@ -247,7 +315,7 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
 
     Seen through positions the shortest delay of 25 ms comes on top, and the ramp of a limited jerk counts as lag.
     """
-    config = load_config("room", ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
+    config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
     history = from_tlog(read_tlog(DATA / "arducopter-vicon-loop.tlog").packets, config)
     flown = [thinned(one, 0.2) for one in stretches(history.asked, history.seen)]
     fit = fit_axis(flown, 0, DRAG_LAG, 0.0)
@@ -267,7 +335,7 @@ def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
     asked = Asked(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
     seen = Seen(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
     with pytest.raises(RecordingError, match="hardly changed in east"):
-        identify(History(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room"), lambda: None)
+        identify(History(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room-hahn-stursberg"), lambda: None)
 
 
 @pytest.mark.usefixtures("no_page")
@@ -275,6 +343,8 @@ def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: p
     waypoints = "[[1.5,1.0,-1.2],[-1.5,-1.0,-1.0],[1.5,-1.0,-1.6],[1.5,1.0,-1.2]]"
     flying = [
         "loopback",
+        "--config",
+        "room-hahn-stursberg",
         "--set",
         f"mission.waypoints={waypoints}",
         "--duration",
@@ -291,7 +361,7 @@ def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: p
     config = load_config(told["config"])
     assert config.plant.lag_s == tuple(told["plant"]["lag_s"])
     assert told["plant"]["dead_time_s"] <= 0.04
-    flown = load_config("room").plant.lag_s  # `clock.latency_s` stands for the shortest delay
+    flown = load_config("room-hahn-stursberg").plant.lag_s  # `clock.latency_s` stands for the shortest delay
     for one, lag_s in zip(told["response"], flown, strict=True):
         assert abs(told["plant"]["dead_time_s"] + one["lag_s"] - lag_s) < 0.06
     page = Path(told["report"]).read_text(encoding="utf-8")

@@ -61,13 +61,14 @@ def found(*warnings: str) -> Identification:
         positions=100,
         plant={},
         candidates=(),
+        ramp_s=0.0,
         response=tuple(response(axis, r2) for axis, r2 in zip(AXES, (0.95, 0.9, 0.26), strict=True)),
         residual_std=(0.01,) * 3,
         r2=(0.95, 0.9, 0.26),
         link={},
         warnings=warnings,
     )
-    return Identification(result, load_config("room"), fit_link(seen(), np.ones(99, dtype=np.int64)), ())
+    return Identification(result, load_config("room-hahn-stursberg"), fit_link(seen(), np.ones(99, dtype=np.int64)), ())
 
 
 def sentences(page: str) -> list[str]:
@@ -110,7 +111,7 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
 
     asked = Asked(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
     history = History(asked, seen(), np.zeros(0, dtype=np.int64))
-    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room")))
+    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
     monkeypatch.setattr(identify_cmd, "design_of", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0

@@ -73,7 +73,7 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config
     if cut := lacks_end(flight):
         warn(f"{cut}: identified from what comes before")
-    return from_records(read(flight), config), config
+    return from_records(read(flight)), config
 
 
 def _design_doubts(config: Config) -> tuple[str, ...]:
@@ -123,6 +123,8 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
         low_s, high_s = kind.dead_time_range_s
         within = f"{low_s:.2f} to {high_s:.2f}"
         kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", within, f"{1e3 * kind.error_m:.1f}")
+    dead_ms, ramp_ms = 1e3 * found.config.plant.dead_time_s, 1e3 * result.ramp_s
+    ramp = f"configured dead time: {dead_ms:.1f} ms, of which {ramp_ms:.1f} ms are half of a setpoint's own ramp"
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{found.link.rate_hz:.4g} Hz"),
@@ -131,4 +133,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
     ):
         link.add_row(name, value)
     told = [f"[yellow]{escape(text)}[/]" for text in result.warnings]
-    return Group(plant, kinds, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}")
+    ramps = [ramp] if result.ramp_s > 0.0 else []
+    return Group(
+        plant, kinds, *ramps, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}"
+    )

@@ -29,14 +29,12 @@ class Free(NamedTuple):
         least: Least value.
         most: Largest value.
         logarithmic: Whether its logarithm is what is fitted.
-        step: Step of the difference quotient.
     """
 
     name: str
     least: float
     most: float
     logarithmic: bool
-    step: float
 
     def inside(self, value: float) -> float:
         """The place of a value among what is fitted, within its bounds."""
@@ -86,13 +84,13 @@ class AxisModel(Protocol):
 
 
 # The lag's pole stays above the drag's: a motion does not tell which is whose.
-_LAG = Free("lag_s", 0.01, 0.6, True, 1e-4)
-_DRAG = Free("drag_1ps", -0.1, 1.5, False, 1e-4)
-_GAIN = Free("gain", 0.2, 5.0, False, 1e-4)
-_WIND = Free("wind_mps2_rts", 1e-4, 10.0, True, 1e-3)
-_NOISE = Free("noise_m", 1e-3, 1.0, True, 1e-3)
-_INPUT = Free("input_mps2_rts", 1e-3, 10.0, True, 1e-3)
-_DRIFT = Free("drift_mps2_rts", 1e-3, 10.0, True, 1e-3)
+_LAG = Free("lag_s", 0.01, 0.6, True)
+_DRAG = Free("drag_1ps", -0.1, 1.5, False)
+_GAIN = Free("gain", 0.2, 5.0, False)
+_WIND = Free("wind_mps2_rts", 1e-4, 10.0, True)
+_NOISE = Free("noise_m", 1e-3, 1.0, True)
+_INPUT = Free("input_mps2_rts", 1e-3, 10.0, True)
+_DRIFT = Free("drift_mps2_rts", 1e-3, 10.0, True)
 _MOTION_STD = (10.0, 2.0, 2.0)  # of position, velocity and acceleration
 
 

@@ -3,7 +3,9 @@
 The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
 and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
 in turn so that each has something of every manoeuvre, on the motion of the next 0.25 to 2 s; the figure is the
-geometric mean of the rms errors over these times and the axes, in which each counts alike.
+geometric mean of the rms errors over these times and the axes, in which each counts alike. For the fit as for the
+judgement the filter goes through the whole flight, and only the innovations in a half, or the motions, count: where it
+began anew in each block, they would tell how it finds the state and little of the plant.
 """
 
 from __future__ import annotations
@@ -11,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import RecordingError
 from uavctl.identify.axis_model import AxisModel
-from uavctl.identify.fit import AxisFit, fit_axis
+from uavctl.identify.fit import ROUGH, AxisFit, fit_axes
 from uavctl.identify.history import LEAST_SAMPLES, Stretch
 from uavctl.identify.prediction import AHEAD_S, predict_ahead
 
@@ -107,10 +110,7 @@ def choose_dead_time(
         if dead_time_s >= 0.0 and dead_time_s not in tried:
             near = min(tried, key=lambda one: abs(one - dead_time_s), default=None)
             starts = [None] * len(axes) if near is None else [one.parameters for one in tried[near]]
-            tried[dead_time_s] = tuple(
-                fit_axis(flown, axis, model, dead_time_s, start)
-                for axis, model, start in zip(axes, models, starts, strict=True)
-            )
+            tried[dead_time_s] = fit_axes(flown, axes, models, dead_time_s, starts, ROUGH)
         advance()
 
     def least() -> float:
@@ -122,8 +122,9 @@ def choose_dead_time(
     for dead_time_s in (near_s - FINE_S, near_s + FINE_S):
         fit(dead_time_s)
     best_s = least()
+    tried[best_s] = fit_axes(flown, axes, models, best_s, [one.parameters for one in tried[best_s]])
     curve = tuple((key, _total(tried[key]) - _total(tried[best_s])) for key in sorted(tried))
-    judged = _judged(both, axes, tried[best_s])
+    judged = _judged(flown, both, axes, tried[best_s])
     advance()
     return ChosenPlant(curve, best_s, _range_s(curve, best_s), tried[best_s], judged)
 
@@ -154,20 +155,27 @@ def is_worse(one: HeldOutError, other: HeldOutError) -> bool:
     return bool(whole > _CERTAIN * spread and whole > 0.0)
 
 
-def halves(flown: Sequence[Stretch]) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]]:
+class Block(NamedTuple):
+    """Begin and end of a part of a stretch [s]."""
+
+    begin_s: float
+    end_s: float
+
+
+def halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ...]]:
     """Blocks of each stretch in turn.
 
     Raises:
         RecordingError: There are no two blocks.
     """
-    blocks: list[Stretch] = []
+    blocks: list[Block] = []
     for stretch in flown:
         count = max(round(stretch.length_s / BLOCK_S), 1 if len(flown) > 1 else 2)
         edges = np.linspace(stretch.times_s[0], stretch.times_s[-1] + 1e-6, count + 1)
-        for begin, end in pairwise(edges):
-            held = (stretch.times_s >= begin) & (stretch.times_s < end)
-            if held.sum() >= LEAST_SAMPLES:
-                blocks.append(replace(stretch, times_s=stretch.times_s[held], positions_m=stretch.positions_m[held]))
+        for begin, end in pairwise(edges.tolist()):
+            held = stretch.times_s[(stretch.times_s >= begin) & (stretch.times_s < end)]
+            if len(held) >= LEAST_SAMPLES:
+                blocks.append(Block(float(held[0]), float(held[-1])))
     if len(blocks) < 2:
         raise RecordingError(
             f"the flight has {len(blocks)} block of {BLOCK_S:g} s with {LEAST_SAMPLES} positions: a fit to one half "
@@ -177,16 +185,27 @@ def halves(flown: Sequence[Stretch]) -> tuple[tuple[Stretch, ...], tuple[Stretch
 
 
 def _judged(
-    both: tuple[tuple[Stretch, ...], tuple[Stretch, ...]], axes: Sequence[int], fits: Sequence[AxisFit]
+    flown: Sequence[Stretch],
+    both: tuple[tuple[Block, ...], tuple[Block, ...]],
+    axes: Sequence[int],
+    fits: Sequence[AxisFit],
 ) -> HeldOutError:
-    begin = min(block.times_s[0] for half in both for block in half)
-    groups = 1 + int((max(block.times_s[-1] for half in both for block in half) - begin) / _GROUP_S)
+    begin = min(stretch.times_s[0] for stretch in flown)
+    groups = 1 + int((max(stretch.times_s[-1] for stretch in flown) - begin) / _GROUP_S)
     squares, counts = np.zeros((groups, len(axes), len(AHEAD_S))), np.zeros((groups, len(axes), len(AHEAD_S)))
-    for i, (axis, whole) in enumerate(zip(axes, fits, strict=True)):
-        for half, other in (both, both[::-1]):
-            fit = fit_axis(half, axis, whole.model, whole.dead_time_s, whole.parameters)
-            for j, one in enumerate(predict_ahead(other, axis, fit)):
-                group = ((one.times_s - begin) / _GROUP_S).astype(np.int64)
-                squares[:, i, j] += np.bincount(group, weights=one.errors_m**2, minlength=groups)
+    models, starts = [one.model for one in fits], [one.parameters for one in fits]
+    for half, other in (both, both[::-1]):
+        counting = [replace(stretch, counted=_within(half, stretch.times_s)) for stretch in flown]
+        for i, fit in enumerate(fit_axes(counting, axes, models, fits[0].dead_time_s, starts)):
+            for j, one in enumerate(predict_ahead(flown, axes[i], fit)):
+                held_out = _within(other, one.times_s, AHEAD_S[j])
+                group = ((one.times_s[held_out] - begin) / _GROUP_S).astype(np.int64)
+                squares[:, i, j] += np.bincount(group, weights=one.errors_m[held_out] ** 2, minlength=groups)
                 counts[:, i, j] += np.bincount(group, minlength=groups)
     return HeldOutError(squares, counts)
+
+
+def _within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
+    """Whether a block of a half holds each of some times, and the time so much later."""
+    held = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in half]
+    return np.asarray(np.logical_or.reduce(held), dtype=np.bool_)

@@ -59,12 +59,14 @@ class Stretch:
         inputs_mps2: (n, 3), the setpoint from then on [m/s²].
         times_s: (m,), of capture [s].
         positions_m: (m, 3) [m].
+        counted: (m,), whether a position counts when parameters are fitted; None is all.
     """
 
     input_times_s: Array
     inputs_mps2: Array
     times_s: Array
     positions_m: Array
+    counted: NDArray[np.bool_] | None = None
 
     @property
     def length_s(self) -> float:

@@ -12,7 +12,7 @@ from logs.svg import Drawing, canvas, colour, dots
 from uavctl.config.load import dump_config
 from uavctl.identify.history import Seen
 from uavctl.identify.prediction import LAGS, SHOWN_S, Prediction
-from uavctl.identify.result import Identification
+from uavctl.identify.result import Identification, Identified
 
 _HEIGHT_IN = 2.6
 _LEFT_IN = 0.85  # room for differences with a sign and three decimals or four
@@ -36,9 +36,18 @@ def write_page(found: Identification, seen: Seen, source: str) -> str:
             for one in result.response
             if not _is_told(one.axis, result.warnings)
         ),
+        *_ramps(result),
         *(f"{warning}." for warning in result.warnings),
     ]
     return page("Identified plant and link", source, story, _sections(found, seen))
+
+
+def _ramps(result: Identified) -> Iterator[str]:
+    if result.ramp_s > 0.0:
+        yield (
+            "The autopilot ramps setpoints by its jerk limit. The fit knows that, the plant of a controller does not: "
+            f"{1e3 * result.ramp_s:.1f} ms, half of the ramp of one setpoint, are in the configured dead time."
+        )
 
 
 def _is_told(axis: str, warnings: Sequence[str]) -> bool:
@@ -69,7 +78,7 @@ _RESPONSE = (
 _DEAD = (
     "The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less than 4 "
     "above its least. The errors compare plants: fitted to one half of the flight and judged by the other, blocks of "
-    "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints as sent."
+    "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints known."
 )
 _REST = (
     "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
@@ -94,7 +103,7 @@ def _rows(found: Identification) -> Iterator[tuple[str, ...]]:
 
 def _candidates(found: Identification) -> str:
     candidates = found.result.candidates
-    ahead = [f"{time_s:g} s ahead [mm]" for time_s in candidates[0].ahead_s]
+    ahead = [f"{time_s:g} s on [mm]" for time_s in candidates[0].ahead_s]
     rows = [
         (
             one.model,
@@ -107,7 +116,8 @@ def _candidates(found: Identification) -> str:
         for response, lag_s, errors in zip(found.result.response, one.lag_s, one.rms_m, strict=True)
     ]
     columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
-    return table(columns, rows, frozenset(range(3, len(columns))))
+    # Names of axes are no paths: they stay whole, and the columns are as wide as they need.
+    return table(columns, rows, frozenset(range(3, len(columns)))).replace('class="many"', 'class="many words"', 1)
 
 
 def _curves(found: Identification) -> Drawing:

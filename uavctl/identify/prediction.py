@@ -76,7 +76,7 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
     """Predict each position of the flight from the ones before it."""
     times, innovations, stds = [], [], []
     for stretch in flown:
-        cut = timeline(stretch, axis, fit.dead_time_s)
+        cut = timeline(stretch, (axis,), fit.dead_time_s)
         one = filtered(cut, fit.model, np.array(fit.parameters))
         times.append(stretch.times_s[0] + cut.captured[1:] * INSTANT_S)
         innovations.append(one.innovations_m[1:])  # the first one's is nothing but its distance from zero
@@ -110,7 +110,7 @@ def predict_ahead(
 
 
 def _ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) -> list[Ahead]:
-    cut = timeline(stretch, axis, fit.dead_time_s)
+    cut = timeline(stretch, (axis,), fit.dead_time_s)
     parameters = np.array(fit.parameters)
     one = filtered(cut, fit.model, parameters)
     motion = fit.model.motion(parameters[None])
@@ -127,7 +127,7 @@ def _ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) 
         found.append(
             Ahead(
                 times_s=stretch.times_s[0] + captured[begins] * INSTANT_S,
-                moved_m=cut.positions_m[later] - cut.positions_m[begins],
+                moved_m=cut.positions_m[later, 0] - cut.positions_m[begins, 0],
                 predicted_m=predicted - one.driven[begins, 0] - one.rest[begins, 0],
             )
         )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -16,7 +18,7 @@ from logs.tlog import TlogPacket
 from uavctl.config import Config
 from uavctl.data import Datagram, PositionSample, Record, Setpoint, StepInput
 from uavctl.errors import RecordingError
-from uavctl.identify.history import Asked, Seen, seen_from
+from uavctl.identify.history import LEAST_SAMPLES, Asked, Seen, seen_from
 from uavctl.loop import MOCAP, make_links
 from uavctl.mavlink.framing import scan
 
@@ -26,8 +28,18 @@ _LOCAL_NED = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_OFFSET_NED)
 
 _AUTOPILOTS = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
 _SHORTEST = 10  # bytes of the longer head
+_STAMPED = {  # positions that begin with their time [µs]
+    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE,
+    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE,
+    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY,
+}
+_SHORT_S = 0.1  # clocks that know nothing of each other are no tenth of a second apart
+_QUICK = 0.2  # share of spacings without a loss, at the least
+_REGULAR, _MOSTLY = 0.25, 0.9  # of a period, and the share of spacings that are nearer to a multiple of it
 _REMEMBERED = 64  # messages among which the newest is looked for: one may be overtaken by others
 
+Address = tuple[int, int]
 Row = tuple[float, float, tuple[float, float, float]]
 
 
@@ -38,9 +50,10 @@ class History:
     Attributes:
         asked: Setpoints.
         seen: Positions.
-        gaps: Messages lost after each one that came from the positions' sender, by the numbers that MAVLink gives them.
+        gaps: Messages lost after each one that came from the positions' sender.
         autopilot: Whose software flew, "px4" or "ardupilot"; empty where nobody said so.
         parameters: The vehicle's own that begin with PSC_, by name, as far as they were asked for.
+        latency_s: The shortest delay from capture to arrival [s], where the stamps tell it; else None.
     """
 
     asked: Asked
@@ -48,6 +61,7 @@ class History:
     gaps: NDArray[np.int64]
     autopilot: str = ""
     parameters: Mapping[str, float] = field(default_factory=dict)
+    latency_s: float | None = None
 
 
 class VehicleWords:
@@ -70,64 +84,101 @@ class VehicleWords:
                     self.parameters[message.param_id] = float(message.param_value)
 
 
-class Numbers:
-    """Numbers of the messages of each sender, modulo 256 as they come, told apart by their order."""
+class Senders:
+    """Who sent what: numbers of the messages of each, modulo 256 as they come, and stamps of its positions."""
 
-    def __init__(self, messages: Iterable[str]) -> None:
-        self._ids = {getattr(mavlink, f"MAVLINK_MSG_ID_{name}") for name in messages}
-        self._numbers: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
-        self._positions: Counter[tuple[int, int]] = Counter()
+    def __init__(self) -> None:
+        self._numbers: defaultdict[Address, list[int]] = defaultdict(list)
+        self._stamps: defaultdict[Address, list[tuple[int, int]]] = defaultdict(list)
 
-    def take(self, data: bytes) -> None:
+    def take(self, data: bytes, at_ns: int) -> None:
         """Count what a datagram, or a packet, holds: messages of unknown ids too, by their lengths."""
-        for number, sender, message_id in _heads(data):
-            known = self._numbers[sender]
-            newest = max(known[-_REMEMBERED:], default=number)
-            known.append(newest + (number - newest + 128) % 256 - 128)
-            self._positions[sender] += message_id in self._ids
+        for head in _heads(data):
+            known = self._numbers[head.sender]
+            newest = max(known[-_REMEMBERED:], default=head.number)
+            known.append(newest + (head.number - newest + 128) % 256 - 128)
+            if head.message_id in _STAMPED:
+                self._stamps[head.sender].append((int.from_bytes(head.payload[:8], "little"), at_ns))
 
-    def gaps(self) -> NDArray[np.int64]:
-        """Messages lost after each one, of who sent most positions."""
-        ((sender, _),) = self._positions.most_common(1) or [((0, 0), 0)]
+    def gaps(self, sender: Address) -> NDArray[np.int64]:
+        """Messages of a sender lost after each one: by the stamps if they are regular, else by the numbers.
+
+        A bridge numbers what it sends, and tells nothing of what was lost on the way to it.
+        """
+        stamps = np.unique([stamp for stamp, _ in self._stamps.get(sender, ())])
+        by_times = _missing_of(np.diff(stamps))
+        if by_times is not None:
+            return by_times
         numbers = sorted(set(self._numbers[sender]))
         return np.array([after - before - 1 for before, after in pairwise(numbers)], dtype=np.int64)
 
+    def shortest_delay_s(self, sender: Address) -> float | None:
+        """The least time from a stamp to its arrival [s], if both are of one clock: then only is it a short one."""
+        delays_s = [1e-9 * (at_ns - 1000 * stamp) for stamp, at_ns in self._stamps.get(sender, ())]
+        return min(delays_s) if delays_s and 0.0 <= min(delays_s) <= _SHORT_S else None
 
-def _heads(data: bytes) -> Iterator[tuple[int, tuple[int, int], int]]:
-    """Number, sender and id of each frame, one after the other up to the first byte that begins none."""
+
+def _missing_of(spacings: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Frames that are missing in each of the spacings of a regular camera's stamps; None of any other's."""
+    if len(spacings) < LEAST_SAMPLES:
+        return None
+    period = float(np.quantile(spacings, _QUICK))
+    for most in (2.0, 4.0, 16.0):  # the better the period is known, the longer a gap tells of it
+        near = spacings[(spacings > 0.5 * period) & (spacings < (most + 0.5) * period)]
+        period = float(near.sum() / np.rint(near / period).sum())
+    frames = spacings / period
+    off = np.abs(frames - np.rint(frames))[frames < 16.5]
+    if np.mean(off < _REGULAR) < _MOSTLY:
+        return None
+    return np.maximum(np.rint(frames).astype(np.int64) - 1, 0)
+
+
+class _Head(NamedTuple):
+    """Head of a frame, and what it carries."""
+
+    number: int
+    sender: Address
+    message_id: int
+    payload: bytes
+
+
+def _heads(data: bytes) -> Iterator[_Head]:
+    """Each frame, one after the other up to the first byte that begins none."""
     at = 0
     while at + _SHORTEST <= len(data):
+        length = data[at + 1]
         if data[at] == mavlink.PROTOCOL_MARKER_V2:
             signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
-            yield data[at + 4], (data[at + 5], data[at + 6]), int.from_bytes(data[at + 7 : at + 10], "little")
-            at += 12 + data[at + 1] + signature
+            sender, kind = (data[at + 5], data[at + 6]), int.from_bytes(data[at + 7 : at + 10], "little")
+            yield _Head(data[at + 4], sender, kind, data[at + 10 : at + 10 + length])
+            at += 12 + length + signature
         elif data[at] == mavlink.PROTOCOL_MARKER_V1:
-            yield data[at + 2], (data[at + 3], data[at + 4]), data[at + 5]
-            at += 8 + data[at + 1]
+            yield _Head(data[at + 2], (data[at + 3], data[at + 4]), data[at + 5], data[at + 6 : at + 6 + length])
+            at += 8 + length
         else:
             return
 
 
-def from_records(records: Iterable[tuple[str, int, Record]], config: Config) -> History:
-    """Out of a recording of ours, with its configuration.
+def from_records(records: Iterable[tuple[str, int, Record]]) -> History:
+    """Out of a recording of ours.
 
     Raises:
         RecordingError: No position or no setpoint in it.
     """
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers, told = Numbers(config.source.messages), VehicleWords()
+    senders, told = Senders(), VehicleWords()
     flown = False
-    for _, _, record in records:
+    for _, at_ns, record in records:
         if isinstance(record, Datagram) and not record.outgoing:
-            numbers.take(record.data)
+            senders.take(record.data, at_ns)
             told.take(record.data)
         elif isinstance(record, StepInput):
             samples.extend(record.samples)
             flown = record.vehicle is not None and record.vehicle.armed and record.vehicle.external
         elif isinstance(record, Setpoint):
             sent.append((record.at_ns, record.accel_mps2, flown))
-    return _history(sent, samples, numbers, told)
+    return _history(sent, samples, senders, told)
 
 
 def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
@@ -140,25 +191,42 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
     Raises:
         RecordingError: No position or no acceleration setpoint in it.
     """
-    links = make_links(config)
-    link = links.get(MOCAP) or next(iter(links.values()))
-    samples: list[PositionSample] = []
+    whole = tuple(packets)
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    numbers, told = Numbers(config.source.messages), VehicleWords()
-    for packet in packets:
+    senders, told = Senders(), VehicleWords()
+    for packet in whole:
         if packet.outgoing:
             sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data))
         else:
-            numbers.take(packet.data)
+            senders.take(packet.data, packet.at_ns)
             told.take(packet.data)
-            samples.extend(item for item in link.receive(packet.data, packet.at_ns) if isinstance(item, PositionSample))
-    return _history(sent, samples, numbers, told)
+    samples = _samples(whole, config)
+    latency_s = senders.shortest_delay_s(_source(samples)) if samples else None
+    if latency_s is not None:
+        clock = msgspec.structs.replace(config.clock, latency_s=round(latency_s, 4))
+        samples = _samples(whole, msgspec.structs.replace(config, clock=clock))
+    return replace(_history(sent, samples, senders, told), latency_s=latency_s)
+
+
+def _samples(packets: Iterable[TlogPacket], config: Config) -> list[PositionSample]:
+    """Positions as the daemon would take them."""
+    links = make_links(config)
+    link = links.get(MOCAP) or next(iter(links.values()))
+    heard = (item for one in packets if not one.outgoing for item in link.receive(one.data, one.at_ns))
+    return [item for item in heard if isinstance(item, PositionSample)]
+
+
+def _source(samples: Iterable[PositionSample]) -> Address:
+    """System and component of who sent most of the positions that were taken."""
+    ((source, _),) = Counter(one.source for one in samples).most_common(1)
+    system, component = source.rsplit(" ", 1)[-1].split("/")
+    return int(system), int(component)
 
 
 def _history(
     sent: list[tuple[int, tuple[float, float, float], bool]],
     samples: list[PositionSample],
-    numbers: Numbers,
+    senders: Senders,
     told: VehicleWords,
 ) -> History:
     if not samples or not sent:
@@ -175,7 +243,7 @@ def _history(
         accel_mps2=np.array([accel for _, accel, _ in sent]),
         flown=np.array([flown for _, _, flown in sent]),
     )
-    return History(asked, seen_from(rows), numbers.gaps(), told.autopilot, told.parameters)
+    return History(asked, seen_from(rows), senders.gaps(_source(samples)), told.autopilot, told.parameters)
 
 
 def _accelerations(data: bytes) -> Iterable[tuple[tuple[float, float, float], bool]]:

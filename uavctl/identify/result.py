@@ -14,6 +14,7 @@ from uavctl.identify.axis_model import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, 
 from uavctl.identify.dead_time import TRIES, ChosenPlant, choose_dead_time, is_worse
 from uavctl.identify.fit import AxisFit, standard_errors
 from uavctl.identify.history import Stretch, stretches, thinned
+from uavctl.identify.jerk_limit import ramped
 from uavctl.identify.link_fit import LinkFit, fit_link
 from uavctl.identify.prediction import AHEAD_S, Prediction, predict
 from uavctl.identify.recorded import History
@@ -21,6 +22,7 @@ from uavctl.identify.recorded import History
 AXES = ("north", "east", "down")
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
 _DIGITS = 4
+_JERK_AS_SHIPPED_MPS3 = 5.0
 _AS_SHIPPED = {"XY": (1.0, 2.0, 1.0), "Z": (1.0, 5.0, 1.0)}  # position, velocity, integral
 _OF_OTHER_MODELS = (
     *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
@@ -66,6 +68,7 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
     positions: int
     plant: dict[str, object]
     candidates: tuple[Candidate, ...]
+    ramp_s: float  # by which the configured dead time is longer than the chosen candidate's
     response: tuple[AxisResponse, ...]
     residual_std: tuple[float, ...]
     r2: tuple[float, ...]
@@ -100,7 +103,11 @@ def identify(history: History, config: Config, advance: Callable[[], None]) -> I
         RecordingError: The flight does not show enough.
     """
     dt_s = config.plant.dt_s
-    flown = tuple(thinned(stretch, dt_s * (1.0 - 1e-6)) for stretch in stretches(history.asked, history.seen))
+    limits_mps3 = _jerk_limits(history, config)
+    flown = tuple(
+        ramped(thinned(stretch, dt_s * (1.0 - 1e-6)), *limits_mps3)
+        for stretch in stretches(history.asked, history.seen)
+    )
     axes = [AXES.index(name) for name in config.plant.axes]
     for axis in axes:
         _check_moved(flown, axis)
@@ -113,12 +120,18 @@ def identify(history: History, config: Config, advance: Callable[[], None]) -> I
         for name, fit, prediction in zip(config.plant.axes, chosen.fits, predictions, strict=True)
     )
     link = fit_link(history.seen, history.gaps)
-    made = _config(config, chosen, responses, link)
+    ramp_s = _mean_ramp_s(config, limits_mps3)
+    made = _config(config, chosen, ramp_s, responses, link)
+    if history.latency_s is not None:
+        made = msgspec.structs.replace(
+            made, clock=msgspec.structs.replace(made.clock, latency_s=round(history.latency_s, _DIGITS))
+        )
     result = Identified(
         flown_s=sum(stretch.length_s for stretch in flown),
         positions=link.received,
         plant=_plant_section(made),
         candidates=tuple(_candidate(one) for one in candidates),
+        ramp_s=ramp_s,
         response=responses,
         residual_std=tuple(one.residual_std_m for one in responses),
         r2=tuple(one.r2 for one in responses),
@@ -153,6 +166,23 @@ def _gains(history: History, config: Config) -> list[tuple[float, float, float]]
         kp, kv, ki = (value if value > 0.0 else other for value, other in zip(told, given, strict=True))
         found.append((kp, kv, ki))
     return found
+
+
+def _jerk_limits(history: History, config: Config) -> tuple[float, float]:
+    """Jerk limits of the level and of down [m/s³] where the autopilot ramps setpoints: as told, else as shipped."""
+    if history.autopilot != "ardupilot" and config.plant.model != VELOCITY_REFERENCE:
+        return math.inf, math.inf
+    told = (history.parameters.get(f"PSC_JERK_{side}", 0.0) for side in ("XY", "Z"))
+    level, down = (value if value > 0.0 else _JERK_AS_SHIPPED_MPS3 for value in told)
+    return level, down
+
+
+def _mean_ramp_s(config: Config, limits_mps3: tuple[float, float]) -> float:
+    """How late the ramp to each of the configuration's own setpoints is on the whole, which its plant has not [s].
+
+    That of a level setpoint that changes as much as it may; it ends with the next setpoint at the latest.
+    """
+    return 0.5 * config.daemon.tick_s * min(config.limits.slew_mps3 / limits_mps3[0], 1.0)
 
 
 def _candidate(one: ChosenPlant) -> Candidate:
@@ -216,12 +246,14 @@ def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
     return found
 
 
-def _config(config: Config, chosen: ChosenPlant, responses: Sequence[AxisResponse], link: LinkFit) -> Config:
+def _config(
+    config: Config, chosen: ChosenPlant, ramp_s: float, responses: Sequence[AxisResponse], link: LinkFit
+) -> Config:
     """The configuration with what was identified."""
     plant = msgspec.structs.replace(
         config.plant,
         model=chosen.name,
-        dead_time_s=chosen.dead_time_s,
+        dead_time_s=round(chosen.dead_time_s + ramp_s, _DIGITS),
         drag_1ps=_rounded(one.drag_1ps for one in responses),
         lag_s=_rounded(one.lag_s for one in responses),
         wind_std_mps2=_rounded(one.wind_std_mps2 for one in responses),
@@ -230,9 +262,12 @@ def _config(config: Config, chosen: ChosenPlant, responses: Sequence[AxisRespons
     estimator = msgspec.structs.replace(
         config.estimator, position_std_m=round(max(one.position_std_m for one in responses), 6)
     )
-    # Slower cameras than two positions a step are counted on for one, which is what 0 says.
-    rate_hz = math.floor(link.rate_hz) if link.rate_hz * config.plant.dt_s >= 2.0 else 0.0
-    source = msgspec.structs.replace(config.source, rate_hz=float(rate_hz))
+    # Slower cameras than two positions a step, or than one in what the delay leaves of it, are counted on for one a
+    # step, which is what 0 says.
+    dt_s, rate_hz = config.plant.dt_s, float(math.floor(link.rate_hz))
+    if rate_hz * dt_s < 2.0 or rate_hz * (dt_s - link.delay_s - link.jitter_s) < 1.0:
+        rate_hz = 0.0
+    source = msgspec.structs.replace(config.source, rate_hz=rate_hz)
     return msgspec.structs.replace(
         config,
         name=f"{config.name}-identified",
