@@ -99,7 +99,7 @@ def test_a_quadrotor_which_campaigns_do_not_fly_is_refused_where_it_stands(tmp_p
     assert told.startswith(f"3: set[1]: {why}")
     (told,) = problems(tmp_path, controller("lqg", f"set = [{quadrotor}]"))
     assert told.startswith(f"6: controller[0].set[1]: {why}")
-    text = (Path(__file__).parents[1] / "uavctl/presets/room.toml").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "uavctl/presets/room-hahn-stursberg.toml").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(text.replace("[sim]", '[sim]\nplant = "quadrotor"'), encoding="utf-8")
     file = tmp_path / "campaign.toml"
     file.write_text('name = "mine"\nconfig = "mine.toml"\n' + controller("lqg"), encoding="utf-8")

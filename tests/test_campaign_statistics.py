@@ -16,6 +16,7 @@ from uavctl.campaign.intervals import (
     bootstrap_mean,
     clopper_pearson,
     paired_difference,
+    paired_ratio,
     step_rate,
     worst_step,
 )
@@ -198,3 +199,21 @@ def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
     (tmp_path / "runs.parquet").write_bytes(b"torn")
     with pytest.raises(UavctlError, match="--resume"):
         summarise(tmp_path)
+
+
+def test_a_ratio_of_means_has_the_interval_of_resampled_pairs() -> None:
+    rng = np.random.default_rng(6)
+    common = rng.gamma(4.0, size=500)
+    a, b = common + 0.1 * rng.normal(size=500), 1.25 * common + 0.1 * rng.normal(size=500)
+    ratio, (low, high) = paired_ratio(a, b)
+    which = rng.integers(0, 500, (4000, 500))
+    wanted = np.quantile(a[which].mean(axis=1) / b[which].mean(axis=1), [0.025, 0.975])
+    assert ratio == pytest.approx(a.mean() / b.mean())
+    assert (low, high) == pytest.approx(tuple(wanted), abs=0.1 * (wanted[1] - wanted[0]))
+    assert high - low < 0.02  # each mean by itself is known to 9 %
+
+
+def test_there_is_no_ratio_to_nothing() -> None:
+    for b in (np.zeros(3), np.zeros(0)):
+        with pytest.raises(UsageError, match="mean of zero"):
+            paired_ratio(b, b)

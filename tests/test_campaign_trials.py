@@ -27,7 +27,7 @@ RUNS = CHUNK + 1  # two tasks a cell
 HEAD = f"""
 name = "small"
 world = "quadrotor"
-config = "room"
+config = "room-hahn-stursberg"
 set = ["smpc.scheme=age-conditioned", "link.loss=0.4"]
 runs = {RUNS}
 seconds = 2.0

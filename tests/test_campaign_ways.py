@@ -19,7 +19,7 @@ from uavctl.campaign.ways import ways
 from uavctl.config import load_config
 from uavctl.trial.room import usable_seen
 
-CONFIG = load_config("room")  # target (1.5, 1, -1.2), walls at +-3, +-2.5, -2.5 and 0
+CONFIG = load_config("room-hahn-stursberg")  # target (1.5, 1, -1.2), walls at +-3, +-2.5, -2.5 and 0
 DT_S = CONFIG.plant.dt_s
 
 
@@ -49,8 +49,8 @@ def test_who_is_never_near_has_no_time_and_a_steady_distance_is_held() -> None:
 
 
 def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
-    config = load_config("room", ["smpc.scheme=age-conditioned"])
-    assert usable_seen(config, None) == pytest.approx(share(build_conditioned(config).solver.rests(np.zeros((9, 9)))))
+    config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])
+    assert usable_seen(config, None) == pytest.approx(share(build_conditioned(config, cov=np.zeros((9, 9))).rests))
     design = build_design(CONFIG)
     assert usable_seen(CONFIG, design) == pytest.approx(share(build_rests(design)))
     assert usable_seen(CONFIG, design) < usable_seen(config, None) < 1.0

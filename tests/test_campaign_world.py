@@ -188,7 +188,7 @@ class _Numbered:
     def __init__(self, steps: int) -> None:
         self._steps, self.asked = steps, 0
 
-    def decide(self, x: Array, late: int) -> Decisions:
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         self.asked += 1
         plan = 100.0 * self.asked + np.arange(self._steps)
         inputs = np.broadcast_to(plan[None, :, None], (len(x), self._steps, 2)).copy()

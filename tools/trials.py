@@ -2,7 +2,7 @@
 
 `python tools/trials.py`: preset `room` as it is, both autopilots, cameras at 5 and 50 Hz, 30 and 60 % loss, in gusts:
 how well it holds its place. `--scenario eight` is a figure of eight, `--scenario blackout` 4 s without any position.
-`python tools/trials.py --pilots age-conditioned own --set smpc.horizon=16 --seeds 5 --jobs 2`
+`python tools/trials.py --config room-hahn-stursberg --pilots hahn-stursberg age-conditioned own --seeds 5 --jobs 2`
 `python tools/trials.py --variant "H 16" smpc.horizon=16 cost.input=[0.25,0.25,0.25] --pilots own`
 
 Pilots: `hahn-stursberg` and `age-conditioned` are ours with that `smpc.scheme` (the latter designed for the losses that
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--variant", action="append", nargs="+", default=[], metavar=("NAME", "KEY=VALUE"), help="one more of ours"
     )
-    parser.add_argument("--pilots", nargs="*", choices=PILOTS, default=[*SCHEMES, "own"])
+    parser.add_argument("--pilots", nargs="*", choices=PILOTS, default=["configured", "own"])
     parser.add_argument(
         "--design", choices=("usual", "configured", "flown"), default="usual", help="losses that ours are designed for"
     )

@@ -70,6 +70,11 @@ def again(folder: Path, cell: int, run: int, library_for: LibraryFor) -> Again:
     cells, runs = msgspec.convert(document["cells"], list[dict[str, Any]]), campaign.spec.runs
     if not 0 <= cell < len(cells) or not 0 <= run < runs:
         raise UsageError(f"cell {cell}, run {run}: there are the cells 0 to {len(cells) - 1}, the runs 0 to {runs - 1}")
+    if campaign.spec.measured != "state":
+        raise UsageError(
+            f"{folder}: its controllers were told positions, and a flight of the simulator has a noise of its own; "
+            "fly one with uavctl loopback"
+        )
     made = cell_of(campaign, cell, library_for)
     different = first_difference(cells[cell], told(made), f"cells[{cell}]")
     if different is not None:

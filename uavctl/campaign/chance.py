@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_NOISE = 3  # child of a run's seed: 0 and 1 are those of `draw`, 2 draws its start
+
 
 @dataclass(frozen=True, eq=False)
 class Chances:
@@ -39,3 +41,12 @@ def draw(master: int, first: int, runs: int, steps: int, n_w: int) -> Chances:
         np.random.default_rng(for_plant).standard_normal(out=normal[i])
         np.random.default_rng(for_link).random(out=link[i])
     return Chances(normal, link)
+
+
+def draw_noise(master: int, first: int, runs: int, steps: int, axes: int) -> Array:
+    """Standard normal draws (N, T, axes) of the positions' noise, apart from all others of a run; see `draw`."""
+    noise = np.empty((runs, steps, axes))
+    for i in range(runs):
+        seed = np.random.SeedSequence([master, first + i]).spawn(_NOISE + 1)[_NOISE]
+        np.random.default_rng(seed).standard_normal(out=noise[i])
+    return noise

@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from uavctl.build import build_conditioned, build_design, build_plant, build_problem, build_solver, needed
+from uavctl.campaign.positions import FilterBelief
 from uavctl.campaign.setting import Setting, met, start_of
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
 from uavctl.config import Config
@@ -34,6 +36,7 @@ from uavctl.smpc.batch_smpc import BatchSmpc, Decider, OneByOne
 from uavctl.smpc.conditioned import ConditionedDecider
 from uavctl.smpc.design import Design
 from uavctl.smpc.explicit import ExplicitDecider
+from uavctl.smpc.innovation import innovations
 from uavctl.smpc.library import Library
 from uavctl.smpc.risk import kappa
 
@@ -57,6 +60,7 @@ class Recipe:
         library_id: The library's hash.
         gains: The gains of a PID.
         margin: Of an MPC without back-offs, see `ControllerSpec`.
+        cov: Covariance (n_x, n_x) that the simple margins begin with; None: the state is measured.
     """
 
     key: str
@@ -67,6 +71,7 @@ class Recipe:
     library_id: str | None = None
     gains: PidGains | None = None
     margin: float = 0.0
+    cov: NDArray[np.float64] | None = None
 
 
 def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
@@ -82,6 +87,9 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
         DesignError: There is no such controller.
     """
     made = Recipe("", given.kind, config, margin=given.margin)
+    if spec.measured == "position":
+        sight = sight_of(config)
+        made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
     if given.kind == "smpc" and not config.conditioned:
         design = build_design(config)
         stored = library_for(config, design)
@@ -112,9 +120,9 @@ def build(recipe: Recipe) -> BatchController:
     if recipe.kind == "packetised":
         return PacketisedPredictive(problem, recipe.margin)
     if recipe.kind == "mean-qp":
-        return MeanQp(problem, recipe.margin)
+        return MeanQp(problem, recipe.margin, recipe.cov)
     if recipe.kind == "governor":
-        return Governor(problem, recipe.margin)
+        return Governor(problem, recipe.margin, recipe.cov)
     if recipe.kind == "hold-last":
         return HoldLast(problem, recipe.margin)
     if recipe.kind == "zero-on-loss":
@@ -127,6 +135,11 @@ def build(recipe: Recipe) -> BatchController:
     if recipe.gains is None:
         raise ValueError("a PID without gains")
     return CascadedPid(problem, recipe.gains)
+
+
+def sight_of(config: Config) -> FilterBelief:
+    """What a controller that believes in a configuration makes of positions."""
+    return FilterBelief(build_plant(config), config.estimator.position_std_m, config.estimator.initial_std)
 
 
 _built = threading.local()  # a controller has a state: each thread of a worker has its own
@@ -146,7 +159,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.conditioned:
-        solver, steps = build_conditioned(config, gated=False).solver, config.smpc.horizon
+        solver, steps = build_conditioned(config, gated=False, cov=recipe.cov).solver, config.smpc.horizon
         return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
     if design is None:
         raise ValueError("an SMPC without a design")

@@ -1,4 +1,4 @@
-"""What the link of a configuration does to the positions of many runs: which one is the newest in each step."""
+"""What the link of a configuration does to the positions of many runs: when each is known, and which is the newest."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Flags = NDArray[np.bool_]
 _ROUNDING = 1e-9
 
 
-def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
-    """Capture step of the newest position that is known at the beginning of each step.
+def known(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
+    """Step that knows the position of each step first, T or more for those that no step does.
 
     One position is captured a step; the first one is known at once, as in the paper. As in the design, the age counts
     whole steps: where every delay is below Δt, a position is known in its own step; else one that is under way for
@@ -42,12 +42,22 @@ def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
         longest_s = max(filter(math.isfinite, link.trace_s))
     within = longest_s < dt_s
     late = np.zeros(lost.shape, np.intp) if within else np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
-    captured = np.arange(steps)
-    known = np.where(lost, steps, captured + late)  # the step that knows it first
-    known[:, 0] = 0
-    found = np.zeros(lost.shape, dtype=np.intp)
-    runs = np.arange(lost.shape[0])
-    for step in captured:
+    first = np.where(lost, steps, np.arange(steps) + late)
+    first[:, 0] = 0
+    return first
+
+
+def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
+    """Capture step (N, T) of the newest position that is known at the beginning of each step; see `known`."""
+    return newest_of(known(link, dt_s, chances))
+
+
+def newest_of(known: Counts) -> Counts:
+    """The same, from the step (N, T) that knows each position first."""
+    steps = known.shape[1]
+    found = np.zeros(known.shape, dtype=np.intp)
+    runs = np.arange(known.shape[0])
+    for step in range(steps):
         first = known[:, step]
         (there,) = np.nonzero(first < steps)
         found[runs[there], first[there]] = np.maximum(found[runs[there], first[there]], step)

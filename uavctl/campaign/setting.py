@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.build import build_plant, build_problem, start_state
-from uavctl.campaign.chance import draw
+from uavctl.campaign.chance import draw, draw_noise
 from uavctl.campaign.disturbances import disturbances
-from uavctl.campaign.links import newest
+from uavctl.campaign.links import known, newest_of
 from uavctl.campaign.spec import CampaignSpec, DisturbanceSpec
 from uavctl.campaign.world import Scene
 from uavctl.config import Config
@@ -51,11 +51,15 @@ class Met:
         scene: The scene.
         newest: Capture step of the newest position known in each step (N, T).
         disturbances: w (N, T, n_w).
+        known: Step that knows the position of each step first (N, T).
+        noise: Noise of the positions (N, T, n_axes) [m]; None where the state is measured.
     """
 
     scene: Scene
     newest: Counts
     disturbances: Array
+    known: Counts
+    noise: Array | None
 
 
 def met(setting: Setting, first: int, runs: int) -> Met:
@@ -77,10 +81,17 @@ def met(setting: Setting, first: int, runs: int) -> Met:
         u_target=judged.u_target,
         start=_starts(setting, first, runs),
     )
+    first_known = known(setting.link, plant.dt_s, chances.link)
+    noise = None
+    if spec.measured == "position":
+        std_m = setting.base.sim.camera.noise_std_m
+        noise = std_m * draw_noise(spec.master, first, runs, spec.steps, len(plant.axes))
     return Met(
         scene,
-        newest(setting.link, plant.dt_s, chances.link),
+        newest_of(first_known),
         disturbances(setting.disturbance, plant.w, chances.normal),
+        first_known,
+        noise,
     )
 
 

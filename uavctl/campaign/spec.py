@@ -16,6 +16,7 @@ TRUE = "true"  # a controller that believes in the link it flies on
 Kind = Literal[
     "smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid"
 ]
+Measured = Literal["state", "position"]
 Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
@@ -113,6 +114,14 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     master: Annotated[
         int, Meta(ge=0, le=LARGEST_SEED, description="seed: run i's draws come from (master, i), in every cell")
     ] = 0
+    measured: Annotated[
+        Measured,
+        Meta(
+            description="what a controller is told of a step whose position comes: `state`, all of it, exactly; or "
+            "`position`, with the noise of `sim.camera.noise_std_m`, of which the flight's filter (its `[estimator]`, "
+            "without a bias) makes state and covariance"
+        ),
+    ] = "state"
     start: Annotated[
         Floats, Meta(max_length=LARGEST_PLANT, description="state (n_x) in which every run starts; else sim.start_*")
     ] = ()

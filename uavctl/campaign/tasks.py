@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.campaign.cells import Cell
-from uavctl.campaign.controllers import Recipe, built
+from uavctl.campaign.controllers import Recipe, built, sight_of
+from uavctl.campaign.positions import PositionFilter
 from uavctl.campaign.setting import Setting, met
 from uavctl.campaign.spec import CHUNK
 from uavctl.campaign.ways import ways
-from uavctl.campaign.world import Flown, fly
+from uavctl.campaign.world import Flown, MeasuredPositions, fly
 from uavctl.smpc.batch_smpc import Tally
 
 Columns = dict[str, NDArray[np.generic]]
@@ -112,8 +113,11 @@ def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:
     """Fly some runs: their trajectories, and what their controller met where it counts that."""
     controller = built(task.recipe)
     meets = met(task.setting, first, runs)
+    seen = None
+    if meets.noise is not None:
+        seen = MeasuredPositions(PositionFilter(sight_of(task.recipe.config), meets.known), meets.noise)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told as failed
-        found = fly(meets.scene, controller, meets.newest, meets.disturbances)
+        found = fly(meets.scene, controller, meets.newest, meets.disturbances, seen)
     tally = getattr(controller, "tally", None)
     return found, tally if isinstance(tally, Tally) else None
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.campaign.positions import PositionFilter
 from uavctl.smpc.batch import BatchController, Counts, News
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
@@ -68,7 +69,26 @@ class Flown:
     failed: Flags
 
 
-def fly(scene: Scene, controller: BatchController, newest: Counts, disturbances: Array) -> Flown:
+@dataclass(frozen=True, eq=False)
+class MeasuredPositions:
+    """What is told of the states of N runs where positions alone are measured.
+
+    Attributes:
+        filter: Makes states of them.
+        noise: Theirs (N, T, n_axes) [m].
+    """
+
+    filter: PositionFilter
+    noise: Array
+
+
+def fly(
+    scene: Scene,
+    controller: BatchController,
+    newest: Counts,
+    disturbances: Array,
+    seen: MeasuredPositions | None = None,
+) -> Flown:
     """Fly all runs at once.
 
     Args:
@@ -76,6 +96,7 @@ def fly(scene: Scene, controller: BatchController, newest: Counts, disturbances:
         controller: Who flies.
         newest: Capture step of the newest position known in each step (N, T), see `links.newest`.
         disturbances: w (N, T, n_w).
+        seen: What the controller is told; None: the state, exactly.
     """
     plant, (runs, steps) = scene.plant, newest.shape
     states, inputs = np.zeros((runs, steps + 1, plant.n_x)), np.zeros((runs, steps, plant.n_u))
@@ -85,8 +106,13 @@ def fly(scene: Scene, controller: BatchController, newest: Counts, disturbances:
     every = np.arange(runs)
     low, high = scene.input_set.bounds
     controller.begin(runs)
+    where = list(plant.position_index)
     for k in range(steps):
-        news = News(k, newest[:, k], states[every, newest[:, k]], inputs[:, :k])
+        if seen is None:
+            state, cov = states[every, newest[:, k]], None
+        else:
+            state, cov = seen.filter.told(k, states[:, k, where] + seen.noise[:, k], newest[:, k], inputs[:, :k])
+        news = News(k, newest[:, k], state, inputs[:, :k], cov)
         wanted = controller.act(news)
         failed |= ~np.isfinite(wanted).all(axis=1)
         asked[:, k] = np.where(failed[:, None], 0.0, wanted)

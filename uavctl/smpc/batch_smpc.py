@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uavctl.data import SolveStatus
 from uavctl.smpc.answer import Answer, Outlook, Solver
 from uavctl.smpc.assemble import KEPT
-from uavctl.smpc.batch import News, predict
+from uavctl.smpc.batch import News, predict, predicted_cov
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -40,8 +40,14 @@ class Decisions:
 class Decider(Protocol):
     """Answers many questions towards one target."""
 
-    def decide(self, x: Array, late: int) -> Decisions:
-        """Plans from states (M, n_x), predicted from positions `late` steps old."""
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
+        """Plans from states (M, n_x), predicted from positions `late` steps old.
+
+        Args:
+            x: The states.
+            late: See above.
+            cov: Covariances (M, n_x, n_x) of their errors; None: the positions showed the state exactly.
+        """
         ...
 
 
@@ -52,7 +58,7 @@ class OneByOne:
         """Args: the solver; the target (n_x,); (H, n_u)."""
         self._solver, self._target, self._shape = solver, target, shape
 
-    def decide(self, x: Array, late: int) -> Decisions:
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
         outlook = Outlook(late=late)
         answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(x)]
@@ -131,8 +137,9 @@ class BatchSmpc:
         x = predict(self._plant, news)
         fresh = (news.newest > self._captured) & (age < steps) & np.isfinite(x).all(axis=1)
         late = np.minimum(age, self._late)
+        cov = predicted_cov(self._plant, news)
         for j in np.unique(late[fresh]):
-            self._replan(news, x, np.flatnonzero(fresh & (late == j)), int(j))
+            self._replan(news, x, cov, np.flatnonzero(fresh & (late == j)), int(j))
         index = news.step - self._made
         playing = (index < steps) & (age < steps)
         self._made[~playing] = -steps
@@ -144,8 +151,8 @@ class BatchSmpc:
         self.tally.fallbacks[lost] += 1
         return asked
 
-    def _replan(self, news: News, x: Array, who: NDArray[np.intp], late: int) -> None:
-        answers = self._decider.decide(x[who], late)
+    def _replan(self, news: News, x: Array, cov: Array | None, who: NDArray[np.intp], late: int) -> None:
+        answers = self._decider.decide(x[who], late, None if cov is None else cov[who])
         found = who[answers.solved]
         self._plans[found] = answers.inputs[answers.solved]
         self._made[found] = news.step

@@ -41,6 +41,7 @@ from uavctl.smpc.part_program import PartProgram
 from uavctl.smpc.places import Places
 from uavctl.smpc.qp import OPEN
 from uavctl.smpc.regulated_rows import RegulatedRows
+from uavctl.smpc.rest_backoffs import rest_backoffs
 from uavctl.smpc.slew import SlewRows
 
 Array = NDArray[np.float64]
@@ -61,14 +62,12 @@ class _Margins:
         budgets: ε̄ of the stages (H,).
         backoff: Back-offs (H, m) of rows that share the budgets equally.
         distant: Standard deviations (H, 1) that rows keep at first which the regulator's plan is not near.
-        rest: What a plan that rests keeps from the rows that an equilibrium may be at, each budget to itself.
     """
 
     sigma: Array
     budgets: Array
     backoff: Array
     distant: Array
-    rest: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +83,8 @@ class _Found:
 class ConditionedSolver:
     """Answers from one strictly convex program for each independent part; never raises on numbers.
 
-    The reference is the equilibrium nearest to the target at which a plan may rest: limits less the back-offs there.
-    An answer depends on its question alone, bit for bit.
+    The reference is the equilibrium nearest to the target at which a plan may rest, see `rest_backoffs`. An answer
+    depends on its question alone, bit for bit.
 
     Args:
         problem: The problem; every question brings a target of its own.
@@ -93,6 +92,7 @@ class ConditionedSolver:
         allowed: 1 - δ_x, the share of time in which the state may be outside of its limits.
         price: See `age_risk`.
         slew_mps3: How far the acceleration setpoint may go in a second [m/s³], see `SlewRows`; infinite: anywhere.
+        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost; None: it is exact.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -106,6 +106,7 @@ class ConditionedSolver:
         allowed: float,
         price: float = PRICE,
         slew_mps3: float = math.inf,
+        cov: Array | None = None,
     ) -> None:
         self.problem = problem
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
@@ -144,18 +145,17 @@ class ConditionedSolver:
         self._budgets = self.risk.budgets[ages]
         self._shared = quantile(self._budgets / max(1, width))[:, :, None]
         self._distant = quantile(DISTANT * self._budgets / max(1, width))[:, :, None]
-        self._whole = quantile(self._budgets)[:, :, None]
+        # By how many rows are in the way of a target: what a plan that rests keeps from each.
+        self._rest = np.zeros((len(self._parts), width))
+        self._rest[:, self._resting] = rest_backoffs(
+            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts)
+        )
         self._last: tuple[tuple[int, bytes], _Margins] | None = None
 
-    def rests(self, cov: Array) -> Array:
-        """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do.
-
-        Args:
-            cov: Covariance of the estimate's error (n_x, n_x).
-        """
+    def rests(self) -> Array:
+        """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do."""
         sides = self.problem.state_set.b.copy()
-        share = quantile(self.risk.budgets / len(self._parts))
-        sides[self._rows] -= (share[:, None] * self._deviations.of(cov)).max(axis=0)
+        sides[self._rows] -= self._rest[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
@@ -165,7 +165,7 @@ class ConditionedSolver:
         margins, limits = self._margins(outlook), self._b
         if outlook.limits is not None:
             limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
-        reference = self._reference(target, limits, margins)
+        reference = self._reference(target, limits)
         hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
         first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
         dx = x - reference
@@ -218,20 +218,18 @@ class ConditionedSolver:
         key = outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
-            rest = (self._whole[late] * sigma[:, self._resting]).max(axis=0)
             shared = self._shared[late] * sigma
-            self._last = key, _Margins(sigma, self._budgets[late], shared, self._distant[late], rest)
+            self._last = key, _Margins(sigma, self._budgets[late], shared, self._distant[late])
         return self._last[1]
 
-    def _reference(self, target: Array, limits: Array, margins: _Margins) -> Array:
+    def _reference(self, target: Array, limits: Array) -> Array:
         """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
         sides = limits if limits.ndim == 1 else limits.min(axis=0)
-        short = self._placed.dot(target[self._rests.held]) > sides[self._resting] - margins.rest
+        short = self._placed.dot(target[self._rests.held]) > (sides - self._rest[0])[self._resting]
         count = np.count_nonzero(short)
         if not count:
             return target
-        reference = np.array(target)
-        rest = (quantile(margins.budgets / count)[:, None] * margins.sigma).max(axis=0)
+        reference, rest = np.array(target), self._rest[min(int(count), len(self._rest)) - 1]
         for one, places in zip(self._parts, self._places, strict=True):
             places.nearest(reference, (sides - rest)[one.columns])
         return reference
@@ -337,7 +335,7 @@ class ConditionedSolver:
 
 
 class ConditionedDecider:
-    """Decisions of a campaign, whose controllers are told the exact state of a step and how old it is.
+    """Decisions of a campaign, whose controllers are told the state of a step, how old it is, and its error if any.
 
     Args:
         solver: The solver.
@@ -348,9 +346,12 @@ class ConditionedDecider:
         self._solver, self._target = solver, target
         self._unseen = unseen(solver.problem.plant, solver.problem.horizon)
 
-    def decide(self, x: Array, late: int) -> Decisions:
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
-        outlook = Outlook(late=late, cov=self._unseen[late] if late else None)
-        problem = self._solver.problem
-        answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(x)]
+        exact, problem = Outlook(late=late, cov=self._unseen[late] if late else None), self._solver.problem
+        outlooks = [exact] * len(x) if cov is None else [Outlook(late=late, cov=one) for one in cov]
+        answers = [
+            self._solver.solve(i, row, self._target, outlook)
+            for i, (row, outlook) in enumerate(zip(x, outlooks, strict=True))
+        ]
         return gathered(answers, (problem.horizon, problem.plant.n_u))

@@ -26,7 +26,7 @@ class ConditionedDesign:
 
     Attributes:
         solver: The solver.
-        estimate_cov: Covariance (n_x, n_x) of the state estimate's error that `rests` counts on.
+        estimate_cov: Covariance (n_x, n_x) of the estimate's error after a position, which `rests` counts on.
         design_id: Hash of all that its answers depend on; the target, which every question brings, is none of it.
         rests: Right sides (m_x,) of the state rows, less what a plan keeps from them that rests; from the others.
     """
@@ -37,7 +37,7 @@ class ConditionedDesign:
     rests: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rests", self.solver.rests(self.estimate_cov))
+        object.__setattr__(self, "rests", self.solver.rests())
 
     @property
     def plant(self) -> Plant:
@@ -68,15 +68,10 @@ class ConditionedDesign:
 AnyDesign = Design | ConditionedDesign  # what a flight is planned with, of either scheme
 
 
-def conditioned_id(problem: Problem, link: AgeModel, allowed: float, slew_mps3: float) -> str:
+def conditioned_id(problem: Problem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array) -> str:
     """Hash of what `ConditionedSolver` is made from."""
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
-    return digest((METHOD, anywhere, link, allowed, slew_mps3))
-
-
-def longest_gap(link: AgeModel, allowed: float, most: int) -> int:
-    """Losses in a row, at most `most`, beyond which gaps are rarer than the share of time that is allowed outside."""
-    return next((losses for losses in range(most) if link.outage(losses + 1) <= allowed), most)
+    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov))
 
 
 def conditioned_record(design: ConditionedDesign) -> dict[str, object]:

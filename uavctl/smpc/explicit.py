@@ -53,7 +53,7 @@ class ExplicitDecider:
         """Build the tables for positions `late` steps old now, rather than in the first decision that asks."""
         self._tables(late)
 
-    def decide(self, x: Array, late: int) -> Decisions:
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`. States that are not finite have no plan."""
         if late >= len(self._variants):
             return self._solver.decide(x, late)

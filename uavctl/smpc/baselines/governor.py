@@ -22,13 +22,14 @@ class Governor:
     Args:
         problem: The problem.
         margin: Standard deviations.
+        cov: Covariance (n_x, n_x) of the newest state known, of a filter to which all comes; None: it is exact.
 
     Raises:
         DesignError: The plant has no regulator.
     """
 
-    def __init__(self, problem: Problem, margin: float) -> None:
-        self._problem, self._margin = problem, margin
+    def __init__(self, problem: Problem, margin: float, cov: Array | None = None) -> None:
+        self._problem, self._margin, self._cov = problem, margin, cov
         self._law = lqr(problem.plant, problem.q_x, problem.q_u)
         self._parts = [_Step(problem, part) for part in parts(problem)]
         self._low, self._high = problem.input_set.bounds
@@ -54,7 +55,7 @@ class Governor:
     def _upto(self, age: int) -> Array:
         """Margins (…, m_x) of means that are 0, 1 … `age` steps old, and older."""
         if len(self._backoffs) <= age:
-            limits, spread = self._problem.state_set, unseen(self._problem.plant, 2 * age)
+            limits, spread = self._problem.state_set, unseen(self._problem.plant, 2 * age, self._cov)
             self._backoffs = self._margin * np.array([deviations(limits, cov) for cov in spread])
         return self._backoffs
 

@@ -95,10 +95,16 @@ def deviations(limits: Polytope, covariance: Array) -> Array:
     return along
 
 
-def unseen(plant: Plant, steps: int) -> Array:
-    """Covariance (steps+1, n_x, n_x) of a prediction over 0, 1 … `steps` steps from a state that was exact."""
+def unseen(plant: Plant, steps: int, cov: Array | None = None) -> Array:
+    """Covariance (steps+1, n_x, n_x) of a prediction over 0, 1 … `steps` steps.
+
+    Args:
+        plant: The plant.
+        steps: See above.
+        cov: Covariance (n_x, n_x) of the state that it begins with; None: that was exact.
+    """
     noise = plant.e @ plant.w @ plant.e.T
-    spread = [np.zeros_like(noise)]
+    spread = [np.zeros_like(noise) if cov is None else cov]
     for _ in range(steps):
         spread.append(plant.a @ spread[-1] @ plant.a.T + noise)
     return np.array(spread)

@@ -92,12 +92,17 @@ class MeanQp(PacketisedPredictive):
     Args:
         problem: The problem.
         margin: κ.
+        cov: Covariance (n_x, n_x) of the newest state known, of a filter to which all comes; None: it is exact.
 
     Raises:
         DesignError: The plant has no regulator.
     """
 
+    def __init__(self, problem: Problem, margin: float, cov: Array | None = None) -> None:
+        self._cov = cov
+        super().__init__(problem, margin)
+
     def _planner(self, margin: float) -> BatchMpc:
         problem = self._problem
-        spread = unseen(problem.plant, problem.horizon)
+        spread = unseen(problem.plant, problem.horizon, self._cov)
         return BatchMpc(problem, margin * np.array([deviations(problem.state_set, cov) for cov in spread]))

@@ -1,0 +1,227 @@
+"""Campaigns in which positions alone are measured: the filter against the flight's own, the promise against chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import campaign_rig as rig
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from uavctl.build import build_estimator, build_plant, build_problem
+from uavctl.campaign.again import again
+from uavctl.campaign.cells import Cell, document
+from uavctl.campaign.chance import draw, draw_noise
+from uavctl.campaign.controllers import sight_of
+from uavctl.campaign.intervals import worst_step
+from uavctl.campaign.links import known, newest_of
+from uavctl.campaign.positions import PositionFilter
+from uavctl.campaign.setting import met
+from uavctl.campaign.tasks import Columns, flown, fly_task, tasks_of
+from uavctl.config import Config, load_config
+from uavctl.data import PositionSample
+from uavctl.errors import UsageError
+from uavctl.flight.estimator import absorb, begin, estimate, set_input
+from uavctl.flight.kalman import make_kalman
+from uavctl.smpc.baselines import Governor, MeanQp
+from uavctl.smpc.baselines.problem import unseen
+from uavctl.smpc.batch import Counts, News, predict, predicted_cov
+from uavctl.smpc.innovation import innovations
+
+Array = NDArray[np.float64]
+S = 1_000_000_000
+RUNS, STEPS = 4, 25
+LINKS = {
+    "losses": ["link.loss=0.4"],
+    "late, some overtaken": ["link.loss=0.2", "link.delay_s=0.3", "link.jitter_s=3.4"],
+}
+NOISY = 'set = ["sim.camera.noise_std_m=0.3", "estimator.position_std_m=0.3"'
+FLIGHTS = {
+    "paper": ["estimator.position_std_m=0.3", "estimator.initial_std=2.0"],
+    "room": [
+        f"estimator.{key}" for key in ("bias_drift=0.0", "bias_max=0.0", "inertial_std_mps2=0.0", "window_s=20.0")
+    ],
+}
+
+
+def arrived(config: Config, overrides: list[str], seed: int) -> Counts:
+    link = load_config("paper", overrides).link  # whose delays are of whole seconds
+    return known(link, 1.0, draw(seed, 0, RUNS, STEPS, 1).link)
+
+
+def told(config: Config, first_known: Counts, positions: Array, inputs: Array) -> tuple[list[Array], list[Array]]:
+    """What the campaign's filter says at the begin of each step, of all runs."""
+    looked = PositionFilter(sight_of(config), first_known)
+    newest = newest_of(first_known)
+    pairs = [looked.told(k, positions[:, k], newest[:, k], inputs[:, :k]) for k in range(STEPS)]
+    return [mean for mean, _ in pairs], [cov for _, cov in pairs]
+
+
+@pytest.mark.parametrize("link", LINKS)
+@pytest.mark.parametrize("preset", FLIGHTS)
+def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(preset: str, link: str) -> None:
+    config = load_config(preset, FLIGHTS[preset])
+    plant, first_known, rng = build_plant(config), arrived(config, LINKS[link], 11), np.random.default_rng(3)
+    axes = len(plant.axes)
+    positions, inputs = 3.0 * rng.normal(size=(RUNS, STEPS, axes)), rng.normal(size=(RUNS, STEPS, plant.n_u))
+    means, covs = told(config, first_known, positions, inputs)
+    newest = newest_of(first_known)
+    dt_ns = round(config.plant.dt_s * 1e9)
+    overtaken = 0
+    for run in range(RUNS):
+        kalman = make_kalman(plant, build_estimator(config), dt_ns)
+        history = begin(kalman, 0, 0)
+        for k in range(STEPS):
+            come = [c for c in range(k + 1) if first_known[run, c] == k]
+            overtaken += sum(c < newest[run, k] for c in come)
+            samples = [sample(plant.axes, positions[run, c], c * dt_ns, k * dt_ns) for c in come]
+            history, _, refused = absorb(kalman, history, k * dt_ns, samples)
+            assert not refused
+            said = estimate(kalman, history, int(newest[run, k]) * dt_ns)
+            assert said is not None
+            assert means[k][run] == pytest.approx(said.mean, abs=1e-8)
+            assert covs[k][run] == pytest.approx(np.array(said.cov), rel=1e-7, abs=1e-10)
+            history = set_input(kalman, history, k * dt_ns, inputs[run, k])
+    assert (overtaken > 0) == (link != "losses")
+
+
+def sample(axes: tuple[str, ...], position: Array, captured_ns: int, received_ns: int) -> PositionSample:
+    named = dict(zip(axes, position.tolist(), strict=True))
+    return PositionSample(
+        source="camera",
+        seq=0,
+        captured_ns=captured_ns,
+        received_ns=received_ns,
+        position_m=(named.get("north", 0.0), named.get("east", 0.0), named.get("down", 0.0)),
+        std_m=0.0,
+    )
+
+
+def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_prediction_too() -> None:
+    """e'P⁻¹e of a Gaussian has the mean n; each run's steps are correlated, so runs are counted."""
+    config = load_config("paper", FLIGHTS["paper"])
+    plant, runs, steps = build_plant(config), 3000, 12
+    chances = draw(2, 0, runs, steps, plant.n_w)
+    first_known = known(load_config("paper", LINKS["losses"]).link, 1.0, chances.link)
+    newest, looked = newest_of(first_known), PositionFilter(sight_of(config), first_known)
+    rng = np.random.default_rng(1)
+    index = list(plant.position_index)
+    state = np.zeros((runs, steps + 1, plant.n_x))
+    state[:, 0] = 2.0 * rng.normal(size=(runs, plant.n_x))
+    noise = 0.3 * draw_noise(2, 0, runs, steps, 2)
+    inputs = rng.normal(size=(runs, steps, plant.n_u))
+    pushes = chances.normal @ np.linalg.cholesky(plant.w).T
+    for k in range(steps):
+        mean, cov = looked.told(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
+        news = News(k, newest[:, k], mean, inputs[:, :k], cov)
+        state[:, k + 1] = state[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + pushes[:, k] @ plant.e.T
+        spread = predicted_cov(plant, news)
+        assert spread is not None
+        for said, error in (
+            (cov, state[np.arange(runs), newest[:, k]] - mean),
+            (spread, state[:, k] - predict(plant, news)),
+        ):
+            squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(said), error)
+            # The variance of a χ² with n degrees is 2n; five standard deviations of the mean over runs.
+            assert squared.mean() == pytest.approx(plant.n_x, abs=5.0 * np.sqrt(2.0 * plant.n_x / runs))
+
+
+def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
+    plant = build_plant(load_config("paper"))
+    assert predicted_cov(plant, News(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2)))) is None
+
+
+def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike() -> None:
+    many, one = draw_noise(7, 10, 5, 20, 2), draw_noise(7, 13, 1, 30, 2)
+    assert np.array_equal(many[3], one[0, :20])
+    assert abs(np.corrcoef(many.ravel(), draw(7, 10, 5, 20, 2).normal.ravel())[0, 1]) < 0.3
+
+
+def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
+    given = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
+    plant = given.plant
+    cov = innovations(plant, 0.3, 0.0, 0).estimate_cov
+    # What the filter leaves is what it ends at where every position comes.
+    looked = PositionFilter(
+        sight_of(load_config("paper", ["estimator.position_std_m=0.3"])), np.arange(80, dtype=np.intp)[None]
+    )
+    for k in range(80):
+        _, last = looked.told(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
+    assert last[0] == pytest.approx(cov, abs=1e-9)
+    assert unseen(plant, 1, cov)[1] == pytest.approx(plant.a @ cov @ plant.a.T + unseen(plant, 1)[1])
+    toward = News(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
+    for kind in (Governor, MeanQp):
+        wary, bold = kind(given, 1.5, cov), kind(given, 1.5)
+        for one in (wary, bold):
+            one.begin(1)
+        assert wary.act(toward)[0, 1] < bold.act(toward)[0, 1] - 0.1
+
+
+def cell(tmp_path: Path, *more: str, overrides: str = "", master: int = 0) -> Cell:
+    """A target one metre from a wall at 30 % loss, under the age-conditioned scheme on noisy positions."""
+    (made,) = rig.cells(
+        tmp_path,
+        f'{NOISY}, "target.position_m=[0, 19, 0]", "link.loss=0.3"]\n',
+        f"runs = 400\nsteps = 40\nmaster = {master}\nstart = [0, 0, 15, 0]\n" + "".join(more),
+        rig.controller("smpc", f'set = ["smpc.scheme=age-conditioned"{overrides}]'),
+    )
+    return made
+
+
+def rows(made: Cell) -> Columns:
+    (task,) = tasks_of([made])
+    return fly_task(task)
+
+
+def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covariance(tmp_path: Path) -> None:
+    """The worst step's interval begins below the 5 % that are allowed, and without P in the margins it does not."""
+    found = rows(cell(tmp_path, 'measured = "position"\n'))
+    assert not any(found["error"])
+    hits = np.asarray(found["outside"], dtype=np.int64).sum(axis=0)
+    worst, (low, _) = worst_step(hits, 400, 40)
+    assert low <= 0.05 and worst > 0.01
+    assert found["slack_used"].sum() <= 0.05 * found["decisions"].sum()
+    # The same scheme told that what it knows is exact: steps of the second half, 8000 of them.
+    believed = rows(cell(tmp_path, 'measured = "position"\n', overrides=', "estimator.position_std_m=1e-5"'))
+    rate = float(np.asarray(believed["outside"])[:, 20:].mean())
+    assert rate > 2.0 * float(np.asarray(found["outside"])[:, 20:].mean())
+    assert binom.sf(round(rate * 400), 400, 0.05) < 1e-3
+
+
+def test_what_is_not_asked_for_changes_nothing(tmp_path: Path) -> None:
+    as_ever, exact = cell(tmp_path), cell(tmp_path, 'measured = "state"\n')
+    first, second = (rows(of_runs(made, 20)) for made in (as_ever, exact))
+    assert all(np.array_equal(first[name], second[name], equal_nan=name not in ("error",)) for name in first)
+    assert met(as_ever.setting, 0, 3).noise is None
+
+
+def of_runs(made: Cell, runs: int) -> Cell:
+    """A cell with so many runs."""
+    return replace(made, setting=replace(made.setting, spec=msgspec.structs.replace(made.setting.spec, runs=runs)))
+
+
+def test_every_kind_flies_on_positions_and_runs_do_not_depend_on_each_other(tmp_path: Path) -> None:
+    kinds = ("lqg", "mean-qp", "governor", "packetised", "hold-last", "worst-case-delay")
+    made = rig.cells(
+        tmp_path,
+        f'{NOISY}]\nmeasured = "position"\nruns = 6\nsteps = 15\n',
+        *(rig.controller(kind) for kind in kinds),
+        rig.table("link", "late", 'set = ["link.loss=0.2", "link.delay_s=1.0", "link.jitter_s=1.0"]'),
+    )
+    for task in tasks_of(made):
+        together, _ = flown(task, 0, 6)
+        alone, _ = flown(task, 4, 1)
+        assert not together.failed.any()
+        assert together.states[4] == pytest.approx(alone.states[0], abs=1e-9)
+
+
+def test_a_run_on_positions_is_not_flown_again_as_a_flight(tmp_path: Path) -> None:
+    campaign = rig.read(tmp_path, f'{NOISY}]\nmeasured = "position"\nruns = 2\n', rig.controller("lqg"))
+    made = rig.cells(tmp_path, f'{NOISY}]\nmeasured = "position"\nruns = 2\n', rig.controller("lqg"))
+    (tmp_path / "campaign.json").write_bytes(msgspec.json.encode(document(campaign, made)))
+    with pytest.raises(UsageError, match="told positions"):
+        again(tmp_path, 0, 0, lambda *_: None)
