@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import Self
 
 import msgspec
@@ -85,8 +86,18 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def positions_of(self, states: Matrix | Floats) -> Floats:
         """The same of many states (n, n_x): (n, 3)."""
         positions = np.zeros((len(states), 3))
-        positions[:, [AXIS_NUMBER[axis] for axis in self.axes]] = np.asarray(states)[:, self.position_index]
+        if isinstance(states, np.ndarray):
+            positions[:, self._columns] = states[:, self.position_index]
+        elif len(self.position_index) > 1:  # to turn all of a plan's numbers into an array takes longer
+            positions[:, self._columns] = list(map(itemgetter(*self.position_index), states))
+        else:
+            positions[:, self._columns] = [[state[index] for index in self.position_index] for state in states]
         return positions
+
+    @cached_property
+    def _columns(self) -> list[int]:
+        """Where each axis stands among north, east, down."""
+        return [AXIS_NUMBER[axis] for axis in self.axes]
 
     def state_name(self, index: int) -> str:
         """Name of a state for people, e.g. "north position"."""
@@ -101,6 +112,15 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def state_box(self) -> Box:
         """Axis-parallel limits of the states."""
         return Box.of(self.c_x, self.b_x, len(self.target))
+
+    @cached_property
+    def closed_sides(self) -> tuple[tuple[tuple[int, int, float], ...], ...]:
+        """Of the lower sides of the states that are not open, and of the upper ones: state, row, its coefficient."""
+        box = self.state_box
+        return tuple(
+            tuple((state, row, self.c_x[row][state]) for state, row in enumerate(rows.tolist()) if row >= 0)
+            for rows in (box.row_lower, box.row_upper)
+        )
 
     @cached_property
     def position_rows(self) -> tuple[tuple[int, int, float], ...]:

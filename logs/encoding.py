@@ -52,10 +52,11 @@ def encode(record: Record) -> bytes:
     if isinstance(record, Datagram):
         return record.data
     try:
-        data = _ENCODER.encode(record)
-        # msgspec writes every non-finite float as null: without one, all is said.
-        if b"null" not in data or not _may_be_non_finite(record):
-            return data
+        if not _is_seen_to_be_non_finite(record):
+            data = _ENCODER.encode(record)
+            # msgspec writes every non-finite float as null: without one, all is said.
+            if b"null" not in data or not _may_be_non_finite(record):
+                return data
         return _ENCODER.encode({field: _spelled(getattr(record, field)) for field in record.__struct_fields__})
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
@@ -130,6 +131,17 @@ def _exact(value: object) -> bytes | None:
         return _BINARY.encode(value)
     except OverflowError:
         return None
+
+
+def _is_seen_to_be_non_finite(record: Record) -> bool:
+    """Whether a field that is a float says so at once, as the gap of most plans does."""
+    values = [getattr(record, name) for name in _float_fields(type(record))]
+    return any(type(value) is float and not math.isfinite(value) for value in values)
+
+
+@cache
+def _float_fields(kind: type[Record]) -> tuple[str, ...]:
+    return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is float)
 
 
 def _may_be_non_finite(value: object) -> bool:

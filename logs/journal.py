@@ -191,6 +191,8 @@ class Journal:
     def _ready(self) -> bool:
         """Whether there is a file to write to; begins one if something waits for it."""
         files = self._files
+        if files.is_open and not files.is_full:
+            return True
         waits = bool(self.queue or self.views_due or files.unwritten)
         if waits and files.is_full:
             files.because = f"goes on after {files.name}"

@@ -29,6 +29,7 @@ class Many:
 
     def of(self, numbers: Floats) -> bytes:
         """The field with a part for each row of the numbers (n, k)."""
-        rows = np.tile(self._one, (len(numbers), 1))
+        rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
+        rows[:] = self._one
         rows[:, self._at] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
         return rows.tobytes()

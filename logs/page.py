@@ -44,6 +44,7 @@ th{font-weight:600}
 tbody th{white-space:nowrap;width:13rem}
 td{overflow-wrap:anywhere}
 .many td:last-child:not(.number){min-width:11rem}
+.words td{overflow-wrap:break-word}
 .number{text-align:right;white-space:nowrap;width:1%%}
 .error{color:var(--limit);font-weight:600}
 details{padding:.6rem 1rem;margin:.75rem 0}

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from logs.design_view import Box, DesignView, Floats
+from logs.design_view import DesignView, Floats
 from uavctl.data import (
     Decision,
     Estimate,
@@ -192,7 +190,7 @@ def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
 def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
     """Limits and the tightened ones of a plan."""
     box = design.state_box
-    lower, upper = tightened(design, box, plan.backoff_x, -1)
+    lower, upper = tightened(design, plan.backoff_x, -1)
     return LimitsPlot(
         position_lower_m=axes_of(design, pick(box.lower, design.position_index)),
         position_upper_m=axes_of(design, pick(box.upper, design.position_index)),
@@ -203,13 +201,12 @@ def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
     )
 
 
-def tightened(design: DesignView, box: Box, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
+def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
     """Sides of the state box less the back-offs of a stage: lower and upper (n_x,)."""
-    lower, upper = box.lower.copy(), box.upper.copy()
-    for side, rows in ((lower, box.row_lower), (upper, box.row_upper)):
-        for state in np.flatnonzero(rows >= 0):
-            row = int(rows[state])
-            side[state] -= backoff[stage][row] / design.c_x[row][state]
+    lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
+    for side, closed in zip((lower, upper), design.closed_sides, strict=True):
+        for state, row, size in closed:
+            side[state] -= kept[row] / size
     return lower, upper
 
 

@@ -87,8 +87,12 @@ class Recorder(_Base):
     later where the computer does not let it run or the disk holds it up. That can be `log.queue` records and no more.
     """
 
+    def catch_up(self) -> None:
+        """Begin a round now: right after a tick, when the control loop has the longest time until it needs anything."""
+        self._due.set()
+
     def _begin(self) -> None:
-        self._stop = threading.Event()
+        self._stop, self._due = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -97,6 +101,7 @@ class Recorder(_Base):
         self._most = 0
         self._journal.closed = True
         self._stop.set()
+        self._due.set()
         self._thread.join(timeout_s)
         return self.status()
 
@@ -107,7 +112,9 @@ class Recorder(_Base):
 
     def _run(self) -> None:
         journal = self._journal
-        while not self._stop.wait(POLL_S):
+        while not self._stop.is_set():
+            self._due.wait(POLL_S)
+            self._due.clear()
             journal.drain(portion(len(journal.queue), RECORDS), portion(len(journal.views_due), VIEWS))
         journal.finish()
 

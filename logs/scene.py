@@ -130,15 +130,18 @@ def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
     return _update(_entity(at_ns, "limits", lines=[_box(lower, upper, _LIMITS)]))
 
 
-def plan_scene(at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None) -> SceneUpdate:
+def plan_scene(
+    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Floats | None = None
+) -> SceneUpdate:
     """A plan's predicted path, its confidence ellipsoids, and what its back-offs leave of the limits.
 
     A stage's ellipsoid has the back-offs of the position limits as semi-axes: what the plan keeps
     from them so that they hold with the promised probability. The estimate's is from its covariance.
+    `places` are the positions of the plan's states, where they are at hand.
     """
-    places = design.positions_of(plan.states)
+    places = design.positions_of(plan.states) if places is None else places
     spread = np.concatenate([places, 2.0 * _reach(design, plan.backoff_x)], axis=1)
-    lower, upper = _sides(design, *tightened(design, design.state_box, plan.backoff_x, -1))
+    lower, upper = _sides(design, *tightened(design, plan.backoff_x, -1))
     entities = [
         _entity(at_ns, "predicted path", lines=[_line((), _PLANNED, 3.0)]),
         _entity(at_ns, "predicted spread"),
@@ -240,9 +243,11 @@ def _sphere(at: Fields, semi_axes_m: Sequence[float]) -> Fields:
 
 def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
     """Ellipsoid that holds the position with 95 %, from the covariance."""
-    cov = np.zeros((3, 3))
-    place = [AXIS_NUMBER[axis] for axis in design.axes]
-    cov[np.ix_(place, place)] = np.array(estimate.cov)[np.ix_(design.position_index, design.position_index)]
+    cov = [[0.0] * 3 for _ in range(3)]
+    places = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
+    for row, i in places:
+        for column, j in places:
+            cov[row][column] = estimate.cov[i][j]
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
     turn = quaternion(from_axes(directions.T.tolist()))

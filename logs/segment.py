@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, McapRecord, Schema, Statistics
+from mcap.records import Channel, DataEnd, Footer, Header, McapRecord, Schema, Statistics
 from mcap.records import SummaryOffset as Group
 
 from logs.disk import OutputFile
@@ -32,6 +32,13 @@ _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log ti
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
 _OPCODE = int(Opcode.MESSAGE)
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+# Both are written for every chunk, without compression, whose name is an empty text: a length of 0.
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first time, last time, size, CRC-32, compression, size
+_CHUNK_FIELDS = 40
+_CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, start, length, bytes of offsets
+_OFFSET = struct.Struct("<HQ")  # channel, where its index is
+_CHUNK_INDEX_END = struct.Struct("<QIQQ")  # bytes of the indexes, compression, compressed size, size
+_CHUNK_INDEX_FIELDS = 64
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
 
 
@@ -194,44 +201,29 @@ class Segment:
         content = b"".join(self._parts)
         times_ns = [one.at_ns for one in entries]
         first, last = min(times_ns), max(times_ns)
-        chunk = _bytes(
-            Chunk(
-                compression="",
-                data=content,
-                message_start_time=first,
-                message_end_time=last,
-                uncompressed_crc=zlib.crc32(content),
-                uncompressed_size=len(content),
-            )
-        )
+        size = len(content)
+        head = _CHUNK.pack(Opcode.CHUNK, _CHUNK_FIELDS + size, first, last, size, zlib.crc32(content), 0, size)
+        length = len(head) + size
         prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
         start = self.bytes + len(prefix)
-        offsets, at = {}, start + len(chunk)
+        at, offsets = start + length, []
         indexes = []
         for channel_id, flat in self._indexes.items():
-            offsets[channel_id] = at
+            offsets.append(_OFFSET.pack(channel_id, at))
             indexes.append(
                 _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
                 + struct.pack(f"<{len(flat)}Q", *flat)
             )
             at += len(indexes[-1])
-        block = b"".join([prefix, chunk, *indexes])
+        block = b"".join([prefix, head, content, *indexes])
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
         self.bytes += len(block)
-        self._chunk_indexes += _bytes(
-            ChunkIndex(
-                chunk_start_offset=start,
-                chunk_length=len(chunk),
-                compression="",
-                compressed_size=len(content),
-                uncompressed_size=len(content),
-                message_start_time=first,
-                message_end_time=last,
-                message_index_offsets=offsets,
-                message_index_length=at - start - len(chunk),
-            )
-        )
+        places = b"".join(offsets)
+        fields = _CHUNK_INDEX_FIELDS + len(places)
+        self._chunk_indexes += _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, fields, first, last, start, length, len(places))
+        self._chunk_indexes += places
+        self._chunk_indexes += _CHUNK_INDEX_END.pack(at - start - length, 0, size, size)
         self._chunks += 1
         before = self._times_ns or (first, last)
         self._times_ns = min(before[0], first), max(before[1], last)

@@ -122,8 +122,9 @@ class Views:
                     self._measured.add(record.at_ns, sample.position_m)
                     yield topics.MEASURED, scene.pose_in_frame(sample.captured_ns, sample.position_m)
             case Plan() if record.status is SolveStatus.OPTIMAL:
-                yield topics.PLAN, scene.poses_in_frame(at_ns, design.positions_of(record.states))
-                yield topics.PLAN_SCENE, scene.plan_scene(at_ns, design, record, self._estimate)
+                places = design.positions_of(record.states)
+                yield topics.PLAN, scene.poses_in_frame(at_ns, places)
+                yield topics.PLAN_SCENE, scene.plan_scene(at_ns, design, record, self._estimate, places)
             case Event():
                 yield topics.LOG, scene.log_line(record)
             case RecorderNote():

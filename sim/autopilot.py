@@ -24,6 +24,7 @@ from sim.parameters import Kind, Parameters
 from sim.personality import PERSONALITIES
 from sim.pilot import CRASHED, WARNING, Pilot
 from sim.setpoints import Ask, interpret
+from sim.spans import earliest
 from sim.telemetry import HOME_POSITION, Message, Telemetry, Vehicle
 from sim.timesync import TimeSync
 from sim.vehicle import Vehicle as Plant
@@ -125,7 +126,7 @@ class Autopilot:
         if self.pilot.crashed:
             return None
         parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial
-        return min((part.next_ns for part in parts if part.next_ns is not None), default=None)
+        return earliest([part.next_ns for part in parts])
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
         """Do what is due at `at_ns`, the vehicle being there; returns the datagrams sent."""

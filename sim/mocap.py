@@ -62,6 +62,9 @@ class Cameras:
     Each effect draws from its own generator, the same number of values for every sample whether the effect is on or
     off, seen or not. So two runs with one seed differ only by the effects that differ.
 
+    Attributes:
+        next_ns: time of the next sample [ns].
+
     Raises:
         ConfigError: the clock offset makes a stamp that is not positive.
     """
@@ -89,10 +92,9 @@ class Cameras:
         self._creeps, self._crept_ns, self._crept_m = STILL, start_ns, STILL
         self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
         self._taken = 0
+        self.next_ns = self._sample_ns()
 
-    @property
-    def next_ns(self) -> int:
-        """Time of the next sample [ns]."""
+    def _sample_ns(self) -> int:
         return self._start_ns + round((self._camera.phase_s + self._taken / self._camera.rate_hz) * 1e9)
 
     @property
@@ -127,6 +129,7 @@ class Cameras:
         camera, at_ns = self._camera, self.next_ns
         since_ns = at_ns - self._start_ns
         self._taken += 1
+        self.next_ns = self._sample_ns()
         noise = self._noise_std_m * self._noise.standard_normal(3)
         latency_s = camera.latency_s + camera.jitter_s * float(self._lateness.random())
         if self._hides(since_ns):

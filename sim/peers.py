@@ -14,7 +14,7 @@ from sim.look import Look
 from sim.mocap import Cameras
 from sim.quadrotor import STEP_S, Quadrotor
 from sim.script import Script, ScriptedChannel
-from sim.spans import within
+from sim.spans import earliest, within
 from sim.vehicle import Vehicle, linear_model
 from sim.wind import Wind
 from uavctl.config.types import Config
@@ -87,8 +87,11 @@ class Peers:
     @property
     def _own_ns(self) -> int:
         """When cameras, autopilot or a fault do something next [ns]."""
-        times = (self._cameras.next_ns, self.autopilot.next_ns, self._faults.next_ns)
-        return min(at_ns for at_ns in times if at_ns is not None)
+        return self._earliest_ns(self.autopilot.next_ns, self._faults.next_ns)
+
+    def _earliest_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
+        found_ns = earliest((autopilot_ns, fault_ns))
+        return self._cameras.next_ns if found_ns is None else min(self._cameras.next_ns, found_ns)
 
     def advance(self, to_ns: int) -> list[Due]:
         """Move time on; returns the datagrams due up to and including `to_ns`, in order of time."""
@@ -172,7 +175,7 @@ class Peers:
     def _run(self, to_ns: int) -> None:
         while True:
             autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
-            at_ns = max(min(self._own_ns, to_ns), self.now_ns)
+            at_ns = max(min(self._earliest_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
             self._move(at_ns)
             busy = False
             if fault_ns is not None and fault_ns <= at_ns:

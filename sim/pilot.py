@@ -15,6 +15,7 @@ from sim.helm import Helm
 from sim.parameters import Parameters
 from sim.personality import ACCEPTED, FAILED, TEMPORARILY_REJECTED, Mode, Personality, Role
 from sim.setpoints import STOP, Ask, Setpoint
+from sim.spans import earliest
 from uavctl.data import Vec3
 
 SECOND_NS = 1_000_000_000
@@ -113,12 +114,9 @@ class Pilot:
     @property
     def next_ns(self) -> int | None:
         """Time of the next thing to do of itself [ns]."""
-        times = [at_ns for at_ns in (self._phase_end_ns, self._deadline_ns) if at_ns is not None]
-        if self._watches:
-            times.append(self._watch_ns)
-        if self._steered is not None and self._steered.next_ns is not None:
-            times.append(self._steered.next_ns)
-        return min(times, default=None)
+        watch_ns = self._watch_ns if self._watches else None
+        steered_ns = None if self._steered is None else self._steered.next_ns
+        return earliest((self._phase_end_ns, self._deadline_ns, watch_ns, steered_ns))
 
     @property
     def _watches(self) -> bool:

@@ -260,7 +260,7 @@ class Vehicle:
         values = list(default)
         state = self.state
         for axis, i in zip(self.model.axes, index, strict=True):
-            values[axis] = float(state[i])
+            values[axis] = state.item(i)
         return values[0], values[1], values[2]
 
     def advance(self, to_ns: int) -> None:

@@ -57,9 +57,9 @@ def look(
         twist: what happens to the cameras' datagrams on their way.
         prepare: called with the peers before the start.
     """
-    config = load_config("room", [*CALM, *overrides, *wrong])
+    config = load_config("room-hahn-stursberg", [*CALM, *overrides, *wrong])
     shared = config.daemon.vehicle == config.daemon.mocap
-    peers = Peers(load_config("room", [*CALM, *overrides]), 0, airborne=airborne, shared_link=shared)
+    peers = Peers(load_config("room-hahn-stursberg", [*CALM, *overrides]), 0, airborne=airborne, shared_link=shared)
     prepare(peers)
     flight, client = Preflight(config, make_links, 0), Client()
     ticks = round(seconds * S) // TICK_NS
@@ -97,7 +97,7 @@ class Hand:
     """
 
     def __init__(self, *overrides: str, heading_rad: float = 0.0, own: bool = False, move: bool = False) -> None:
-        self.config = load_config("room", [*CALM, *overrides])
+        self.config = load_config("room-hahn-stursberg", [*CALM, *overrides])
         self.flight = Preflight(self.config, make_links, 0, move=move)
         self.vehicle, self.cameras = Peer(1, 1), Peer(17, 18)
         self.heading_rad, self.own = heading_rad, own

@@ -595,7 +595,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def bases() -> dict[str, dict[str, Any]]:
     """Both presets with every key, and the first one with a mission, a fence and a fault."""
-    found = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room")}
+    found = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
     for table in found.values():
         table["security"]["require"] = ["vehicle", "mocap"]
     mission = [
@@ -603,5 +603,5 @@ def bases() -> dict[str, dict[str, Any]]:
         "fence=[{state='north', side='upper', times_s=[0.0, 5.0], values=[2.9, 2.5]}]",
         "sim.fault=[{at_s=0.5, kind='blackout', for_s=0.3}]",
     ]
-    found["mission"] = tomllib.loads(dump_config(load_config("room", mission)))
+    found["mission"] = tomllib.loads(dump_config(load_config("room-hahn-stursberg", mission)))
     return found

@@ -35,7 +35,7 @@ class Nothing:
 def flown_ticks() -> list[list[Item]]:
     """A flight's records, tick by tick."""
     ticks: list[list[Item]] = [[]]
-    for item in lockstep("room", FLIGHT_S).entries:
+    for item in lockstep("room-hahn-stursberg", FLIGHT_S).entries:
         if item[0] == "/uavctl/step_input" and ticks[-1]:
             ticks.append([])
         ticks[-1].append(item)

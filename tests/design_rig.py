@@ -38,7 +38,7 @@ def paper_plant() -> Plant:
 
 
 def room_plant() -> Plant:
-    table = preset("room")["plant"]
+    table = preset("room-hahn-stursberg")["plant"]
     return drag_lag(
         drag_1ps=table["drag_1ps"],
         lag_s=table["lag_s"],

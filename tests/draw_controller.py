@@ -15,16 +15,16 @@ from uavctl.errors import ConfigError, DesignError
 TRIES = 30  # draws of a design until there is one
 # Designs that have a policy library: it takes seconds to make one, so these are few, and kept in the cache.
 WITH_LIBRARY = (
-    ("room",),
+    ("room-hahn-stursberg",),
     (
-        "room",
+        "room-hahn-stursberg",
         "link.model=gilbert-elliott",
         "link.loss=0.2",
         "link.burst_enter=0.1",
         "link.burst_leave=0.5",
         "link.burst_loss=0.8",
     ),
-    ("room", "solver.exact=false", "link.loss=0.2"),
+    ("room-hahn-stursberg", "solver.exact=false", "link.loss=0.2"),
     ("paper",),
 )
 
@@ -45,7 +45,7 @@ def draw_controller(rng: np.random.Generator, seed: int) -> Config:
 
 def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
     """Preset and overrides of design, solver, estimator and fallback; not all of them fit together."""
-    name = str(rng.choice(["room", "paper"], p=[0.7, 0.3]))
+    name = str(rng.choice(["room-hahn-stursberg", "paper"], p=[0.7, 0.3]))
     horizon = int(rng.integers(7, 15))
     said = {
         "smpc.horizon": horizon,
@@ -59,7 +59,7 @@ def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
         "fallback.blind_hold_s": 0.5 * hold_s,
         "fallback.recover_samples": int(rng.integers(1, 5)),
         "limits.slew_mps3": rng.uniform(3.0, 50.0),
-        "source.rate_hz": rng.choice([0.0, 5.0]) if name == "room" else 0.0,
+        "source.rate_hz": rng.choice([0.0, 5.0]) if name == "room-hahn-stursberg" else 0.0,
     }
     # The search solves many problems: of two axes and short horizons only.
     rules = ["fixed", "list", "greedy", *(["search"] if name == "paper" and horizon < 10 else [])]
@@ -69,17 +69,17 @@ def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
         said["schedule.delays"] = delays if rule == "fixed" else [int(delays)] * (horizon - 2) + [int(delays) + 1] * 2
     else:
         said["schedule.rule"] = rule
-        width = 9 if name == "room" else 4
+        width = 9 if name == "room-hahn-stursberg" else 4
         said["schedule.search_states"] = [[0.0] * width, [0.5] + [0.0] * (width - 1)]
     said |= _believed_link(rng)
     method = str(rng.choice(["exact", "printed"], p=[0.8, 0.2]))
     said["solver.method"] = method
     said["risk.estimate"] = "exact" if method == "printed" else rng.choice(["exact", "innovations"])
-    if name == "room" and method == "exact" and rng.uniform() < 0.3:
+    if name == "room-hahn-stursberg" and method == "exact" and rng.uniform() < 0.3:
         said |= {"schedule.late": int(rng.integers(1, 3)), "link.delay_s": rng.uniform(0.0, 0.3)}
-    if name == "room" and rng.uniform() < 0.4:
+    if name == "room-hahn-stursberg" and rng.uniform() < 0.4:
         said |= {"estimator.bias_drift": 0.0, "estimator.bias_max": 0.0}
-    if name == "room" and rng.uniform() < 0.3:
+    if name == "room-hahn-stursberg" and rng.uniform() < 0.3:
         said |= {"plant.drag_1ps": [float(rng.uniform(0.05, 0.4))] * 3, "plant.lag_s": [0.25, 0.25, 0.3]}
     return name, [f"{key}={value}" for key, value in said.items()]
 

@@ -94,7 +94,7 @@ def drawn(seed: int) -> Drawn:
     ticks = round(config.duration_s / config.daemon.tick_s)
     steps = round(config.duration_s / config.plant.dt_s)
     per_step = ticks // steps
-    takes_off = config.name == "room" and config.sim.plant == "quadrotor" and rng.uniform() < 0.4
+    takes_off = config.name == "room-hahn-stursberg" and config.sim.plant == "quadrotor" and rng.uniform() < 0.4
     if takes_off:
         low = replace(config.sim, start_position_m=(*config.sim.start_position_m[:2], -0.05))
         config = replace(config, sim=low)
@@ -138,11 +138,13 @@ def _true_link(rng: np.random.Generator, config: Config, calm: bool) -> LinkConf
 
 def _simulated(rng: np.random.Generator, config: Config, seed: int, calm: bool) -> Config:
     """Vehicle, cameras, their clock and frame, connections, and faults at their times."""
-    plant = str(rng.choice(["linear", "quadrotor"])) if config.name == "room" else "linear"
+    plant = str(rng.choice(["linear", "quadrotor"])) if config.name == "room-hahn-stursberg" else "linear"
     autopilot = str(rng.choice(["px4", "ardupilot"]))
     camera = replace(
         config.sim.camera,
-        rate_hz=float(rng.choice([5.0, 10.0, 30.0])) if config.name == "room" else config.sim.camera.rate_hz,
+        rate_hz=float(rng.choice([5.0, 10.0, 30.0]))
+        if config.name == "room-hahn-stursberg"
+        else config.sim.camera.rate_hz,
         noise_std_m=float(rng.choice([0.0, 0.003, 0.02])),
         latency_s=float(rng.choice([0.0, 0.02])),
         jitter_s=float(rng.choice([0.0, 0.05])),
@@ -150,9 +152,11 @@ def _simulated(rng: np.random.Generator, config: Config, seed: int, calm: bool) 
         clock_drift_ppm=float(rng.uniform(-300.0, 300.0)),
         occlusions_per_s=0.0 if calm else 0.1,
         other_body_m=(1.0, -1.0, -0.5),
-        message=str(rng.choice(["vision", "vicon", "mocap", "odometry"])) if config.name == "room" else "odometry",
+        message=str(rng.choice(["vision", "vicon", "mocap", "odometry"]))
+        if config.name == "room-hahn-stursberg"
+        else "odometry",
     )
-    duration_s = float(rng.integers(8, 15)) if config.name == "room" else float(rng.integers(12, 25))
+    duration_s = float(rng.integers(8, 15)) if config.name == "room-hahn-stursberg" else float(rng.integers(12, 25))
     sim = replace(
         config.sim,
         plant=plant,
@@ -232,16 +236,16 @@ def _mission(rng: np.random.Generator, config: Config) -> Config:
             interpolation=str(rng.choice(["linear", "cubic"])),
         )
         mission = replace(mission, trajectory=motion)
-    fenced = config.name == "room" and config.solver.method != "printed" and rng.uniform() < 0.2
+    fenced = config.name == "room-hahn-stursberg" and config.solver.method != "printed" and rng.uniform() < 0.2
     overrides = ["fence=[{state='north', side='upper', times_s=[2.0, 6.0], values=[3.0, 2.2]}]"] if fenced else []
-    fence = load_config("room", overrides).fence
+    fence = load_config("room-hahn-stursberg", overrides).fence
     moved = replace(config, mission=mission, fence=fence)
     return moved if fits(moved) else config
 
 
 def _place(rng: np.random.Generator, config: Config) -> Vec3:
     """Somewhere well inside of the limits."""
-    if config.name == "room":
+    if config.name == "room-hahn-stursberg":
         return (float(rng.uniform(-1.5, 1.5)), float(rng.uniform(-1.0, 1.0)), float(rng.uniform(-1.6, -0.9)))
     return (float(rng.uniform(-10.0, 20.0)), float(rng.uniform(-10.0, 8.0)), 0.0)
 

@@ -55,7 +55,7 @@ def rows_of(tlog: str, topic: str = "/mavlink", encoding: str = "mavlink") -> li
 
 
 def flown(packets: tuple[TlogPacket, ...]) -> ForeignReplay:
-    config = load_config("room", ["daemon.vehicle=tlog", "daemon.mocap=tlog", "solver.method=exact"])
+    config = load_config("room-hahn-stursberg", ["daemon.vehicle=tlog", "daemon.mocap=tlog", "solver.method=exact"])
     incoming = [(packet.at_ns, packet.data) for packet in packets if not packet.outgoing]
     controller = replace(build_controller(config), envelope=None)  # as `uavctl log replay` does: others flew it
     return replay_tlog(

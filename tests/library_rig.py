@@ -27,7 +27,7 @@ from uavctl.smpc.policies import Policy
 
 Array = NDArray[np.float64]
 
-PRESETS = ("paper", "room")
+PRESETS = ("paper", "room-hahn-stursberg")
 # Stages and rows that a margin may miss by: 1e-6 of the row's unit.
 KEPT = 1e-6
 

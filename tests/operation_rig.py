@@ -141,7 +141,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
         tap = Tap(vehicle_port)
         found = Scene(Path(folder), tap, vehicle_port, mocap_port)
         done = threading.Event()
-        config = load_config("room", [PATIENT_VEHICLE, *overrides])
+        config = load_config("room-hahn-stursberg", [PATIENT_VEHICLE, *overrides])
 
         def serve_peers() -> None:
             serve(

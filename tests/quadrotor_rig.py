@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Autopilot = Literal["px4", "ardupilot"]
 
 S = 1_000_000_000
-MODEL = linear_model(load_config("room").plant)
+MODEL = linear_model(load_config("room-hahn-stursberg").plant)
 DATA = Path(__file__).parent / "data"
 # The recorded PX4 flew a vehicle with drag of 1 N s/m and 1 kg (SIH_KDV, SIH_MASS), the same along all axes.
 HOVER_SUM_RPS = 4.0 * CRAZYFLIE_2.hover_rps

@@ -16,7 +16,7 @@ HEADER = Header(
     started_utc="2026-01-02T03:04:05Z",
     seed=7,
     command="uavctl loopback",
-    config_toml='name = "room"\nduration_s = 40.0\n',
+    config_toml='name = "room-hahn-stursberg"\nduration_s = 40.0\n',
     design_id="d1",
     design={"gamma_x": [1.0, 0.5]},
     versions={"uavctl": "0.1"},

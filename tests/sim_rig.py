@@ -111,7 +111,9 @@ class Bench:
 
 
 def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
-    return Bench(load_config("room", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne)
+    return Bench(
+        load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne
+    )
 
 
 def flying(one: Bench) -> tuple[float, ...]:

@@ -130,7 +130,9 @@ def drawn_pair(seed: int) -> Config:
     """A world with two faults at random moments; each of the four worlds in turn."""
     rng = np.random.default_rng([seed, 14])
     plant, autopilot = WORLDS[seed % len(WORLDS)]
-    config = load_config("room", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.seed={seed}"])
+    config = load_config(
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.seed={seed}"]
+    )
     sim, link = config.sim, config.link
     wind = sim.wind
     if plant == "quadrotor":

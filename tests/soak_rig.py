@@ -22,7 +22,7 @@ MOST_FINDINGS = 20  # of one flight: the first ones tell
 
 def prepared_for(*overrides: str) -> Prepared:
     """Design, library and controller of preset `room`."""
-    config = load_config("room", overrides)
+    config = load_config("room-hahn-stursberg", overrides)
     return prepare(config, design_of(config))
 
 

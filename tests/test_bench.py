@@ -14,20 +14,23 @@ from baseline_rig import problem
 from numpy.typing import NDArray
 from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
 
+from sim.world import World
 from uavctl.bench import BenchResult, Sizes, run, run_bench
 from uavctl.bench.decisions import questions, time_decisions
+from uavctl.bench.flown import ROUNDS, time_flight
 from uavctl.bench.frozen_qp import FrozenProgram, time_frozen_qp
 from uavctl.bench.growth import copies, few_policies, growth_with_axes, lengthened
 from uavctl.bench.in_flight import InFlight
 from uavctl.bench.plot import bench_svg
 from uavctl.bench.states import LOOP_STEPS, closed_loops, draw_states
 from uavctl.bench.timing import FROZEN, Case, exponent, timed
-from uavctl.build import build_conditioned
+from uavctl.build import build_conditioned, build_controller
 from uavctl.cli import bench_cmd
 from uavctl.cli.app import run as command
 from uavctl.config import load_config
-from uavctl.data import SolveStatus
+from uavctl.data import Plan, Record, SolveStatus
 from uavctl.errors import UavctlError
+from uavctl.loop import ControlLoop
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook
 from uavctl.smpc.components import decompose
 from uavctl.smpc.conditioned import ConditionedSolver
@@ -124,7 +127,7 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
 
 
 def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> None:
-    solver = build_conditioned(load_config("room", ["smpc.scheme=age-conditioned"])).solver
+    solver = build_conditioned(load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])).solver
     asked = [*questions(solver, 30, 4)]
     low, high = solver.problem.state_set.bounds
     assert all((low <= x).all() and (x <= high).all() for x, _, _ in asked)
@@ -140,13 +143,44 @@ def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> 
     assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max
 
 
+def test_a_flight_s_own_decisions_are_asked_again() -> None:
+    """As many as the flight's plans, and each as hard."""
+    config = load_config(
+        "room-hahn-stursberg", ["smpc.scheme=age-conditioned", "duration_s=6", "sim.start_velocity_mps=[1.4, 1.4, 0]"]
+    )
+    plans: list[Plan] = []
+
+    class Plans:
+        def put(self, topic: str, at_ns: int, record: Record) -> None:
+            if topic == "/uavctl/plan":
+                assert isinstance(record, Plan) and at_ns == record.base_ns
+                plans.append(record)
+
+    World(config, ControlLoop(config, build_controller(config), Plans(), lambda: 0)).run(config.duration_s)
+    told: list[tuple[int, int]] = []
+    found = time_flight(config, lambda *now: told.append(now))
+    assert found is not None and found.questions == len(plans) > 10
+    assert found.iterations.max == max(plan.iterations for plan in plans) > 0
+    assert found.left_alone == pytest.approx(sum(plan.iterations == 0 for plan in plans) / len(plans))
+    assert found.gave_way == pytest.approx(sum(plan.slack > 0.0 for plan in plans) / len(plans))
+    assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max and found.first_us > 0.0
+    assert told == [(done, ROUNDS) for done in range(ROUNDS)]
+
+
+def test_a_flight_that_asks_nothing_has_no_decisions() -> None:
+    assert time_flight(load_config("room", ["smpc.scheme=age-conditioned", "duration_s=0.1"])) is None
+
+
 def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--set", "smpc.scheme=age-conditioned", "--states", "5"]
+    options = ["--set", "smpc.scheme=age-conditioned", "--set", "duration_s=4", "--states", "5"]
     assert command(["bench", *options, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["states"] == 5 and set(document["iterations"]) == {"p50", "p99", "max"}
+    assert document["flight"]["questions"] > 5
     assert command(["bench", *options]) == 0
-    assert f"at most {document['iterations']['max']:.0f}." in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"at most {document['iterations']['max']:.0f}." in shown
+    assert f"{document['flight']['questions']} of its own flight" in shown
     assert command(["bench", *options, "--plot", "x.svg"]) == 2
 
 

@@ -145,7 +145,7 @@ class _Biased:
 def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None:
     """Preset `room`, without noise; without the estimate the push shows, so the test could fail."""
     off = ["estimator.bias_drift=0.0", "estimator.bias_max=0.0"]
-    config = load_config("room", ["solver.method=exact", *([] if estimated else off)])
+    config = load_config("room-hahn-stursberg", ["solver.method=exact", *([] if estimated else off)])
     controller = build_controller(config)
     target = np.array(config.target.position_m)
     world = _Biased(controller, np.array([0.2, -0.15, 0.15]), controller.plant.equilibrium(config.target.position_m))
@@ -156,7 +156,7 @@ def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None
 
 
 def test_plans_leave_room_for_it_and_what_is_flown_keeps_the_input_limits() -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     spec = build_spec(config)
     low, high = spec.input_set.bounds
     np.testing.assert_allclose(high, np.array(config.sets.input_upper) - config.estimator.bias_max)
@@ -224,7 +224,7 @@ def test_without_it_nothing_is_estimated_shifted_or_left_free() -> None:
 )
 def test_a_configuration_that_does_not_fit_is_refused(overrides: tuple[str, ...], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
-        load_config("room", list(overrides))
+        load_config("room-hahn-stursberg", list(overrides))
 
 
 def test_what_positions_that_are_taken_back_told_of_it_is_forgotten() -> None:

@@ -25,7 +25,7 @@ def test_the_paper_s_plant_is_as_printed() -> None:
 
 
 def test_a_room_has_three_states_an_axis() -> None:
-    plant = build_plant(load_config("room", ["plant.gain=[1, 1, 0.5]", "plant.drag_1ps=[0, 0, 0.3]"]))
+    plant = build_plant(load_config("room-hahn-stursberg", ["plant.gain=[1, 1, 0.5]", "plant.drag_1ps=[0, 0, 0.3]"]))
     assert (plant.n_x, plant.n_u, plant.axes) == (9, 3, ("north", "east", "down"))
     # Steady state of v' = a - c v with a = g u: v = g u / c.
     speed = np.linalg.matrix_power(plant.a, 2000) @ np.zeros(9)
@@ -35,7 +35,7 @@ def test_a_room_has_three_states_an_axis() -> None:
 
 
 def test_open_sides_make_no_rows_and_weights_are_diagonal() -> None:
-    spec = build_spec(load_config("room"))
+    spec = build_spec(load_config("room-hahn-stursberg"))
     assert spec.state_set.b.size == 12  # accelerations are free
     assert spec.input_set.b.size == 6
     assert np.diag(spec.q_x).tolist() == [10, 1, 0.1] * 3
@@ -96,8 +96,8 @@ def test_a_controller_holds_the_configuration_s_numbers() -> None:
     [([], True), (["relay.enabled=true"], False), (['source.messages=["LOCAL_POSITION_NED"]'], False)],
 )
 def test_a_velocity_that_is_made_of_our_positions_is_no_witness(overrides: list[str], asked: bool) -> None:
-    config = load_config("room", overrides)
-    assert (build_controller(config, build_design(load_config("room"))).trust.at_rest_mps > 0.0) == asked
+    config = load_config("room-hahn-stursberg", overrides)
+    assert (build_controller(config, build_design(load_config("room-hahn-stursberg"))).trust.at_rest_mps > 0.0) == asked
 
 
 @pytest.mark.parametrize("preset", presets())

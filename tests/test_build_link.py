@@ -21,14 +21,14 @@ STEP_NS = 1_000_000_000
     ("preset", "overrides", "p"),
     [
         ("paper", [], 0.7),
-        ("room", [], 0.7),
-        ("room", ["link.loss=0"], 1.0),
+        ("room-hahn-stursberg", [], 0.7),
+        ("room-hahn-stursberg", ["link.loss=0"], 1.0),
         # Two of four samples in 0.2 s are sure to arrive within 0.03 + 0.04 s of delay: 1 - 0.3².
-        ("room", ["source.rate_hz=20"], 0.91),
-        ("room", ["source.rate_hz=20", "link.delay_s=0.07"], 0.7),
+        ("room-hahn-stursberg", ["source.rate_hz=20"], 0.91),
+        ("room-hahn-stursberg", ["source.rate_hz=20", "link.delay_s=0.07"], 0.7),
         ("paper", ["source.rate_hz=10"], 1.0 - 0.3**10),
         # What the simulator's cameras do is no assumption of the design.
-        ("room", ["sim.camera.rate_hz=20", "sim.camera.latency_s=0.1"], 0.7),
+        ("room-hahn-stursberg", ["sim.camera.rate_hz=20", "sim.camera.latency_s=0.1"], 0.7),
         # A fifth of the time in the bad state: 0.8 · 0.1 + 0.2 · 0.8 lost.
         ("paper", [*BURSTS, "link.loss=0.1"], 0.76),
         # Two packets in a row: both good 0.8 · 0.9, one of each 0.8 · 0.1 + 0.2 · 0.4, both bad 0.2 · 0.6.
@@ -41,7 +41,7 @@ STEP_NS = 1_000_000_000
         # One arrives in 1 + (0.1 + 2 · 0.05 + 3 · 0.15) packets; right after one that did, with 0.7.
         ("paper", RUNS, 1.0 / 1.65),
         ("paper", ["link.probability=[0.1, 0.6, 0.9, 0.8]"], 0.6),
-        ("room", ["link.probability=[0.5]", "source.rate_hz=20"], 0.75),
+        ("room-hahn-stursberg", ["link.probability=[0.5]", "source.rate_hz=20"], 0.75),
     ],
 )
 def test_the_link_s_probability_counts_samples_that_are_in_time(preset: str, overrides: list[str], p: float) -> None:
@@ -60,7 +60,7 @@ def test_the_link_s_probability_counts_samples_that_are_in_time(preset: str, ove
     ],
 )
 def test_packets_of_a_step_that_come_too_late_are_not_counted_on(overrides: list[str], packets: Packets) -> None:
-    assert packets_per_step(load_config("room", overrides)) == packets
+    assert packets_per_step(load_config("room-hahn-stursberg", overrides)) == packets
 
 
 def test_what_a_design_for_the_whole_flight_counts_on_is_the_least_of_what_is_ahead() -> None:
@@ -86,7 +86,7 @@ def test_what_a_design_for_the_whole_flight_counts_on_is_the_least_of_what_is_ah
 )
 def test_a_link_that_no_position_crosses_in_time_is_refused(overrides: list[str], key: str, figures: str) -> None:
     with pytest.raises(DesignError, match=figures) as caught:
-        build_link(load_config("room", overrides))
+        build_link(load_config("room-hahn-stursberg", overrides))
     assert caught.value.key == key
 
 
@@ -175,7 +175,7 @@ def test_the_simulated_channel_follows_the_probabilities_step_by_step() -> None:
     ],
 )
 def test_bursts_that_the_mean_loss_hides_are_refused(overrides: list[str], key: str, message: str) -> None:
-    config = load_config("room", ["link.model=gilbert-elliott", *overrides])
+    config = load_config("room-hahn-stursberg", ["link.model=gilbert-elliott", *overrides])
     with pytest.raises(DesignError, match=message) as caught:
         build_design(config)
     assert caught.value.key == key
@@ -183,8 +183,8 @@ def test_bursts_that_the_mean_loss_hides_are_refused(overrides: list[str], key: 
 
 def test_a_design_for_bursts_has_wider_back_offs_than_one_for_their_mean_loss() -> None:
     few = ["link.loss=0.05", "link.burst_enter=0.02", "link.burst_leave=0.5"]
-    bursts = build_design(load_config("room", ["link.model=gilbert-elliott", *few]))
-    mean = build_design(load_config("room", [f"link.loss={0.05 * 25 / 26 + 1 / 26}"]))
+    bursts = build_design(load_config("room-hahn-stursberg", ["link.model=gilbert-elliott", *few]))
+    mean = build_design(load_config("room-hahn-stursberg", [f"link.loss={0.05 * 25 / 26 + 1 / 26}"]))
     assert bursts.schedule.alpha.min() < mean.schedule.alpha.min() < 1.0
     assert np.all(bursts.kappa_x >= mean.kappa_x)
     assert bursts.assumptions[0].value < mean.assumptions[0].value

@@ -264,7 +264,7 @@ def test_positions_of_the_vehicle_itself_need_no_frame() -> None:
 def recorded(*wrong: str) -> Checked:
     same = "udpin://0.0.0.0:14540"
     overrides = [f"daemon.vehicle={same}", f"daemon.mocap={same}", "link.loss=0.0", *wrong]
-    flight, begun_ns, at_ns = Preflight(load_config("room", overrides), make_links, 0), 0, 0
+    flight, begun_ns, at_ns = Preflight(load_config("room-hahn-stursberg", overrides), make_links, 0), 0, 0
     for stamp_ns, data in packets("arducopter-vicon.tlog"):
         begun_ns = begun_ns or stamp_ns
         at_ns = stamp_ns - begun_ns
@@ -316,12 +316,12 @@ def seen_with(autopilot: int, flags: int) -> Seen:
 def test_a_resting_px4_has_a_position_of_its_own(autopilot: int, flags: int, there: bool) -> None:
     seen = seen_with(autopilot, flags)
     assert compared(seen) is there
-    own = axis_items(seen, load_config("room"), [])[0]
+    own = axis_items(seen, load_config("room-hahn-stursberg"), [])[0]
     assert own.name == "own position" and (own.state is State.GOOD) is there
 
 
 def test_another_origin_is_found_beside_a_resting_px4() -> None:
     seen = seen_with(12, 0x1EF)
     seen.own = [(at_ns, (1.0, 0.0, -0.1)) for at_ns, _ in seen.own]
-    axes = axis_items(seen, load_config("room"), [])[1]
+    axes = axis_items(seen, load_config("room-hahn-stursberg"), [])[1]
     assert axes.name == "axes" and axes.state is State.BAD

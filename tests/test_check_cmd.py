@@ -189,7 +189,7 @@ class Bench:
     """Virtual time."""
 
     def __init__(self, *overrides: str) -> None:
-        self.config = load_config("room", ["link.loss=0.0", *overrides])
+        self.config = load_config("room-hahn-stursberg", ["link.loss=0.0", *overrides])
         self.now_ns = 1
         self.peers = Peers(self.config, 200_000_000, airborne=False)
         self.arrived: dict[str, list[tuple[bytes, int]]] = {"vehicle": [], "mocap": []}

@@ -47,7 +47,7 @@ def test_no_positions_at_all() -> None:
 @pytest.mark.parametrize("shared", [False, True])
 def test_on_a_shared_link_the_vehicle_s_own_estimate_is_offered(shared: bool) -> None:
     urls = [f'daemon.{role}="udpin://127.0.0.1:14540"' for role in ("vehicle", "mocap")]
-    config = load_config("room", urls if shared else [])
+    config = load_config("room-hahn-stursberg", urls if shared else [])
     flight, vehicle = Preflight(config, make_links, 0), Peer(1, 1)
     for at_ns in (MS, 2 * MS):
         flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ns // MS), at_ns)
@@ -181,7 +181,7 @@ def test_two_sources_of_one_id_are_found_by_their_stamps() -> None:
 
 
 def test_no_vehicle() -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     flight = Preflight(config, make_links, 0)
     found = Checked(flight, S)
     assert {"vehicle", "positions"} <= set(found.bad)
@@ -228,7 +228,7 @@ def test_armed_and_in_the_air_are_told() -> None:
     ],
 )
 def test_the_rate_of_the_vehicles_own_velocity_is_told(periods_ms: list[int], told: str, wanted_state: State) -> None:
-    flight, vehicle, at_ms = Preflight(load_config("room"), make_links, 0), Peer(1, 1), 1000
+    flight, vehicle, at_ms = Preflight(load_config("room-hahn-stursberg"), make_links, 0), Peer(1, 1), 1000
     flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ms), at_ms * MS)
     for period_ms in periods_ms:
         at_ms += period_ms
@@ -239,7 +239,7 @@ def test_the_rate_of_the_vehicles_own_velocity_is_told(periods_ms: list[int], to
 
 @pytest.mark.parametrize("armed", [False, True])
 def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     flight = Preflight(config, make_links, 0, take_off_m=1.0)
     flight.receive("vehicle", Peer(1, 1).heartbeat(base_mode=129 if armed else 1), 1)
     one = next(one for one in flight.items(1) if one.name == "armed")
@@ -250,7 +250,7 @@ def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
 @BOTH
 def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
     """Every message to the vehicle is one of these, and every command asks for a message."""
-    config = load_config("room", [f"sim.autopilot={autopilot}", "relay.enabled=true"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "relay.enabled=true"])
     peers, flight = Peers(config, 0, airborne=False), Preflight(config, make_links, 0)
     kinds, commands = set(), set()
     for tick in range(300):
@@ -275,8 +275,8 @@ MOTIVE = "daemon.mocap=natnet://10.0.0.5/drone"
 
 
 def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
-    bridge = Preflight(load_config("room"), make_links, 0).items(3 * S)
-    motive = Preflight(load_config("room", [MOTIVE]), make_links, 0).items(3 * S)
+    bridge = Preflight(load_config("room-hahn-stursberg"), make_links, 0).items(3 * S)
+    motive = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0).items(3 * S)
     hints = [next(one.hint for one in items if one.name == "positions") for items in (bridge, motive)]
     assert "VISION_POSITION_ESTIMATE" in hints[0] and "Motive" not in hints[0]
     assert "Motive track the body" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
@@ -284,7 +284,7 @@ def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
 
 def told_by_motive(*place: float) -> Preflight:
     """Motive's metres, sent with the axes of another up."""
-    flight, peer = Preflight(load_config("room", [MOTIVE]), make_links, 0), Peer(246, 197)
+    flight, peer = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0), Peer(246, 197)
     level = (
         20,
         12,
@@ -366,7 +366,7 @@ def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) ->
 
 @given(st.lists(st.binary(max_size=64), max_size=30))
 def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
-    flight = Preflight(load_config("room"), make_links, 0)
+    flight = Preflight(load_config("room-hahn-stursberg"), make_links, 0)
     for n, data in enumerate(chunks):
         flight.receive("vehicle" if n % 2 else "mocap", data, n * MS)
         list(flight.tick(n, n * MS))

@@ -124,7 +124,7 @@ OTHERS: dict[int, dict[str, tuple[int, ...]]] = {
 @pytest.mark.parametrize("autopilot", [3, 12])
 @pytest.mark.parametrize("relay", ["false", "true"])
 def test_a_value_is_good_just_when_it_is_what_the_words_want(autopilot: int, relay: str) -> None:
-    config = load_config("room", [f"relay.enabled={relay}"])
+    config = load_config("room-hahn-stursberg", [f"relay.enabled={relay}"])
     judged, kinds = 0, set()
     for others in product(*OTHERS[autopilot].values()):
         told = dict(zip(OTHERS[autopilot], map(float, others), strict=True))

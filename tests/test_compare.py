@@ -98,7 +98,10 @@ def test_the_simulator_s_start() -> None:
     paper = load("paper")
     given = spec("paper")
     np.testing.assert_array_equal(start_state(paper.config, given.plant), START)
-    room = start_state(load("room", ("sim.start_velocity_mps=[0.1, 0.2, 0.3]",)).config, spec("room").plant)
+    room = start_state(
+        load("room-hahn-stursberg", ("sim.start_velocity_mps=[0.1, 0.2, 0.3]",)).config,
+        spec("room-hahn-stursberg").plant,
+    )
     np.testing.assert_array_equal(room, [-2.4, 0.1, 0.0, -1.9, 0.2, 0.0, -0.7, 0.3, 0.0])
 
 

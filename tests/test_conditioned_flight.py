@@ -27,13 +27,14 @@ FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'
 
 @pytest.fixture(scope="module")
 def flight() -> Memory:
-    return lockstep("room", 16.0, SCHEME, "sim.seed=4")
+    return lockstep("room", 30.0, "sim.seed=4")
 
 
 def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
     plans = flight.of(Plan)
     assert {plan.method for plan in plans} == {METHOD}
     assert {plan.status for plan in plans} == {SolveStatus.OPTIMAL}
+    # Most of them on the way, at the limit of speed: the bias that moves meanwhile is in no margin.
     assert sum(bool(plan.gave_way) for plan in plans) <= 0.05 * len(plans)
     assert {decision.mode for decision in flight.of(Decision)} <= {ControlMode.WAIT, ControlMode.TRACK}
     target = np.array(load_config("room").target.position_m)
@@ -50,9 +51,10 @@ def test_the_setpoints_play_the_plans_out(flight: Memory) -> None:
         assert len(plans[one.plan_seq].inputs) > one.plan_index
 
 
-def test_what_is_planned_has_arrived_by_the_end_of_its_step(flight: Memory) -> None:
-    """The gate limits setpoints within a step; none is left behind the plan at its last tick."""
-    config = load_config("room")
+def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
+    """The gate limits setpoints within a step of several ticks; none is left behind the plan at its last tick."""
+    flight = lockstep("room-hahn-stursberg", 16.0, SCHEME, "sim.seed=4")
+    config = load_config("room-hahn-stursberg")
     ticks = round(config.plant.dt_s / config.daemon.tick_s)
     plans, setpoints = {plan.seq: plan for plan in flight.of(Plan)}, {one.at_ns: one for one in flight.of(Setpoint)}
     moving = 0
@@ -66,21 +68,21 @@ def test_what_is_planned_has_arrived_by_the_end_of_its_step(flight: Memory) -> N
 
 
 def test_a_flight_replays_bit_for_bit(flight: Memory) -> None:
-    config = load_config("room", ["duration_s=16.0", SCHEME, "sim.seed=4"])
+    config = load_config("room", ["duration_s=30.0", "sim.seed=4"])
     assert replay(flight.entries, lambda sink: make_loop(config, sink)).identical
 
 
 def test_a_fence_that_closes_in_is_kept() -> None:
-    found = lockstep("room", 20.0, SCHEME, FENCE, "target.position_m=[1.5,1.0,-1.2]")
+    found = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
     assert max(truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 14e9) < 1.2
     last = found.of(Plan)[-1]
-    assert last.reference[0] < 1.18  # the target itself is outside
+    assert last.reference[0] < 1.2  # the target itself is outside
     assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
 
 
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
-    config = load_config("room", [SCHEME])
-    conditioned, design = build_conditioned(config), build_design(load_config("room"))
+    config = load_config("room")
+    conditioned, design = build_conditioned(config), build_design(load_config("room-hahn-stursberg"))
     ours, theirs = resting(conditioned), resting(design)
     rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
     assert (ours[rows] > theirs[rows] + 0.1).all()
@@ -142,7 +144,7 @@ def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path)
 
 def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
     file = tmp_path / "fast.toml"
-    given = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "smpc.horizon=24"]
+    given = ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "smpc.horizon=24"]
     text = CAMPAIGN.partition("[[controller]]")[0].replace("paper", "room")
     asked = f'{text}set = {given}\n[[controller]]\nname = "ours"\nkind = "smpc"\n'.replace("'", '"')
     file.write_text(asked, encoding="utf-8")

@@ -39,11 +39,11 @@ def changed(old: str, new: str) -> str:
 
 
 def test_presets_load_and_have_the_numbers_of_the_paper() -> None:
-    assert presets() == ("paper", "room", "room-ardupilot", "room-px4")
+    assert presets() == ("paper", "room", "room-ardupilot", "room-hahn-stursberg", "room-px4")
     paper = load_config("paper")
     assert paper.plant.a[0] == (1.0, 0.79, 0.0, 0.0)
     assert (paper.smpc.horizon, paper.smpc.tau, paper.schedule.delays) == (12, 4, 5)
-    assert load_config("room").plant.axes == ("north", "east", "down")
+    assert load_config("room-hahn-stursberg").plant.axes == ("north", "east", "down")
 
 
 def test_a_file_is_the_same_as_the_preset(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_a_file_is_the_same_as_the_preset(tmp_path: Path) -> None:
     assert load_config(str(file)) == load_config("paper")
 
 
-@pytest.mark.parametrize("preset", ["paper", "room"])
+@pytest.mark.parametrize("preset", ["paper", "room-hahn-stursberg"])
 def test_dumped_text_gives_an_equal_configuration(preset: str) -> None:
     config = load_config(preset, ["link.blackout=[[1, 2.5]]", "link.loss=0.1", "estimator.position_std_m=1e-7"])
     assert parse(dump_config(config), "dump").config == config
@@ -185,7 +185,7 @@ def test_all_problems_come_at_once() -> None:
 
 def test_shapes_of_drag_lag_are_checked() -> None:
     with pytest.raises(ConfigError) as caught:
-        load("room", ["plant.lag_s=[0.2]", "plant.gain=[1, 1, 0]", "plant.drag_1ps=[-0.1, 0, 0]"])
+        load("room-hahn-stursberg", ["plant.lag_s=[0.2]", "plant.gain=[1, 1, 0]", "plant.drag_1ps=[-0.1, 0, 0]"])
     reasons = "\n".join(caught.value.problems)
     assert "plant.lag_s: has 1 entries, number of axes = 3" in reasons
     assert "plant.gain: [1.0, 1.0, 0.0] is out of range" in reasons

@@ -28,7 +28,7 @@ class Bench:
     """Virtual time with the simulated peers behind the daemon's connections."""
 
     def __init__(self, *overrides: str) -> None:
-        self.config = load_config("room", overrides)
+        self.config = load_config("room-hahn-stursberg", overrides)
         self.memory = Memory()
         self.loop = make_loop(self.config, self.memory)
         self.now_ns = 1

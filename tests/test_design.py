@@ -43,7 +43,7 @@ def test_design_of_the_paper() -> None:
 
 
 def test_design_of_the_room_fits_around_its_target() -> None:
-    design = make_design(spec("room"))
+    design = make_design(spec("room-hahn-stursberg"))
     assert design.target.tolist() == [1.5, 0.0, 0.0, 1.0, 0.0, 0.0, -1.2, 0.0, 0.0]
     assert all(check.ok for check in design.assumptions)
     assert design.assumptions[0].value == pytest.approx(1.0 - 0.3 ** (design.terminal.tau + 1))
@@ -161,10 +161,15 @@ def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPat
     [
         ("paper", {"tau": 12}, "smpc.tau", r"N = 0 free steps of the horizon H = 12.* takes 2"),
         ("paper", {"tau": 11}, "smpc.tau", r"N = 1 free steps"),
-        ("room", {"tau": 10}, "smpc.tau", r"N = 2 free steps .* takes 3"),
+        ("room-hahn-stursberg", {"tau": 10}, "smpc.tau", r"N = 2 free steps .* takes 3"),
         ("paper", {"tau": 3, "delays": 5, "delta_tau": 0.995}, "smpc.delta_tau", r"Assumption 4\.1 fails.*0\.9919"),
         ("paper", {"target_m": (0.0, 4.0, 0.0)}, "target.position_m", r"Assumption 4\.3 fails.*16\.4076, limit 16"),
-        ("room", {"target_m": (1.5, 1.0, -0.1)}, "target.position_m", r"Assumption 4\.3 fails.*limit 0\.1"),
+        (
+            "room-hahn-stursberg",
+            {"target_m": (1.5, 1.0, -0.1)},
+            "target.position_m",
+            r"Assumption 4\.3 fails.*limit 0\.1",
+        ),
         ("paper", {"k_tau": -np.eye(2, 4)}, "smpc.k_tau", r"Assumption 4\.2"),
         ("paper", {"delta_x": 0.99}, "smpc.delta_x", r"0\.99 is out of reach.*0\.9831"),
         ("paper", {"link": bernoulli(np.array([0.4]))}, "smpc.delta_x", r"0\.95 is out of reach"),
@@ -179,7 +184,7 @@ def test_a_design_that_cannot_be_is_refused(name: str, changes: dict[str, Any], 
     assert caught.value.exit_code == 2
 
 
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_record_is_json_without_infinity(name: str) -> None:
     design = make_design(spec(name))
     record = json.loads(json.dumps(design_record(design), allow_nan=False))
@@ -200,7 +205,7 @@ def test_record_is_json_without_infinity(name: str) -> None:
     assert set(record["assumptions"][0]) == {"item", "ok", "value", "limit", "text"}
     assert record["spectral_radius"] == design.terminal.spectral_radius
     # 258.6 for each of the paper's two axes; the room's is the least that a static gain leaves.
-    assert record["stationary_cost"] == pytest.approx({"paper": 517.2, "room": 1.2721}[name], rel=5e-4)
+    assert record["stationary_cost"] == pytest.approx({"paper": 517.2, "room-hahn-stursberg": 1.2721}[name], rel=5e-4)
 
 
 def test_record_of_a_design_without_state_limits() -> None:

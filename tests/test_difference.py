@@ -150,7 +150,7 @@ def test_counts_in_another_order_are_the_same_counts() -> None:
 
 
 def test_fields_have_names_and_units() -> None:
-    places = Places(build_plant(load_config("room")))
+    places = Places(build_plant(load_config("room-hahn-stursberg")))
     told = {
         ("/uavctl/estimate", "mean[0]"): ("north position", "m"),
         ("/uavctl/plan", "states[3][4]"): ("east velocity in stage 3", "m/s"),

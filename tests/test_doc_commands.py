@@ -33,7 +33,7 @@ def test_a_design_can_be_made_of_each(line: str) -> None:
     given = [
         (words[place], words[place + 1]) for place in range(len(words) - 1) if words[place] in ("--set", "--config")
     ]
-    config = next((value for name, value in given if name == "--config"), "room")
+    config = next((value for name, value in given if name == "--config"), "room-hahn-stursberg")
     overrides = tuple(value for name, value in given if name == "--set")
     assert build_design(Common(config=config, overrides=overrides).load().config).schedule
 

@@ -33,8 +33,9 @@ def typed(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, st
         (["--goto", "1,2,up"], "give north, east and down"),
         (["--goto", "1,2,nan"], "give north, east and down"),
         (["--goto", "9,0,-1"], "north 9 m is outside"),
-        (["--goto", "0,0,-2.49"], "--goto: down -2.49 m is outside"),  # in the room, but there its set does not fit
-        (["--arm", "--takeoff", "2.45"], "may not rest"),
+        # In the room, but nearer to its ceiling than a plan may rest.
+        (["--goto", "0,0,-2.499"], "--goto: down -2.499 m is outside"),
+        (["--arm", "--takeoff", "2.499"], "may not rest"),
         (["--config", "paper", "--arm", "--takeoff", "1"], "no vertical axis"),
     ],
 )

@@ -34,7 +34,7 @@ from uavctl.flight.estimator import (
     set_input,
     without,
 )
-from uavctl.flight.kalman import Kalman, make_kalman
+from uavctl.flight.kalman import CONTRADICTED, Belief, Kalman, contradicted, felt, make_kalman, predicted, updated
 from uavctl.flight.propagation import make_propagation
 from uavctl.smpc.plant import Plant
 
@@ -81,6 +81,80 @@ def test_a_span_asked_for_again_gives_the_same_bits_and_cannot_be_written_to() -
         for known, new in zip(propagation.over(dt_ns), fresh, strict=True):
             assert known.tobytes() == new.tobytes() and not known.flags.writeable
     assert len(propagation.parts) < 100  # arbitrary stamps do not fill the memory
+
+
+@pytest.mark.parametrize("axes", [("north",), ("north", "east", "down")])
+def test_a_prediction_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...]) -> None:
+    """Recordings replay bit for bit: products may be made in a faster way, and give nothing else."""
+    kalman, _ = make(axes, bias_drift=0.1, bias_max=0.4, inertial_std_mps2=0.2)
+    rng, n_x, n_z = np.random.default_rng(5), kalman.n_x, len(kalman.identity)
+    for _ in range(200):
+        root, u = rng.normal(size=(n_z, n_z)), rng.normal(size=kalman.n_u)
+        mean, cov = rng.normal(size=n_z), root @ root.T * 10.0 ** rng.uniform(-4, 0)
+        begun_ns, at_ns = sorted((START_NS + rng.integers(0, 2 * DT_NS, 2)).tolist())
+        known = Belief(at_ns=begun_ns, captured_ns=begun_ns, mean=mean, cov=cov, felt_ns=begun_ns)
+        found = predicted(kalman, START_NS, known, u, at_ns)
+        now_ns = begun_ns
+        while now_ns < at_ns:
+            end_ns = min(at_ns, START_NS + ((now_ns - START_NS) // DT_NS + 1) * DT_NS)
+            part = np.hstack(kalman.propagation.over(end_ns - now_ns))
+            f, g = part[:, :n_z], part[:, n_z:]
+            mean, cov = f @ mean + g @ u, f @ cov @ f.T
+            cov = 0.5 * (cov + cov.T)
+            if (end_ns - START_NS) % DT_NS == 0:
+                mean[n_x:], cov[:n_x, n_x:], cov[n_x:, :n_x], cov[n_x:, n_x:] = 0.0, 0.0, 0.0, kalman.w
+            now_ns = end_ns
+        assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
+
+
+@pytest.mark.parametrize("axes", [("north",), ("north", "east", "down")])
+def test_an_update_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...]) -> None:
+    kalman, _ = make(axes, bias_drift=0.1, bias_max=0.4, inertial_std_mps2=0.2)
+    rng, n_z = np.random.default_rng(6), len(kalman.identity)
+
+    def joseph(belief: Belief, of_z: Array, off: Array, noise: Array) -> tuple[Array, Array]:
+        ph = belief.cov @ of_z.T
+        gain = np.linalg.solve(of_z @ ph + noise, ph.T).T
+        keep = np.eye(n_z) - gain @ of_z
+        cov = keep @ belief.cov @ keep.T + gain @ noise @ gain.T
+        return belief.mean + gain @ off, 0.5 * (cov + cov.T)
+
+    for _ in range(200):
+        root, u = rng.normal(size=(n_z, n_z)), rng.normal(size=kalman.n_u)
+        belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=rng.normal(size=n_z), cov=root @ root.T)
+        accel = kalman.felt_z @ belief.mean + kalman.felt_u @ u + 0.01 * rng.normal(size=kalman.n_felt)
+        off = accel - kalman.felt_z @ belief.mean - kalman.felt_u @ u
+        mean, cov = joseph(belief, kalman.felt_z, off, np.eye(kalman.n_felt) * 0.2**2)
+        found = felt(kalman, belief, accel, u)
+        assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
+        one = sample(START_NS, position_m=tuple(rng.normal(size=3).tolist()))
+        values = np.array(one.position_m)[list(kalman.axes)]
+        of_z = np.eye(n_z)[kalman.shown[: len(values)]]
+        noise = np.diag([max(one.std_m, kalman.parameters.position_std_m) ** 2] * len(values))
+        mean, cov = joseph(belief, of_z, values - belief.mean[kalman.shown[: len(values)]], noise)
+        found = updated(kalman, belief, one)
+        # Rows picked out of the covariance and a product with them differ in nothing either.
+        assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
+
+
+@pytest.mark.parametrize("axes", [("north",), ("north", "east", "down")])
+def test_a_sample_contradicts_by_its_distance_whether_that_has_to_be_solved_for_or_not(axes: tuple[str, ...]) -> None:
+    kalman, _ = make(axes, bias_drift=0.1, bias_max=0.4, inertial_std_mps2=0.2)
+    rng, n_z, found = np.random.default_rng(7), len(kalman.identity), []
+    index = kalman.shown[: len(axes)]
+    for _ in range(2000):
+        root = rng.normal(size=(n_z, n_z)) * 10.0 ** rng.uniform(-4, 0)
+        belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=rng.normal(size=n_z), cov=root @ root.T)
+        variances = 10.0 ** rng.uniform(-5, -3, len(axes))
+        of_values = belief.cov[np.ix_(index, index)] + np.diag(variances)
+        off = np.linalg.cholesky(of_values) @ rng.normal(size=len(axes)) * 10.0 ** rng.uniform(-1, 1.5)
+        distance = float(off @ np.linalg.inv(of_values) @ off)
+        assert contradicted(kalman, belief, belief.mean[index] + off, variances) == (distance > CONTRADICTED)
+        plain = off @ off <= 0.9 * CONTRADICTED * variances.min()
+        found.append((bool(plain), distance > CONTRADICTED))
+    assert all(found.count(one) > 50 for one in ((True, False), (False, False), (False, True)))
+    broken = np.full(len(axes), np.nan)
+    assert not contradicted(kalman, belief, broken, variances)
 
 
 def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:

@@ -63,7 +63,7 @@ def active(design: Design, x: Array, inputs: Array, answer: Answer) -> Flags:
 @pytest.mark.parametrize("name", PRESETS)
 def test_plans_are_the_solvers_over_the_box_with_the_same_rows_active(name: str) -> None:
     design, rng = case(name).design, np.random.default_rng(11)
-    count = {"paper": 400, "room": 60}[name]  # half of room's box asks for the exact program
+    count = {"paper": 400, "room-hahn-stursberg": 60}[name]  # half of room's box asks for the exact program
     x = np.array([uniform(design, rng) if i % 2 else near(design, rng) for i in range(count)])
     fast, slow = deciders(name)
     decided = fast.decide(x, 0)
@@ -101,7 +101,10 @@ def test_states_of_a_flight_are_answered_without_the_solver(name: str) -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_plans_are_the_solvers_along_closed_loops(name: str) -> None:
     one, rng = case(name), np.random.default_rng(12)
-    start = {"paper": np.array([35.0, -2.0, -20.0, -4.0]), "room": one.design.target + 0.3 * one.design.terminal.k[0]}
+    start = {
+        "paper": np.array([35.0, -2.0, -20.0, -4.0]),
+        "room-hahn-stursberg": one.design.target + 0.3 * one.design.terminal.k[0],
+    }
     x = [state for _ in range(10) for state in closed_loop(one, start[name], 0.3, 50, rng)]
     fast, slow = deciders(name)
     agree(fast.decide(np.array(x), 0), slow.decide(np.array(x), 0))
@@ -109,7 +112,7 @@ def test_plans_are_the_solvers_along_closed_loops(name: str) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_target_far_away_is_answered_alike(seed: int) -> None:
-    one, rng = case("room"), np.random.default_rng(seed)
+    one, rng = case("room-hahn-stursberg"), np.random.default_rng(seed)
     target = equilibrium(one.design, rng)
     shape = (one.design.horizon, one.design.plant.n_u)
     fast, slow = (

@@ -18,7 +18,7 @@ class Flight:
     """A flight in virtual time, either direction of which can be cut."""
 
     def __init__(self, *overrides: str) -> None:
-        config = load_config("room", ['solver.method="exact"', "link.loss=0.0", *overrides])
+        config = load_config("room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", *overrides])
         self.memory = Memory()
         self.loop = make_loop(config, self.memory)
         self.truths: list[Truth] = []

@@ -9,7 +9,8 @@ from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
 from soak_rig import prepared_for
 
-from uavctl.cli.prepare import Prepared
+from uavctl.build import design_of
+from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 
@@ -30,7 +31,15 @@ def prepared() -> Prepared:
 def world(request: pytest.FixtureRequest) -> Config:
     """The preset from its start, where plans begin at once; nothing is lost unless a fault says so."""
     plant, autopilot = request.param
-    return load_config("room", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"])
+    return load_config(
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"]
+    )
+
+
+@pytest.fixture(scope="module")
+def as_flown() -> Prepared:
+    config = load_config("room")
+    return prepare(config, design_of(config))
 
 
 def with_faults(config: Config, *faults: FaultConfig) -> Config:
@@ -71,13 +80,37 @@ def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_noth
     prepared: Prepared, seed: int
 ) -> None:
     """The link loses the value when it is new, and so what comes first of it is stale already."""
-    config = load_config("room", ["sim.camera.message=vision", "link.loss=0.3", f"sim.seed={seed}"])
+    config = load_config("room-hahn-stursberg", ["sim.camera.message=vision", "link.loss=0.3", f"sim.seed={seed}"])
     frozen = with_faults(config, FaultConfig(at_s=1.3, kind="frozen", for_s=20.0))
     flight = bounded(fly_true(prepared, frozen, flight_s=14.0, own_motion=False))
     # It flies on the stale value until that comes again, and drifts the faster for it.
     assert flight.outside_m <= 0.7
     blackout = with_faults(config, FaultConfig(at_s=1.3, kind="blackout", for_s=20.0))
     assert bounded(fly_true(prepared, blackout, flight_s=14.0, own_motion=False)).outside_m <= 0.0
+
+
+@pytest.mark.fault(14, 15)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize(
+    ("fault", "moved_m"),
+    [
+        (FaultConfig(at_s=0.3, kind="frozen", for_s=30.0), 5.0),
+        (FaultConfig(at_s=2.0, kind="frozen", for_s=30.0), 5.0),
+        (FaultConfig(at_s=0.0, kind="frame", name="swapped"), MOVED_M / 2),
+        (FaultConfig(at_s=2.0, kind="frame", name="turned-180"), MOVED_M),
+        (FaultConfig(at_s=5.0, kind="drift", velocity_mps=(0.0, 0.0, 0.3)), MOVED_M),
+    ],
+    ids=lambda one: f"{one.kind}-{one.at_s}" if isinstance(one, FaultConfig) else "",
+)
+def test_as_delivered_the_preset_stays_near_the_room_too(
+    as_flown: Prepared, autopilot: str, fault: FaultConfig, moved_m: float
+) -> None:
+    """Plans of the age-conditioned scheme in steps of a tick; from 0.3 s on it may brake for as far as it has gone."""
+    config = load_config("room", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"])
+    flight = bounded(fly_true(as_flown, with_faults(config, fault), flight_s=14.0))
+    assert flight.moved_m < moved_m
+    assert flight.outside_m <= 0.3
+    assert flight.alarms and "LAND" in flight.ended
 
 
 @pytest.mark.fault(15, 45)
@@ -161,7 +194,7 @@ def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: floa
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.fault(41)
 def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str) -> None:
-    config = load_config("room", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])
+    config = load_config("room-hahn-stursberg", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])
     gale = FaultConfig(at_s=6.0, kind="wind", velocity_mps=(9.0, 0.0, 0.0))
     flight = fly_true(prepared, with_faults(config, gale))
     assert flight.ended in ("AUTO.LAND", "LAND")

@@ -14,7 +14,7 @@ from uavctl.flight.step import StepOutput, initial_state, step
 
 def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], NDArray[np.float64]]:
     """A camera sample a Δt with noise, 30 % loss, 30 to 70 ms of delay; truth (steps + 1, n_x) at the boundaries."""
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     controller = build_controller(config)
     plant = controller.plant
     rng = np.random.default_rng(seed)
@@ -44,7 +44,7 @@ def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], N
 
 def test_room_reaches_the_target_within_its_limits_over_a_link_with_losses_and_delay() -> None:
     inputs, outputs, truth = fly(seconds=14.0, seed=4)
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     assert np.linalg.norm(truth[-20:, [0, 3, 6]] - config.target.position_m, axis=1).max() < 0.35
     assert (truth >= np.array(config.sets.state_lower)).all()
     assert (truth <= np.array(config.sets.state_upper)).all()

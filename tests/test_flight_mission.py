@@ -1,4 +1,4 @@
-"""Flights of preset `room` with a mission, over the real bytes: waypoints, a trajectory, a fence that closes in."""
+"""Flights of the printed scheme with a mission, over real bytes: waypoints, a trajectory, a fence that closes in."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def as_waypoints(seconds: float) -> tuple[str]:
 
 @cache
 def flown(seconds: float, *overrides: str) -> Memory:
-    return lockstep("room", seconds, *overrides)
+    return lockstep("room-hahn-stursberg", seconds, *overrides)
 
 
 def steps(memory: Memory) -> list[tuple[Decision, Truth]]:
@@ -75,7 +75,7 @@ def beyond_limits(memory: Memory) -> tuple[Array, Array]:
     State limits share one price: a fence that shuts the vehicle out may make it faster than it should be, too. A limit
     that gives way keeps none of its chance: there the state may be off by a back-off more than the mean was moved.
     """
-    room = build_design(load_config("room")).state_set
+    room = build_design(load_config("room-hahn-stursberg")).state_set
     plans = {plan.seq: plan for plan in memory.of(Plan)}
     told = steps(memory)
     beyond = np.array([truth.state for _, truth in told[1:]]) @ room.c.T - room.b
@@ -105,7 +105,7 @@ def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: 
     beyond, given = beyond_limits(memory)
     assert (beyond <= given).all()
     assert overrides == SHUT_OUT or not given.any()
-    config = load_config("room", [f"duration_s={seconds}", *overrides])
+    config = load_config("room-hahn-stursberg", [f"duration_s={seconds}", *overrides])
     result = replay(memory.entries, partial(make_loop, config))
     assert result.identical, result.first_difference
 
@@ -217,7 +217,7 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
     data = flight(flown(22.0, *WAYPOINTS))
     assert summarise(data, wall_s=1.0).state_violations == 0
     fence = 'fence=[{state="north",side="upper",times_s=[0],values=[1.0]}]'
-    header = msgspec.structs.replace(data.header, config_toml=dump_config(load_config("room", [fence])))
+    header = msgspec.structs.replace(data.header, config_toml=dump_config(load_config("room-hahn-stursberg", [fence])))
     fenced = replace(data, header=header)
     beyond = fenced.steps.state[:, 0] - 1.0
     summary = summarise(fenced, wall_s=1.0)

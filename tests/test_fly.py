@@ -20,27 +20,18 @@ from loopback_rig import make_loop
 from operation_rig import ended
 
 from logs.reader import read, records
-from logs.replay import recorded_library, replay
-from uavctl.build import build_design
+from logs.replay import replay
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.load import parse
 from uavctl.control_messages import daemon_name
 from uavctl.control_socket import listening
 from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
-from uavctl.library_bytes import decode
-from uavctl.library_store import library_for
 from uavctl.lock import lock_paths, sole_daemon
 
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 SOURCE = Path(__file__).parent / "foreign_source.py"
 LIMIT_S = 180.0  # for what is stuck, not for what is slow: a machine may have much else to do
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _library() -> None:
-    """The daemons find the policy library in the cache, so that their time limits are for flying."""
-    library_for(build_design(load_config("room")))
 
 
 @pytest.fixture
@@ -160,8 +151,7 @@ def test_the_hand_over_ends_in_zero(flown: Flown) -> None:
 def test_the_recording_replays_identically(flown: Flown) -> None:
     header = next(records(flown[3], Header))
     config = parse(header.config_toml, "recording").config
-    library = decode(recorded_library(flown[3]).data).library
-    result = replay(read(flown[3]), lambda sink: make_loop(config, sink, library=library))
+    result = replay(read(flown[3]), lambda sink: make_loop(config, sink))
     assert result.identical, result.first_difference
     assert result.decisions > 200
 

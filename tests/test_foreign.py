@@ -179,7 +179,16 @@ def test_frame_length_needs_a_head() -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "a.mcap", rows_of(TLOGS[0]))
-    arguments = ["log", "replay", str(path), "--json", "--set", "solver.method=exact"]
+    arguments = [
+        "log",
+        "replay",
+        str(path),
+        "--json",
+        "--config",
+        "room-hahn-stursberg",
+        "--set",
+        "solver.method=exact",
+    ]
     assert run(arguments) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["positions"] == by_tlog(TLOGS[0]).positions

@@ -17,7 +17,7 @@ TICK_NS = 50_000_000
 class Flight:
     """A flight in virtual time with somebody who watches."""
 
-    def __init__(self, name: str = "room", *overrides: str) -> None:
+    def __init__(self, name: str = "room-hahn-stursberg", *overrides: str) -> None:
         config = load_config(name, ['solver.method="exact"', *overrides])  # no library has to be made
         self.loop = make_loop(config, Memory())
         self.peers = Peers(config, 0)
@@ -52,7 +52,7 @@ def test_before_the_first_tick_nothing_is_known_and_nothing_fails() -> None:
 
 
 def test_a_flight_in_figures() -> None:
-    flight = Flight("room", "link.loss=0.0")
+    flight = Flight("room-hahn-stursberg", "link.loss=0.0")
     health = flight.run(200, lateness_ns=700_000)
     assert health.mode is ControlMode.TRACK and health.running_s == 199 * TICK_NS * 1e-9
     estimate, decision = flight.loop.estimate, flight.loop.decision

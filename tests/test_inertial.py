@@ -30,6 +30,8 @@ from flight_rig import (
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from uavctl.build import build_estimator, build_plant
+from uavctl.config import load_config
 from uavctl.data import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import back_mps2, place, reckons
@@ -47,7 +49,18 @@ from uavctl.flight.estimator import (
     set_input,
 )
 from uavctl.flight.fallback import End, Fallback
-from uavctl.flight.kalman import DOUBTED_NS, REFUSED, Belief, Kalman, felt, make_kalman
+from uavctl.flight.kalman import (
+    DOUBTED_NS,
+    REFUSED,
+    UNFELT_DRIFT,
+    UNFELT_NS,
+    Belief,
+    Kalman,
+    felt,
+    first_belief,
+    make_kalman,
+    predicted,
+)
 from uavctl.flight.step import StepOutput, initial_state, step
 
 Array = NDArray[np.float64]
@@ -132,6 +145,7 @@ def known(kalman: Kalman, history: History, at_ns: int) -> tuple[Array, Array]:
 
 def test_equals_conditioning_positions_and_accelerations_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("uavctl.flight.kalman.FELT_SIGMA", math.inf)  # all of them are to count
+    monkeypatch.setattr("uavctl.flight.kalman.UNFELT_DRIFT", 1.0)  # one noise throughout
     kalman = make()
     places = {START_NS + t * MS: p for t, p in ((30, 0.10), (200, 0.14), (415, 0.13), (700, 0.2))}
     accels = {START_NS + t * MS: a for t, a in ((75, 0.1), (130, 0.12), (260, -0.1), (350, 0.3), (610, 0.2))}
@@ -256,7 +270,10 @@ def test_one_that_cannot_be_is_left_out_and_no_reason_for_doubt() -> None:
     assert max(abs(float(belief.mean[1])) for belief in beliefs) < 0.05
 
 
-def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_so() -> None:
+def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("uavctl.flight.kalman.UNFELT_DRIFT", 1.0)  # as fast in doubt as without
     kalman = make()
 
     def told(*, lies: bool, late: bool) -> Belief:
@@ -463,3 +480,24 @@ def test_a_fallback_that_ends_holds_by_nothing() -> None:
     assert back_mps2(recover, lied, controller) == (0.0, 0.0, 0.0)
     later = msgspec.structs.replace(tick, belief=belief_at(kalman, history, START_NS + 300 * MS))
     assert back_mps2(recover, later, controller) == (0.0, 0.0, 0.0)  # the data are too old
+
+
+def test_a_bias_drifts_slowly_while_no_inertial_data_are_used() -> None:
+    """A tenth as fast as configured: before the first of them, a second after the last, and in doubt."""
+    config = load_config("room")
+    believed, dt_ns = build_estimator(config), round(config.plant.dt_s * 1e9)
+    kalman = make_kalman(build_plant(config), believed, dt_ns)
+    first = first_belief(kalman, sample(0))
+    step = believed.bias_drift**2 * config.plant.dt_s
+    quiet, seconds = UNFELT_DRIFT**2 * step, UNFELT_NS // dt_ns
+
+    def gained(steps: int, **known: int) -> float:
+        """By the variance of a bias in whole steps; the first of them has no drift of its own yet."""
+        belief = msgspec.structs.replace(first, **known)
+        after = predicted(kalman, 0, belief, np.zeros(kalman.n_u), steps * dt_ns)
+        return float(after.cov[kalman.bias.start, kalman.bias.start] - (0.25 * believed.bias_max) ** 2)
+
+    assert gained(11) == pytest.approx(11 * quiet)
+    assert gained(11, felt_ns=0) == pytest.approx(quiet + 10 * step)
+    assert gained(11, felt_ns=0, doubted_ns=0) == pytest.approx(11 * quiet)
+    assert gained(3 * seconds, felt_ns=0) == pytest.approx(quiet + seconds * step + (2 * seconds - 1) * quiet)

@@ -259,7 +259,7 @@ def test_who_flies_by_it_tells_it_from_the_start() -> None:
 
 def test_the_linear_plant_cannot_fly_by_it() -> None:
     with pytest.raises(ConfigError) as caught:
-        load_config("room", [FLOWN])
+        load_config("room-hahn-stursberg", [FLOWN])
     assert 'sim.inertial.flown: has no effect with plant "linear"' in caught.value.problems[0]
 
 

@@ -46,7 +46,11 @@ def test_figures_of_a_flight(tmp_path: Path) -> None:
     assert found.bytes == path.stat().st_size
     assert "closed in order" in shown(found)
     assert found.origin is not None
-    assert (found.origin.config, found.origin.seed, found.origin.command) == ("room", 7, "uavctl loopback")
+    assert (found.origin.config, found.origin.seed, found.origin.command) == (
+        "room-hahn-stursberg",
+        7,
+        "uavctl loopback",
+    )
 
 
 def test_a_topic_that_begins_late_or_falls_silent_has_a_gap_there(tmp_path: Path) -> None:

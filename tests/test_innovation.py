@@ -35,7 +35,7 @@ START = np.array([-2.4, 0, 0, -1.9, 0, 0, -0.7, 0, 0])
 
 def room(sample_age_s: float = 0.2) -> Design:
     form = innovations(ROOM, STD_M, sample_age_s, losses=5)
-    return make_design(replace(spec("room"), plant=form.plant, estimate_cov=form.estimate_cov))
+    return make_design(replace(spec("room-hahn-stursberg"), plant=form.plant, estimate_cov=form.estimate_cov))
 
 
 def kalman(plant: Plant) -> Kalman:
@@ -145,7 +145,7 @@ def test_back_offs_of_the_first_stages_are_honest() -> None:
     design = room()
     beliefs, places, states = arrivals(0.3, 6000, 100_000_000, seed=3)
     answer = ConicSolver(design).solve(0, START, design.target)
-    blind = ConicSolver(make_design(spec("room"))).solve(0, START, design.target)
+    blind = ConicSolver(make_design(spec("room-hahn-stursberg"))).solve(0, START, design.target)
     upper = [row for row in range(design.state_set.b.size) if design.state_set.c[row].sum() > 0]
     shown = np.argmax(design.state_set.c[upper], axis=1)
     for t in (1, 2, 3):
@@ -169,7 +169,7 @@ def test_a_room_keeps_its_three_components_and_its_terminal_margin() -> None:
     design = room()
     assert [component.states.tolist() for component in decompose(design)] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
     assert check_schedule(design) == pytest.approx(0.05176, abs=1e-4)
-    assert check_schedule(make_design(spec("room"))) == pytest.approx(0.05241, abs=1e-4)
+    assert check_schedule(make_design(spec("room-hahn-stursberg"))) == pytest.approx(0.05241, abs=1e-4)
 
 
 def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
@@ -224,7 +224,7 @@ def test_a_disturbed_state_that_no_position_shows_is_refused() -> None:
 
 
 def test_a_configuration_plans_with_one_plant_and_estimates_with_the_other() -> None:
-    config = load_config("room", ["risk.estimate=innovations"])
+    config = load_config("room-hahn-stursberg", ["risk.estimate=innovations"])
     design, controller, plant = build_design(config), build_controller(config), build_plant(config)
     np.testing.assert_array_equal(controller.plant.e, plant.e)
     np.testing.assert_array_equal(controller.plant.w, plant.w)
@@ -234,7 +234,7 @@ def test_a_configuration_plans_with_one_plant_and_estimates_with_the_other() -> 
     np.testing.assert_array_equal(design.estimate_cov, form.estimate_cov)
     np.testing.assert_array_equal(design.plant.e, form.plant.e)
     # Ten positions a second, 0.07 s on their way at most: the newest is 0.17 s old at most.
-    often = build_spec(load_config("room", ["risk.estimate=innovations", "source.rate_hz=10"]))
+    often = build_spec(load_config("room-hahn-stursberg", ["risk.estimate=innovations", "source.rate_hz=10"]))
     np.testing.assert_array_equal(often.estimate_cov, innovations(plant, 0.005, 0.17, 5, drift).estimate_cov)
 
 
@@ -243,4 +243,4 @@ def test_exact_plans_with_the_plant_itself() -> None:
     assert made.estimate_cov is None
     np.testing.assert_array_equal(make_design(made).estimate_cov, np.zeros((4, 4)))
     assert load_config("paper").risk.estimate == "exact"
-    assert load_config("room").risk.estimate == "innovations"
+    assert load_config("room-hahn-stursberg").risk.estimate == "innovations"

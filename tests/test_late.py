@@ -151,7 +151,7 @@ def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
     assert solver.solve(0, x, target, Outlook(late=3)).status is SolveStatus.FAILED
 
 
-@pytest.mark.parametrize("preset", ["paper", "room"])
+@pytest.mark.parametrize("preset", ["paper", "room-hahn-stursberg"])
 def test_back_offs_grow_with_the_age(preset: str) -> None:
     """Of every state row, in every stage before the feedback sets in."""
     asked = spec(preset)
@@ -208,7 +208,7 @@ def test_an_age_without_a_design_is_named() -> None:
 def test_delays_of_a_step_and_more_ask_for_late_designs(
     overrides: list[str], steps: int, tail: list[float] | None
 ) -> None:
-    config = load_config("room", ["link.loss=0.1", *overrides])
+    config = load_config("room-hahn-stursberg", ["link.loss=0.1", *overrides])
     assert late_steps(config) == steps
     link = build_delayed_link(config)
     if tail is None:
@@ -244,7 +244,7 @@ CAMERAS = [
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overrides: list[str]) -> None:
     """With one captured at each boundary, the longest way, it is the age that comes about."""
-    config = load_config("room", ["smpc.scheme=age-conditioned", *overrides])
+    config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides])
     link, measured = build_delayed_link(config), silent(config, 0.0, 6)
     promised = np.array([link.outage(step) for step in range(7)])
     assert np.all(np.abs(measured - promised) <= 5.0 * np.sqrt(promised * (1.0 - promised) / 40_000) + 1e-12)
@@ -263,8 +263,8 @@ def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overri
     ],
 )
 def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: float) -> None:
-    config = load_config("room", ["smpc.scheme=age-conditioned", *overrides])
-    one_a_step = load_config("room", ["smpc.scheme=age-conditioned", *overrides, "source.rate_hz=0"])
+    config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides])
+    one_a_step = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides, "source.rate_hz=0"])
     link, measured = build_delayed_link(config), silent(config, phase, 6)
     promised = np.array([link.outage(step) for step in range(7)])
     assert np.all(measured <= promised + 5.0 * np.sqrt(promised * (1.0 - promised) / 40_000) + 1e-12)
@@ -275,7 +275,7 @@ def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: floa
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides: list[str], phase: float) -> None:
     """A link's model is of the longest ways: the budget of an age that it has not must not be a licence."""
-    config = load_config("room", ["smpc.scheme=age-conditioned", "smpc.horizon=48", *overrides])
+    config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", "smpc.horizon=48", *overrides])
     risk = build_conditioned(config).solver.risk
     measured = silent(config, phase, 12)
     spent = (measured[:-1] - measured[1:]) @ risk.budgets[:12] + measured[-1]
@@ -294,13 +294,13 @@ def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides:
 )
 def test_delays_that_no_design_stands_are_refused(overrides: list[str], key: str, figures: str) -> None:
     with pytest.raises(DesignError, match=figures) as caught:
-        build_design(load_config("room", overrides))
+        build_design(load_config("room-hahn-stursberg", overrides))
     assert caught.value.key == key
 
 
 def test_the_printed_solver_is_for_what_it_knows() -> None:
     for overrides in (["schedule.late=1", "risk.estimate=exact"], ["risk.estimate=innovations"]):
-        config = load_config("room", ["solver.method=printed", *overrides])
+        config = load_config("room-hahn-stursberg", ["solver.method=printed", *overrides])
         with pytest.raises(DesignError) as caught:
             build_solver(build_design(config), config)
         assert caught.value.key == "solver.method"
@@ -313,11 +313,11 @@ LATE_LINK = (*LATE, "solver.method=exact")
 
 @pytest.fixture(scope="module")
 def late_flight() -> Memory:
-    return lockstep("room", 12.0, *LATE_LINK)
+    return lockstep("room-hahn-stursberg", 12.0, *LATE_LINK)
 
 
 def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) -> None:
-    config = load_config("room", list(LATE_LINK))
+    config = load_config("room-hahn-stursberg", list(LATE_LINK))
     design = build_design(config)
     solver = ConicSolver(design)
     ages = {decision.step: decision.age_steps for decision in late_flight.of(Decision) if decision.boundary}
@@ -336,7 +336,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
 
 
 def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> None:
-    config = load_config("room", list(LATE_LINK))
+    config = load_config("room-hahn-stursberg", list(LATE_LINK))
     lower, upper = np.array(config.sets.state_lower), np.array(config.sets.state_upper)
     data = flight(late_flight)
     positions = np.array([truth.position_m for truth in data.truths])
@@ -347,16 +347,16 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 
 
 def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
-    config = load_config("room", ["duration_s=12.0", *LATE_LINK])
+    config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE_LINK])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
 
 
 def test_a_flight_on_late_positions_with_a_library() -> None:
     """Every plan comes from the late policies, with a certificate that the exact program confirms."""
-    design = build_design(load_config("room", list(LATE)))
+    design = build_design(load_config("room-hahn-stursberg", list(LATE)))
     library = make_library(design, most=12)
     assert [len(parts) for parts in library.variants] == [3, 3, 3]
-    memory, solver = lockstep("room", 12.0, *LATE, library=library), ConicSolver(design)
+    memory, solver = lockstep("room-hahn-stursberg", 12.0, *LATE, library=library), ConicSolver(design)
     plans = memory.of(Plan)
     assert len(plans) > 40
     assert {plan.method for plan in plans} == {"frozen", "mixture"}
@@ -366,5 +366,5 @@ def test_a_flight_on_late_positions_with_a_library() -> None:
         assert exact.status is SolveStatus.OPTIMAL
         assert plan.cost_lower <= exact.cost * (1.0 + 1e-7)
         assert exact.cost <= plan.cost * (1.0 + 1e-7)
-    config = load_config("room", ["duration_s=12.0", *LATE])
+    config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE])
     assert replay(memory.entries, lambda sink: make_loop(config, sink, design, library)).identical

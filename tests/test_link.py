@@ -91,7 +91,7 @@ def test_useless_samples_are_counted(data: bytes, reason: str) -> None:
     found = samples(link.receive(data, NOW))
     assert link.stats(NOW).bad == {reason: 1}
     # What is absurd is refused by the controller, which has to know how long a source says nothing else.
-    limits = build_estimator(load_config("room"))
+    limits = build_estimator(load_config("room-hahn-stursberg"))
     assert [refusal(one, NOW, limits) for one in found] == (["sample-invalid"] if reason == "absurd" else [])
 
 

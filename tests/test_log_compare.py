@@ -33,12 +33,12 @@ EXACT = "solver.method=exact"
 
 @pytest.fixture(scope="module")
 def base() -> Memory:
-    return lockstep("room", SECONDS, EXACT)
+    return lockstep("room-hahn-stursberg", SECONDS, EXACT)
 
 
 @pytest.fixture(scope="module")
 def other() -> Memory:
-    return lockstep("room", SECONDS, EXACT, "sim.seed=3", "link.loss=0.25")
+    return lockstep("room-hahn-stursberg", SECONDS, EXACT, "sim.seed=3", "link.loss=0.25")
 
 
 def record(path: Path, entries: Sequence[tuple[str, int, Record]]) -> Path:

@@ -24,7 +24,7 @@ class Rig:
     """The loop against the simulated peers; the vehicle's heartbeats can be replaced by ones of our own."""
 
     def __init__(self, *overrides: str) -> None:
-        self.config = load_config("room", overrides)
+        self.config = load_config("room-hahn-stursberg", overrides)
         self.memory = Memory()
         self.loop = make_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0)

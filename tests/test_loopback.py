@@ -48,8 +48,8 @@ def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.
 
 
 def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    library_for(build_design(load_config("room")))
-    found = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room")
+    library_for(build_design(load_config("room-hahn-stursberg")))
+    found = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room-hahn-stursberg")
     assert found["steps"] >= 15
     # Not its states: where the machine stood still, the vehicle flew on as it was told last.
     assert found["input_violations"] == found["recorder_dropped"] == 0

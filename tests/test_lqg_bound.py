@@ -46,7 +46,7 @@ def prices(plant: Plant, q_x: Array, q_u: Array) -> tuple[float, Array, Array]:
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.7, 0.9])
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_independent_losses_are_a_lyapunov_equation(name: str, loss: float) -> None:
     given = problem(name)
     known, price, spread = prices(given.plant, given.q_x, given.q_u)
@@ -123,7 +123,7 @@ def stacked(plant: Plant, steps: int) -> tuple[Array, Array]:
     return of_x, of_u.reshape(steps, plant.n_x, -1)
 
 
-@pytest.mark.parametrize("name", ["paper", "room", "coupled 0"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg", "coupled 0"])
 def test_without_any_news_the_finite_bound_is_a_least_squares_plan_and_the_open_loop_s_spread(name: str) -> None:
     given, steps = problem(name), 9
     plant = given.plant

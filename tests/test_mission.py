@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 DT_NS = 200_000_000
 SECOND_NS = 1_000_000_000
-ROOM = Path("uavctl/presets/room.toml").read_text(encoding="utf-8")
+ROOM = Path("uavctl/presets/room-hahn-stursberg.toml").read_text(encoding="utf-8")
 
 
 def on_a_line(*places_m: float, hold_s: float = 1.0, fences: tuple[Fence, ...] = ()) -> Mission:
@@ -208,11 +208,11 @@ def test_a_mission_is_over_where_its_trajectory_ends_and_after_its_last_waypoint
 def test_the_end_of_a_mission_is_configured_and_needs_something_that_ends() -> None:
     config, design = room_with("mission.waypoints=[[1,1,-1]]", "mission.then=land")
     assert build_mission(config, design, build_rests(design)).land
-    assert not build_mission(load_config("room"), design, build_rests(design)).land
+    assert not build_mission(load_config("room-hahn-stursberg"), design, build_rests(design)).land
     with pytest.raises(ConfigError, match=r"mission\.then.*no end to come after"):
-        load_config("room", ["mission.then=land"])
+        load_config("room-hahn-stursberg", ["mission.then=land"])
     with pytest.raises(ConfigError, match=r"mission\.then"):
-        load_config("room", ["mission.waypoints=[[1,1,-1]]", "mission.then=loiter"])
+        load_config("room-hahn-stursberg", ["mission.waypoints=[[1,1,-1]]", "mission.then=loiter"])
 
 
 def test_a_configured_trajectory_is_over_at_its_last_sample() -> None:
@@ -231,7 +231,7 @@ def circle(seconds: float = 12.0, radius_m: float = 0.9, turn_s: float = 10.0) -
 
 
 def room_with(*overrides: str) -> tuple[Config, Design]:
-    config = load_config("room", list(overrides))
+    config = load_config("room-hahn-stursberg", list(overrides))
     return config, build_design(config)
 
 

@@ -10,7 +10,7 @@ from uavctl.config.load import dump_config, parse
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
 
-ROOM = Path("uavctl/presets/room.toml").read_text(encoding="utf-8")
+ROOM = Path("uavctl/presets/room-hahn-stursberg.toml").read_text(encoding="utf-8")
 
 MISSION = """
 [mission]

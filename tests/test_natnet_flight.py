@@ -29,7 +29,7 @@ from uavctl.library_store import library_for
 @pytest.fixture(scope="module", autouse=True)
 def _library() -> None:
     """The daemon finds the policy library in the cache."""
-    library_for(build_design(load_config("room")))
+    library_for(build_design(load_config("room-hahn-stursberg")))
 
 
 @contextmanager

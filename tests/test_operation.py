@@ -29,7 +29,7 @@ from uavctl.library_store import library_for
 @pytest.fixture(scope="module", autouse=True)
 def _library() -> None:
     """The daemons find the policy library in the cache, so that their time limits are for flying."""
-    library_for(build_design(load_config("room")))
+    library_for(build_design(load_config("room-hahn-stursberg")))
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_a_unit_of_systemd_s_comes_with_the_package() -> None:
     # Where its user's processes look for locks, and where a killed daemon's word stays.
     assert (lines["RuntimeDirectory"], lines["RuntimeDirectoryMode"]) == ("uavctl", "0700")
     assert lines["RuntimeDirectoryPreserve"] == "yes"
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     assert float(lines["TimeoutStopSec"]) > config.fallback.brake_s + config.fallback.hold_s + 10.0
 
 

@@ -251,7 +251,7 @@ def test_orders_and_their_answers_are_replayed_bit_for_bit() -> None:
     assert run(make_controller(), inputs) == run(make_controller(StubSolver(small_plant())), inputs)
 
 
-@pytest.mark.parametrize("preset", ["room", "paper"])
+@pytest.mark.parametrize("preset", ["room-hahn-stursberg", "paper"])
 def test_a_configured_flight_knows_where_it_may_rest(preset: str) -> None:
     config = load_config(preset, ["solver.method=exact"])
     controller = build_controller(config)

@@ -163,8 +163,8 @@ def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
     class Astray:
         """Adds a push in the last input of one plan, and gives up another one."""
 
-        def decide(self, x: Array, late: int) -> Decisions:
-            plans = inner.decide(x, late)
+        def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
+            plans = inner.decide(x, late, cov)
             plans.inputs[0, -1, 1] += 1e-3
             plans.inputs[1, -1, 1] += 1e-3
             plans.solved[1] = False

@@ -61,7 +61,9 @@ def test_the_paper_s_cheapest_policy() -> None:
         assert np.delete(policy.slope, at).tolist() == [0.0] * (len(rows) - 1)
 
 
-@pytest.mark.parametrize("design", [design_of("paper"), design_of("room"), coupled()], ids=["paper", "room", "coupled"])
+@pytest.mark.parametrize(
+    "design", [design_of("paper"), design_of("room-hahn-stursberg"), coupled()], ids=["paper", "room", "coupled"]
+)
 def test_backoffs_and_cost_are_those_of_the_covariances_recursion(design: Design) -> None:
     rng = np.random.default_rng(4)
     for i, part in enumerate(decompose(design)):
@@ -245,7 +247,7 @@ def test_the_best_policy_is_the_exact_program_s(name: str) -> None:
 
 def test_a_proof_that_there_is_no_policy_serves_other_questions_and_harms_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same program for all questions, and with a new one for each."""
-    design = build_design(load_config("room", ["schedule.late=2"])).late[1]
+    design = build_design(load_config("room-hahn-stursberg", ["schedule.late=2"])).late[1]
     part = decompose(design)[2]
     program, region, rng = program_of(design, 2), Region(design, part), np.random.default_rng(11)
     questions = [

@@ -104,7 +104,7 @@ def test_absurd_setpoints_are_limited_and_stay_finite() -> None:
 
 
 def test_it_can_take_the_place_of_the_linear_vehicle() -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     linear = Vehicle(config, np.random.SeedSequence(1), 0)
     one = quadrotor()
     for name in ("model", "now_ns", "grounded", "has_down", "state", "input", "position_m", "velocity_mps"):

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from patience import until
 from recording_fakes import Clock, Disk, flight, own
 from view_rig import flown
 
+import logs.recorder
 from logs.chunks import Message, scan
 from logs.disk import DiskFile, OutputFile
 from logs.journal import Journal
@@ -36,6 +38,17 @@ def test_thread_writes_what_was_put_in_order(tmp_path: Path) -> None:
     assert (status.written, status.waiting, status.dropped, status.refused) == (503, 0, 0, 0)
     assert status.bytes < path.stat().st_size  # the index comes on top
     assert status.segments == (str(path),)
+
+
+def test_the_thread_catches_up_when_it_is_asked_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Right after a tick, so that its rounds are over when the next one begins; of itself it looks far more rarely."""
+    monkeypatch.setattr(logs.recorder, "POLL_S", 1e6)
+    recorder = Recorder(tmp_path / "flight.mcap")
+    for count, (topic, at_ns, record) in enumerate(flight(5), start=1):
+        recorder.put(topic, at_ns, record)
+        recorder.catch_up()
+        until(lambda: not recorder._queue, f"record {count} is taken")
+    assert recorder.close().written == 5 + 3  # its notes
 
 
 def test_name_that_is_taken_is_refused(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ class Indoors:
 
     def __init__(self, name: str, *more: str) -> None:
         self.config = load_config(
-            "room",
+            "room-hahn-stursberg",
             [
                 f"sim.autopilot={name}",
                 "sim.camera.rate_hz=30.0",

@@ -121,7 +121,7 @@ def test_a_recording_without_a_decision_is_not_identical(flown: Memory) -> None:
 
 def test_a_foreign_recording_goes_through_parser_clock_estimator_and_controller() -> None:
     tlog = DATA / "arducopter-vicon.tlog"
-    config = load_config("room", ["daemon.vehicle=tlog", "daemon.mocap=tlog"])
+    config = load_config("room-hahn-stursberg", ["daemon.vehicle=tlog", "daemon.mocap=tlog"])
     packets = [(p.at_ns, p.data) for p in read_tlog(tlog) if not p.outgoing]
     result = replay_tlog(packets, lambda sink: make_loop(config, sink), link=VEHICLE, tick_ns=50_000_000)
     assert result.datagrams == len(packets)

@@ -22,7 +22,7 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
         "px4",
         "ardupilot",
         "preset paper",
-        "preset room",
+        "preset room-hahn-stursberg",
         "simulated quadrotor",
         "solver library",
         "solver exact",

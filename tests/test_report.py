@@ -117,7 +117,7 @@ def test_same_flight_same_page(room_flight: FlightData, room_html: str) -> None:
 
 @pytest.fixture(scope="module")
 def judged_html() -> str:
-    memory = lockstep("room", 14.0, "solver.method=exact", "link.blackout=[[6, 8]]")
+    memory = lockstep("room-hahn-stursberg", 14.0, "solver.method=exact", "link.blackout=[[6, 8]]")
     return html_of(FlightData.from_records(memory.entries))
 
 

@@ -36,7 +36,7 @@ def flight() -> FlightData:
 
 @pytest.fixture(scope="module")
 def short() -> FlightData:
-    return FlightData.from_records(lockstep("room", 2.0, "solver.method=exact").entries)
+    return FlightData.from_records(lockstep("room-hahn-stursberg", 2.0, "solver.method=exact").entries)
 
 
 @contextmanager

@@ -130,7 +130,7 @@ def test_what_went_amiss_is_told() -> None:
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.03])
 def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: float) -> None:
-    config = load_config("room", (f"clock.latency_s={latency_s}",))
+    config = load_config("room-hahn-stursberg", (f"clock.latency_s={latency_s}",))
     found = FlightData.from_records(fly(room(), 4.0, config_toml=dump_config(config)))
     stats = LinkStats(
         at_ns=1,

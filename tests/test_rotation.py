@@ -261,7 +261,7 @@ def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     looking = Onlookers(Views(), lambda definition, _, data: seen.append((definition.topic, data)))
     log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
     recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, onlookers=looking)
-    loaded = load_config("room")
+    loaded = load_config("room-hahn-stursberg")
     recorder.put("/uavctl/header", 0, made_header(loaded, build_design(loaded)))
     fly(recorder, clock, flight(20)[1:])
     room.free = 2000

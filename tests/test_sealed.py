@@ -260,7 +260,9 @@ ON_FREE_PORTS = ("daemon.vehicle=udpin://127.0.0.1:0", "daemon.mocap=udpin://loc
 
 
 def test_connections_get_the_doors_that_are_asked_for(tmp_path: Path, state: Path) -> None:
-    config = load_config("room", (*ON_FREE_PORTS, f"security.key_file={key_file(tmp_path)}", "security.link_id=9"))
+    config = load_config(
+        "room-hahn-stursberg", (*ON_FREE_PORTS, f"security.key_file={key_file(tmp_path)}", "security.link_id=9")
+    )
     with connected(config) as connections:
         assert [type(one) for one in connections.values()] == [Sealed, Sealed]
         assert connections["vehicle"].url == config.daemon.vehicle
@@ -275,10 +277,10 @@ def test_connections_get_the_doors_that_are_asked_for(tmp_path: Path, state: Pat
 
 
 def test_without_a_key_nothing_is_put_around_and_nothing_written(state: Path) -> None:
-    with connected(load_config("room", ON_FREE_PORTS)) as connections:
+    with connected(load_config("room-hahn-stursberg", ON_FREE_PORTS)) as connections:
         assert not any(isinstance(one, Sealed) for one in connections.values())
     one = ("daemon.vehicle=udpin://127.0.0.1:0", "daemon.mocap=udpin://127.0.0.1:0")
-    with connected(load_config("room", one)) as connections:
+    with connected(load_config("room-hahn-stursberg", one)) as connections:
         assert list(connections) == ["vehicle"]
     assert not state.exists()
 
@@ -289,12 +291,12 @@ def test_a_bad_key_or_url_opens_nothing(tmp_path: Path, state: Path) -> None:
     path.chmod(0o644)
     with (
         pytest.raises(KeyFileError, match="chmod 600"),
-        connected(load_config("room", (*ON_FREE_PORTS, f"security.key_file={path}"))),
+        connected(load_config("room-hahn-stursberg", (*ON_FREE_PORTS, f"security.key_file={path}"))),
     ):
         raise AssertionError("opened")
     with (
         pytest.raises(ConnectionSpecError),
-        connected(load_config("room", (ON_FREE_PORTS[0], "daemon.mocap=udpin://127.0.0.1:x"))),
+        connected(load_config("room-hahn-stursberg", (ON_FREE_PORTS[0], "daemon.mocap=udpin://127.0.0.1:x"))),
     ):
         raise AssertionError("opened")
     assert not state.exists()
@@ -302,7 +304,7 @@ def test_a_bad_key_or_url_opens_nothing(tmp_path: Path, state: Path) -> None:
 
 @pytest.mark.fault(37)
 def test_what_one_run_took_the_next_one_refuses(tmp_path: Path, state: Path) -> None:
-    config = load_config("room", (f"security.key_file={key_file(tmp_path)}",))
+    config = load_config("room-hahn-stursberg", (f"security.key_file={key_file(tmp_path)}",))
     stamp = int((time.time() - EPOCH_S) * SECOND)
     peer = SignedPeer(stamp=stamp)
     words = [peer.heartbeat() for _ in range(10)]
@@ -336,7 +338,7 @@ def test_a_door_passes_on_what_concerns_the_connection_alone() -> None:
 @pytest.mark.fault(39)
 def test_a_flood_that_holds_nothing_is_taken_by_the_handful() -> None:
     """Twenty datagrams a millisecond would wake the loop a thousand times a tick."""
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     now_ns, looks = [1], [0]
 
     def wait(connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:

@@ -30,16 +30,16 @@ UDP = ("daemon.vehicle=udpin://0.0.0.0:14540", "daemon.mocap=udpin://0.0.0.0:145
 @pytest.mark.fault(33)
 def test_what_cannot_be_is_refused(override: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        load_config("room", (override,))
+        load_config("room-hahn-stursberg", (override,))
 
 
 def test_the_presets_ask_for_nothing() -> None:
-    assert load_config("room").security == SecurityConfig()
+    assert load_config("room-hahn-stursberg").security == SecurityConfig()
 
 
 def test_a_dumped_configuration_comes_back() -> None:
     given = ('security.allow=["192.0.2.0/24", "2001:db8::1"]', "security.key_file=~/vehicle.key", "security.link_id=3")
-    config = load_config("room", given)
+    config = load_config("room-hahn-stursberg", given)
     assert config.security.allow == ("192.0.2.0/24", "2001:db8::1")
     assert 'key_file = "~/vehicle.key"' in dump_config(config)
 
@@ -59,7 +59,7 @@ def test_a_dumped_configuration_comes_back() -> None:
     ],
 )
 def test_what_is_open_to_strangers_is_warned_of(overrides: tuple[str, ...], wanted: list[str]) -> None:
-    config = load_config("room", overrides)
+    config = load_config("room-hahn-stursberg", overrides)
     found = warnings(config.security, config.daemon)
     assert len(found) == len(wanted)
     for text, words in zip(found, wanted, strict=True):

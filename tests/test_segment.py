@@ -4,6 +4,7 @@ import struct
 from pathlib import Path
 
 import pytest
+from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -59,6 +60,21 @@ def test_index_points_at_the_messages(tmp_path: Path) -> None:
                 assert (opcode, owner, message_time) == (5, channel, log_time)
                 seen += 1
     assert seen == 63
+
+
+def test_a_chunk_and_its_index_are_what_the_format_s_own_records_write(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 300, chunk_bytes=2048)
+    data, found = path.read_bytes(), chunks(path)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) == len(found) > 10
+    for chunk, index in zip(found, summary.chunk_indexes, strict=True):
+        written, place = RecordBuilder(), index.chunk_start_offset
+        chunk.write(written)
+        assert written.end() == data[place : place + index.chunk_length]  # type: ignore[no-untyped-call]
+        index.write(written)
+        assert written.end() in data  # type: ignore[no-untyped-call]
 
 
 def test_chunks_stay_within_their_size(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def test_one_seed_one_history() -> None:
 
 def test_samples_that_are_not_sent_shift_nothing_of_the_link() -> None:
     def arrived(*overrides: str) -> dict[int, int]:
-        peers = Peers(load_config("room", ["link.loss=0.3", "link.jitter_s=0.1", *overrides]), 0)
+        peers = Peers(load_config("room-hahn-stursberg", ["link.loss=0.3", "link.jitter_s=0.1", *overrides]), 0)
         due = [(at_ns, decode(data)) for at_ns, link, data in peers.advance(60 * S) if link == MOCAP]
         return {msg.usec: at_ns for at_ns, (msg,) in due}
 
@@ -185,6 +185,6 @@ def test_samples_that_are_not_sent_shift_nothing_of_the_link() -> None:
 )
 def test_what_cannot_be_is_refused(key: str, value: str, words: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        load_config("room", [f"sim.camera.{key}={value}"])
+        load_config("room-hahn-stursberg", [f"sim.camera.{key}={value}"])
     (problem,) = caught.value.problems
     assert words in problem

@@ -20,7 +20,7 @@ SHORT = 2.0 / 2.3
 
 
 def craft(*overrides: str) -> SteeredPlant:
-    vehicle = Peers(load_config("room", [*CALM, AT, *overrides]), 0).vehicle
+    vehicle = Peers(load_config("room-hahn-stursberg", [*CALM, AT, *overrides]), 0).vehicle
     assert isinstance(vehicle, Vehicle)
     return SteeredPlant(vehicle)
 

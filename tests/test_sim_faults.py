@@ -26,7 +26,9 @@ HEAD = ["link.loss=0", "link.jitter_s=0", "sim.camera.rate_hz=10", "sim.camera.p
 
 def config(*faults: str, plant: str = "linear", autopilot: str = "px4") -> Config:
     listed = ", ".join(f"{{{fault}}}" for fault in faults)
-    return load_config("room", [*HEAD, f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.fault=[{listed}]"])
+    return load_config(
+        "room-hahn-stursberg", [*HEAD, f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.fault=[{listed}]"]
+    )
 
 
 def positions(given: Config, seconds: int = 5) -> list[int]:
@@ -44,9 +46,10 @@ def test_a_span_of_the_link_or_of_the_cameras_begins_and_ends_in_time(kind: str)
 
 def test_faults_are_added_to_the_spans_that_there_are_already() -> None:
     given = load_config(
-        "room", [*HEAD, "link.blackout=[[0.95, 1.25]]", 'sim.fault=[{at_s=3, for_s=0.2, kind="blackout"}]']
+        "room-hahn-stursberg",
+        [*HEAD, "link.blackout=[[0.95, 1.25]]", 'sim.fault=[{at_s=3, for_s=0.2, kind="blackout"}]'],
     )
-    missing = set(positions(load_config("room", HEAD))) - set(positions(given))
+    missing = set(positions(load_config("room-hahn-stursberg", HEAD))) - set(positions(given))
     assert sorted(missing) == [10, 11, 12, 30, 31, 32]
 
 
@@ -66,7 +69,8 @@ def test_the_steady_wind_changes_at_its_time_and_carries_the_vehicle_away() -> N
 def test_gusts_go_on_when_the_steady_wind_changes() -> None:
     def wind(*faults: str) -> tuple[float, ...]:
         given = load_config(
-            "room", ["sim.plant=quadrotor", "sim.wind.gust_wind_mps=5", f"sim.fault=[{', '.join(faults)}]"]
+            "room-hahn-stursberg",
+            ["sim.plant=quadrotor", "sim.wind.gust_wind_mps=5", f"sim.fault=[{', '.join(faults)}]"],
         )
         peers = Peers(given, 0)
         peers.advance(3 * S)
@@ -253,7 +257,7 @@ def test_the_recording_tells_what_is_amiss() -> None:
 
 def test_random_occlusions_are_told_while_they_last() -> None:
     hides = ["sim.camera.occlusions_per_s=0.5", "sim.camera.occlusion_s=1.0"]
-    peers = Peers(load_config("room", [*HEAD, *hides]), 0)
+    peers = Peers(load_config("room-hahn-stursberg", [*HEAD, *hides]), 0)
     told = []
     for tenth in range(300):
         peers.advance(tenth * S // 10)

@@ -26,7 +26,7 @@ def ignore(truth: Truth) -> None:
 
 
 def seats(count: int, vehicle: str, mocap: str = "udpout://127.0.0.1:14560", *overrides: str) -> tuple[Seat, ...]:
-    return fleet(load_config("room", overrides), vehicle, mocap, count, ignore)
+    return fleet(load_config("room-hahn-stursberg", overrides), vehicle, mocap, count, ignore)
 
 
 def test_each_has_the_id_seed_place_and_ports_after_the_one_before() -> None:
@@ -108,7 +108,7 @@ class Station:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_only_it(autopilot: str) -> None:
     told: tuple[list[Truth], list[Truth]] = ([], [])
-    config = load_config("room", [f"sim.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"])
     pair = [
         Seat(one.config, one.vehicle, one.mocap, told[i].append)
         for i, one in enumerate(fleet(config, ANY, ANY, 2, ignore))
@@ -189,7 +189,7 @@ def test_a_url_that_is_none_is_told_as_it_was_given(url: str, capsys: pytest.Cap
 
 def test_the_daemon_s_own_id_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"sim\.system_id: 245 is that of the daemon too"):
-        load_config("room", ["sim.system_id=245"])
+        load_config("room-hahn-stursberg", ["sim.system_id=245"])
 
 
 @pytest.mark.parametrize("number", ["0", "11", "-1", "two"])

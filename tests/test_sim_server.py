@@ -24,7 +24,9 @@ HERE = ("127.0.0.1", 0)
 
 
 def config(*overrides: str) -> Config:
-    return load_config("room", ["link.loss=0", "sim.camera.rate_hz=50", "sim.camera.phase_s=0", *overrides])
+    return load_config(
+        "room-hahn-stursberg", ["link.loss=0", "sim.camera.rate_hz=50", "sim.camera.phase_s=0", *overrides]
+    )
 
 
 class Served:

@@ -46,7 +46,7 @@ def test_paper_follows_the_printed_recursion_at_the_boundaries() -> None:
         np.testing.assert_allclose(flown.state, x, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_stops_on_the_way_change_no_bit(name: str) -> None:
     config = load_config(name)
     straight, halting = vehicle(config), vehicle(config)
@@ -63,7 +63,7 @@ def test_stops_on_the_way_change_no_bit(name: str) -> None:
         assert straight.state.tolist() == halting.state.tolist()
 
 
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_its_acceleration_is_the_slope_of_its_velocity_wind_and_all(name: str) -> None:
     flown = vehicle(load_config(name))
     step_ns = flown.model.dt_ns // 1000
@@ -96,7 +96,7 @@ def test_paper_between_the_boundaries_is_a_first_order_lag() -> None:
 
 
 def test_drag_lag_matches_an_integrator_with_the_input_changed_within_a_step() -> None:
-    config = load_config("room", [*DRAGGED, "sim.start_velocity_mps=[0.3,-0.2,0.1]"])
+    config = load_config("room-hahn-stursberg", [*DRAGGED, "sim.start_velocity_mps=[0.3,-0.2,0.1]"])
     flown = vehicle(config)
     w = np.array([0.15, 0.15, 0.10]) * np.random.default_rng(np.random.SeedSequence(1)).standard_normal(3)
 
@@ -150,7 +150,7 @@ def test_the_input_is_in_plant_units_and_limited_only_beyond_ten_g() -> None:
 
 
 def test_on_the_floor_nothing_moves_but_the_draws_go_on() -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     resting, flying = vehicle(config), vehicle(config)
     resting.rest()
     for one in (resting, flying):
@@ -167,7 +167,7 @@ def test_on_the_floor_nothing_moves_but_the_draws_go_on() -> None:
 
 
 def test_one_seed_one_flight_another_seed_another() -> None:
-    config = load_config("room")
+    config = load_config("room-hahn-stursberg")
     first, again, other = vehicle(config, 1), vehicle(config, 1), vehicle(config, 2)
     for one in (first, again, other):
         one.advance(5 * S)
@@ -175,7 +175,7 @@ def test_one_seed_one_flight_another_seed_another() -> None:
 
 
 def test_time_cannot_go_back() -> None:
-    flown = vehicle(load_config("room"))
+    flown = vehicle(load_config("room-hahn-stursberg"))
     flown.advance(10)
     with pytest.raises(ValueError, match="back"):
         flown.advance(9)

@@ -128,7 +128,7 @@ class Stuck(io.StringIO):
 def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
     stuck = Stuck()
     told: list[int] = []
-    seat = Seat(load_config("room"), ANY, ANY, lambda truth: told.append(truth.at_ns))
+    seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda truth: told.append(truth.at_ns))
     with watching(Console(file=stuck, force_terminal=True)) as tell:
         tell((ONE,))
         assert stuck.tried.wait(LIMIT_S)
@@ -142,7 +142,7 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
 
 def test_looks_come_with_the_run_and_at_its_end() -> None:
     looks: list[tuple[Look, ...]] = []
-    seat = Seat(load_config("room"), ANY, ANY, lambda _: None)
+    seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda _: None)
     serve_all(
         (seat,),
         duration_s=1.0,

@@ -61,7 +61,7 @@ def test_the_first_decision_of_preset_paper_knows_the_first_sample_and_a_heartbe
 
 
 def test_ticks_lie_on_the_grid_and_see_only_what_has_arrived() -> None:
-    flyer, _, _ = fly("room", 4.0, start_ns=3 * S)
+    flyer, _, _ = fly("room-hahn-stursberg", 4.0, start_ns=3 * S)
     assert flyer.ticks == [(n, 3 * S + n * 50 * MS) for n in range(80)]
     arrivals = [at_ns for _, at_ns, _, _ in flyer.got]
     assert arrivals == sorted(arrivals)
@@ -71,7 +71,7 @@ def test_ticks_lie_on_the_grid_and_see_only_what_has_arrived() -> None:
 
 
 def test_positions_come_late_by_the_channels_delay() -> None:
-    flyer, truths, world = fly("room", 20.0)
+    flyer, truths, world = fly("room-hahn-stursberg", 20.0)
     samples = flyer.messages(MOCAP)
     for _, at_ns, msg in samples:
         captured_ns = msg.usec * 1000 - 4000 * S
@@ -108,7 +108,7 @@ def test_truth_of_a_boundary_is_the_state_there_and_the_input_from_there() -> No
 
 
 def test_the_truth_of_the_last_boundary_is_told_even_if_the_run_ends_there() -> None:
-    _, truths, _ = fly("room", 0.65)
+    _, truths, _ = fly("room-hahn-stursberg", 0.65)
     assert [one.at_ns for one in truths] == [0, 200 * MS, 400 * MS, 600 * MS]
     _, truths, _ = fly("paper", 0.1)
     assert [one.at_ns for one in truths] == [0]
@@ -124,7 +124,7 @@ def test_odometry_shows_the_true_state_of_its_capture() -> None:
 
 
 def test_silence_of_the_controller_is_answered_by_the_vehicle() -> None:
-    flyer, truths, _ = fly("room", 4.0, script=lambda tick: (0.5, 0.0, 0.0) if tick < 20 else None)
+    flyer, truths, _ = fly("room-hahn-stursberg", 4.0, script=lambda tick: (0.5, 0.0, 0.0) if tick < 20 else None)
     # the last setpoint at 0.95 s, the timeout 1 s later
     assert [(at_ns, msg.text) for _, at_ns, msg in flyer.messages(VEHICLE) if msg.get_type() == "STATUSTEXT"] == [
         (1950 * MS, "Failsafe activated")
@@ -147,7 +147,7 @@ def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> No
             return tuple(Outgoing(link=link, data=self.client.timesync(at_ns + 1)) for link in (VEHICLE, MOCAP))
 
     flyer = Asking()
-    World(load_config("room", ["link.loss=0"]), flyer).run(1.0)
+    World(load_config("room-hahn-stursberg", ["link.loss=0"]), flyer).run(1.0)
     answers = [(n, at_ns, msg) for n, at_ns, msg in flyer.messages(VEHICLE) if msg.get_type() == "TIMESYNC" and msg.tc1]
     assert [(n, at_ns, msg.ts1, msg.tc1) for n, at_ns, msg in answers] == [
         (n + 1, n * 50 * MS, n * 50 * MS + 1, n * 50 * MS + 20 * S) for n in range(19)
@@ -156,7 +156,7 @@ def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> No
 
 
 def test_equal_urls_are_one_connection() -> None:
-    flyer, _, _ = fly("room", 3.0, "daemon.mocap=udpin://0.0.0.0:14540")
+    flyer, _, _ = fly("room-hahn-stursberg", 3.0, "daemon.mocap=udpin://0.0.0.0:14540")
     kinds = {msg.get_type() for _, _, msg in flyer.messages(VEHICLE)}
     assert {"HEARTBEAT", "VISION_POSITION_ESTIMATE"} <= kinds
     assert flyer.messages(MOCAP) == []
@@ -167,7 +167,7 @@ def test_a_seed_gives_the_same_flight_bit_for_bit(autopilot: str) -> None:
     def run(seed: int) -> tuple[Any, ...]:
         noisy = ["link.duplicate=0.1", "link.corrupt=0.05", "link.truncate=0.05", f"sim.seed={seed}"]
         flyer, truths, _ = fly(
-            "room",
+            "room-hahn-stursberg",
             20.0,
             f"sim.autopilot={autopilot}",
             *noisy,
@@ -187,7 +187,7 @@ def test_progress_is_told_after_every_step() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_time_missed_is_caught_up_as_if_nothing_had_been_missed(autopilot: str) -> None:
-    config = load_config("room", [f"sim.autopilot={autopilot}"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}"])
     told: tuple[list[Truth], list[Truth]] = ([], [])
     due: tuple[list[Any], list[Any]] = ([], [])
     for steps, truths, got in zip((1, 977), told, due, strict=True):
@@ -201,7 +201,7 @@ def test_time_missed_is_caught_up_as_if_nothing_had_been_missed(autopilot: str) 
 
 
 def test_the_next_event_is_never_later_than_something_due() -> None:
-    peers = Peers(load_config("room", ["sim.autopilot=ardupilot"]), 0)
+    peers = Peers(load_config("room-hahn-stursberg", ["sim.autopilot=ardupilot"]), 0)
     peers.advance(0)
     for _ in range(2000):
         next_ns = peers.next_ns

@@ -42,7 +42,9 @@ def hard_states(given: Problem, count: int, seed: int) -> list[tuple[Array, Arra
     return found
 
 
-@pytest.mark.parametrize(("name", "slew_mps3"), [("room", ROOM_MPS3), ("room", 0.5), ("paper", 0.9)])
+@pytest.mark.parametrize(
+    ("name", "slew_mps3"), [("room-hahn-stursberg", ROOM_MPS3), ("room-hahn-stursberg", 0.5), ("paper", 0.9)]
+)
 def test_there_is_a_plan_from_everywhere_and_its_setpoints_change_no_faster(name: str, slew_mps3: float) -> None:
     given = problem(name)
     solver, d, side = solver_of(given, slew_mps3), given.plant.accel_map, slew_mps3 * given.plant.dt_s
@@ -65,7 +67,7 @@ def test_there_is_a_plan_from_everywhere_and_its_setpoints_change_no_faster(name
 
 def test_a_plan_ends_at_rest_when_the_gate_has_limited_it() -> None:
     """A plan that is played out through the gate, tick by tick, ends at nearly the velocity that it believes in."""
-    given = problem("room")
+    given = problem("room-hahn-stursberg")
     plant, ticks = given.plant, 4
     x, target = plant.equilibrium((-2.0, -1.5, -0.8)), plant.equilibrium((1.5, 1.0, -1.2))
     x[[1, 4]] = 1.2, -1.0
@@ -93,7 +95,7 @@ def test_what_can_never_bind_is_no_row() -> None:
 
 
 def test_without_a_word_of_what_was_sent_the_first_input_is_free() -> None:
-    given = problem("room")
+    given = problem("room-hahn-stursberg")
     solver = solver_of(given, 0.5)
     x, target, _ = hard_states(given, 1, 4)[0]
     free = solver.solve(0, x, target).inputs

@@ -101,7 +101,7 @@ def make_link(config: Config) -> Link:
 
 def test_a_body_becomes_samples_as_old_as_their_exposure_and_replays() -> None:
     # The exposure lies 30 ms before the sending: without the echoes the least delay would be taken for none.
-    config = load_config("room", ("frame.yaw_deg=90",))
+    config = load_config("room-hahn-stursberg", ("frame.yaw_deg=90",))
     with Server([OTHER, DRONE], latency_s=0.03) as server, closing(open_source(url(server))) as connection:
         desk = Desk(connection, config)
         # An answer that was long under way tells less than the next ones.
@@ -127,7 +127,7 @@ def test_a_body_becomes_samples_as_old_as_their_exposure_and_replays() -> None:
 def test_a_lost_body_gives_nothing_and_is_counted_until_it_is_back() -> None:
     body = drone()
     with Server([OTHER, body]) as server, closing(open_source(url(server))) as connection:
-        desk = Desk(connection, load_config("room"))
+        desk = Desk(connection, load_config("room-hahn-stursberg"))
         desk.until(lambda: bool(desk.samples))
         body.tracked = False
         desk.until(lambda: connection.refused["untracked"] > 20)
@@ -141,7 +141,7 @@ def test_a_lost_body_gives_nothing_and_is_counted_until_it_is_back() -> None:
 
 def test_a_server_that_went_is_asked_until_it_is_back() -> None:
     with Server([DRONE]) as server, closing(open_source(url(server))) as connection:
-        desk = Desk(connection, load_config("room"))
+        desk = Desk(connection, load_config("room-hahn-stursberg"))
         desk.until(lambda: bool(desk.samples))
         server.__exit__()
         desk.until(lambda: connection.refused["server-silent"] > 0)
@@ -161,7 +161,7 @@ def test_a_group_is_joined() -> None:
         Server([DRONE], version=(3, 1), group=group, needs_mask=False) as server,
         closing(open_source(url(server) + "?interface=127.0.0.1")) as connection,
     ):
-        desk = Desk(connection, load_config("room"))
+        desk = Desk(connection, load_config("room-hahn-stursberg"))
         desk.until(lambda: len(desk.samples) > 3)
 
 
@@ -177,7 +177,7 @@ def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() 
         until(lambda: not running(child), "the process ends")
 
         with closing(open_source(url(server))) as connection:
-            desk = Desk(connection, load_config("room"))
+            desk = Desk(connection, load_config("room-hahn-stursberg"))
             desk.until(lambda: bool(desk.samples))
             os.kill(child_of(os.getpid(), HOST), signal.SIGKILL)
             desk.until(lambda: connection.closed)
@@ -306,17 +306,19 @@ def test_other_urls_are_opened_as_ever() -> None:
 )
 def test_configurations_that_cannot_be(overrides: tuple[str, ...], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        load_config("room", ("daemon.mocap=natnet://10.0.0.5/drone", *overrides))
+        load_config("room-hahn-stursberg", ("daemon.mocap=natnet://10.0.0.5/drone", *overrides))
 
 
 def test_it_is_told_that_nothing_is_signed() -> None:
-    config = load_config("room", ("daemon.mocap=natnet://10.0.0.5/drone",))
+    config = load_config("room-hahn-stursberg", ("daemon.mocap=natnet://10.0.0.5/drone",))
     assert any("natnet://10.0.0.5/drone has no signatures" in text for text in warnings(config.security, config.daemon))
 
 
 def test_the_daemon_opens_it_by_its_configuration() -> None:
     with Server([DRONE]) as server:
-        config = load_config("room", ("daemon.vehicle=udpin://127.0.0.1:0", f"daemon.mocap={url(server)}"))
+        config = load_config(
+            "room-hahn-stursberg", ("daemon.vehicle=udpin://127.0.0.1:0", f"daemon.mocap={url(server)}")
+        )
         with connected(config) as connections:
             desk = Desk(connections["mocap"], config)
             desk.until(lambda: bool(desk.samples))

@@ -20,7 +20,7 @@ from uavctl.errors import RecordingError, UsageError
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("spared") / "flight.mcap"
     recorder = SyncRecorder(path)
-    for entry in lockstep("room", 2.0, "solver.method=exact").entries:
+    for entry in lockstep("room-hahn-stursberg", 2.0, "solver.method=exact").entries:
         recorder.put(*entry)
     assert recorder.close().ok
     return path

@@ -33,7 +33,7 @@ def delayed_response(plant: Plant, tau: int, k: Array, steps: int) -> list[Array
     return states[tau + 1 :]
 
 
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_covariance_is_the_sum_of_impulse_responses(name: str) -> None:
     plant = paper_plant() if name == "paper" else room_plant()
     given = spec(name)
@@ -51,7 +51,7 @@ def test_covariance_is_the_sum_of_impulse_responses(name: str) -> None:
     np.testing.assert_array_equal(terminal.sigma_x, terminal.sigma_xi[-n_x:, -n_x:])
 
 
-@pytest.mark.parametrize("name", ["paper", "room"])
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_covariance_of_z_is_that_of_the_states_it_is_made_from(name: str) -> None:
     given = spec(name)
     terminal = make_terminal(given.plant, given.tau, given.k_tau, given.q_x, given.q_u)
@@ -107,7 +107,7 @@ def test_stationary_cost_of_two_gains() -> None:
 
 
 def test_the_room_s_gain_is_a_local_minimum_of_the_stationary_cost() -> None:
-    given = spec("room")
+    given = spec("room-hahn-stursberg")
 
     def cost(k: Array) -> float:
         return stationary_cost(make_terminal(given.plant, given.tau, k, given.q_x, given.q_u))

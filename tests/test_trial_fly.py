@@ -138,7 +138,7 @@ def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str])
 
 
 def test_the_tool_says_why_nobody_flies(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.delta_x=0.999999999"]
+    arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.horizon=4"]
     assert trials.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
     assert "refused" in capsys.readouterr().out
 

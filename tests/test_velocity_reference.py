@@ -149,7 +149,7 @@ def test_a_steady_force_is_held_without_an_input() -> None:
 
 
 def test_it_rests_and_reaches_and_has_a_regulator() -> None:
-    plant = build_plant(load_config("room", list(OVERRIDES)))
+    plant = build_plant(load_config("room-hahn-stursberg", list(OVERRIDES)))
     assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES, 3, 9)
     rest = plant.equilibrium((1.0, -2.0, -0.5))
     assert rest[list(plant.position_index)].tolist() == [1.0, -2.0, -0.5]
@@ -192,7 +192,7 @@ def test_its_states_have_names() -> None:
 
 
 def test_the_simulators_own_reading_is_the_same() -> None:
-    config = load_config("room", list(OVERRIDES))
+    config = load_config("room-hahn-stursberg", list(OVERRIDES))
     plant, model = build_plant(config), linear_model(config.plant)
     for ours, theirs in ((plant.a, model.a), (plant.b, model.b), (plant.e, model.e)):
         np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12)
@@ -276,18 +276,18 @@ def test_one_entry_an_axis_is_wanted() -> None:
 )
 def test_a_configuration_that_does_not_fit_is_refused(override: str, words: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        load_config("room", [*OVERRIDES, override])
+        load_config("room-hahn-stursberg", [*OVERRIDES, override])
     assert any(words in problem for problem in caught.value.problems)
 
 
 def test_its_keys_mean_nothing_to_a_plant_that_flies_the_acceleration() -> None:
     with pytest.raises(ConfigError) as caught:
-        load_config("room", ["plant.velocity_1ps=[2,2,5]"])
+        load_config("room-hahn-stursberg", ["plant.velocity_1ps=[2,2,5]"])
     assert any('plant.velocity_1ps: has no meaning with model "drag-lag"' in one for one in caught.value.problems)
 
 
 def test_a_design_of_it_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = [part for one in (*OVERRIDES, "smpc.scheme=age-conditioned") for part in ("--set", one)]
-    assert main(["design", "--config", "room", "--json", *arguments]) == 0
+    assert main(["design", "--config", "room-hahn-stursberg", "--json", *arguments]) == 0
     found = json.loads(capsys.readouterr().out)
     assert len(found["rests"]) == 2 * 3 * STATES

@@ -127,8 +127,8 @@ def test_gusts_that_last_are_found() -> None:
 
 
 def test_the_filter_is_the_flights_own() -> None:
-    config = load_config("room", ("solver.method=exact",))
-    memory = lockstep("room", 8.0, "solver.method=exact")
+    config = load_config("room-hahn-stursberg", ("solver.method=exact",))
+    memory = lockstep("room-hahn-stursberg", 8.0, "solver.method=exact")
     flight = FlightData.from_records(memory.entries)
     track = Track(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
     known = {belief.captured_ns: belief for belief, _, _ in track.one_ahead()}

@@ -41,7 +41,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("viewers")
     # What `make fly` types, but for its length.
     with unpaged():
-        assert run(["loopback", "--udp", "--config", "room", "--duration", "8", "--out", str(out), "--json"]) == 0
+        assert (
+            run(
+                ["loopback", "--udp", "--config", "room-hahn-stursberg", "--duration", "8", "--out", str(out), "--json"]
+            )
+            == 0
+        )
     return out / "flight.mcap"
 
 

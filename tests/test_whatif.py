@@ -66,7 +66,7 @@ def test_another_link_loses_what_it_would_have_lost() -> None:
 
 
 def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_millimetre() -> None:
-    quiet: Case = ("room", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
+    quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
     other = Relinked(history(quiet), config_of(quiet, change).link, config_of(quiet).sim.seed, 0.0)
     memory, _ = again(quiet, change, other=other)

@@ -35,7 +35,7 @@ def said(camera: CameraConfig, frame: FrameConfig, where: tuple[Vec3, Vec3]) -> 
 
 
 def camera_of(message: str) -> CameraConfig:
-    camera = load_config("room").sim.camera
+    camera = load_config("room-hahn-stursberg").sim.camera
     return CameraConfig(rate_hz=camera.rate_hz, message=message)  # type: ignore[arg-type]
 
 

@@ -32,7 +32,7 @@ def cells(lines: list[str]) -> list[list[str]]:
 
 @cache
 def room() -> tuple[Answer, Design]:
-    design = build_design(load_config("room"))
+    design = build_design(load_config("room-hahn-stursberg"))
     x = design.target + np.tile([0.3, -0.1, 0.0], 3)
     return ConicSolver(design).solve(0, x, design.target), design
 

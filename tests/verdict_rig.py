@@ -22,7 +22,7 @@ Noise = Callable[[int, Array], Array]
 
 
 def room() -> Config:
-    return load_config("room", ("solver.method=exact",))
+    return load_config("room-hahn-stursberg", ("solver.method=exact",))
 
 
 def plain(_step: int, w: Array) -> Array:

@@ -16,8 +16,8 @@ from uavctl.whatif.history import Entry, History, history_of
 EXACT = ("solver.method=exact",)
 PAPER = ("paper", 20.0, EXACT)
 # The cameras' shortest delay is taken to be unknown, as it is without TIMESYNC.
-ROOM = ("room", 8.0, (*EXACT, "clock.latency_s=0.0"))
-QUADROTOR = ("room", 8.0, (*EXACT, "sim.plant=quadrotor"))
+ROOM = ("room-hahn-stursberg", 8.0, (*EXACT, "clock.latency_s=0.0"))
+QUADROTOR = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.plant=quadrotor"))
 Case = tuple[str, float, tuple[str, ...]]
 # Positions and setpoints cross MAVLink as float32, in one order of rounding here and in another there.
 WIRE = 1e-5

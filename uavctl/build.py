@@ -31,7 +31,6 @@ from uavctl.smpc.conditioned_design import (
     ConditionedDesign,
     conditioned_id,
     conditioned_record,
-    longest_gap,
 )
 from uavctl.smpc.conic import ConicSolver
 from uavctl.smpc.design import Design, DesignSpec, make_design
@@ -168,12 +167,16 @@ def build_problem(config: Config) -> Problem:
     )
 
 
-def build_conditioned(config: Config, *, gated: bool = True) -> ConditionedDesign:
+def build_conditioned(
+    config: Config, *, gated: bool = True, cov: NDArray[np.float64] | None = None
+) -> ConditionedDesign:
     """What flights of the scheme with risk conditioned on the age are planned with.
 
     Args:
         config: The configuration.
         gated: Whether the last gate limits how fast what is planned may change; in a campaign nothing does.
+        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost; None: what the
+            configuration says of it.
 
     Raises:
         DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
@@ -181,11 +184,11 @@ def build_conditioned(config: Config, *, gated: bool = True) -> ConditionedDesig
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
     link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
     slew_mps3 = config.limits.slew_mps3 if gated else math.inf
-    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3)
-    cov = np.zeros((problem.plant.n_x,) * 2)
-    if config.risk.estimate != "exact":
-        cov = _innovations(config, problem.plant, longest_gap(link, allowed, problem.horizon)).estimate_cov
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3))
+    if cov is None:
+        exact = config.risk.estimate == "exact"
+        cov = np.zeros((problem.plant.n_x,) * 2) if exact else _innovations(config, problem.plant, 0).estimate_cov
+    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov)
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov))
 
 
 def _planned_inputs(config: Config) -> Polytope:

@@ -1,6 +1,6 @@
-"""What `--realtime` does to the process: scheduling class, locked memory, garbage collected between ticks only.
+"""What a flight does to the process: garbage is collected between ticks only; with `--realtime` class and memory too.
 
-Each part that is not permitted is told with what to do, and the flight goes on without it.
+Each part of `--realtime` that is not permitted is told with what to do, and the flight goes on without it.
 """
 
 from __future__ import annotations
@@ -47,6 +47,19 @@ class Collector:
 
 
 @contextmanager
+def collected_between_ticks() -> Iterator[Collector]:
+    """Keep garbage collection out of the ticks: it is for the collector's caller to say when; undone at the end."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield Collector()
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
+@contextmanager
 def realtime(priority: int = PRIORITY) -> Iterator[tuple[Outcome, ...]]:
     """Make this thread, and the threads and memory that come later, real-time as far as permitted; undone at the end.
 
@@ -59,14 +72,9 @@ def realtime(priority: int = PRIORITY) -> Iterator[tuple[Outcome, ...]]:
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     scheduling = _schedule(priority)
     memory = _lock_memory()
-    gc.collect()
-    gc.freeze()
-    gc.disable()
     try:
-        yield scheduling, memory, Outcome("garbage", True, "collected once a second, between ticks")
+        yield scheduling, memory
     finally:
-        gc.enable()
-        gc.unfreeze()
         if memory.ok:
             ctypes.CDLL(None).munlockall()
         if scheduling.ok:

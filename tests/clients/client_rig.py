@@ -34,7 +34,17 @@ def free_port(kind: socket.SocketKind) -> int:
 def simulator(autopilot: str, vehicle: str, *options: str) -> Iterator[str]:
     """`uavctl sim` on a URL of this machine; gives the URL with the port that is really used."""
     mocap = f"udpout://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
-    command = [sys.executable, "-m", "uavctl", "sim", "--config", "room", "--autopilot", autopilot, "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "uavctl",
+        "sim",
+        "--config",
+        "room-hahn-stursberg",
+        "--autopilot",
+        autopilot,
+        "--json",
+    ]
     process = subprocess.Popen(
         [*command, "--vehicle", vehicle, "--mocap", mocap, *options], stdout=subprocess.PIPE, text=True
     )

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.bench.flown import FlightBench
 from uavctl.bench.result import Quantiles
 from uavctl.bench.timing import clock_us, quiet
 from uavctl.smpc.answer import Outlook
@@ -31,6 +32,7 @@ class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
     gave_way: float  # share of those with slack
     without: int  # answers without a plan
     clock_us: float  # an empty measurement, which all times contain
+    flight: FlightBench | None = None  # the same of the configuration's own flight
 
 
 def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tuple[Array, Array, Outlook]]:

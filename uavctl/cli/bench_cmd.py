@@ -9,12 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uavctl.bench import DEFAULT_SIZES, BenchResult, ConditionedTimes, DecisionBench, run_bench, time_decisions
+from uavctl.bench.flown import time_flight
 from uavctl.bench.plot import bench_svg
 from uavctl.bench.run import Advance
 from uavctl.build import build_conditioned, build_design, build_spec
@@ -61,7 +63,10 @@ def bench(
         with located(loaded):
             solver = build_conditioned(loaded.config).solver
         with _progress() as advance:
+            advance("a flight's own decisions", 0, None)
+            flight = time_flight(loaded.config, lambda done, total: advance("a flight's own decisions", done, total))
             decided = time_decisions(solver, states, seed, lambda done: advance("decisions", done, states))
+        decided = msgspec.structs.replace(decided, flight=flight)
         common.show(decided, lambda: _decisions(decided, loaded.config.name))
         return 0
     if plot is not None:
@@ -88,12 +93,22 @@ def _conditioned_solver(config: Config) -> ConditionedSolver | None:
 
 def _decisions(found: DecisionBench, name: str) -> str:
     """The figures of scheme `age-conditioned` in words."""
-    us, iterations = found.us, found.iterations
+    us, iterations, flight = found.us, found.iterations, found.flight
+    flown = (
+        ""
+        if flight is None
+        else (
+            f"\n{flight.questions} of its own flight: median {_us(flight.us.p50)}, p99 {_us(flight.us.p99)}, at most "
+            f"{_us(flight.us.max)}, the first one {_us(flight.first_us)}; iterations {flight.iterations.p50:.0f}, p99 "
+            f"{flight.iterations.p99:.0f}, at most {flight.iterations.max:.0f}. {flight.left_alone:.1%} need no "
+            f"program, {flight.gave_way:.1%} give way."
+        )
+    )
     return (
         f"{name}, risk conditioned on the age: one decision for all axes, {found.states} states and targets anywhere "
         f"within the limits.\nMedian {_us(us.p50)}, p99 {_us(us.p99)}, at most {_us(us.max)}; iterations "
         f"{iterations.p50:.0f}, p99 {iterations.p99:.0f}, at most {iterations.max:.0f}.\n"
-        f"{found.left_alone:.1%} need no program, {found.gave_way:.1%} give way, {found.without} got no plan."
+        f"{found.left_alone:.1%} need no program, {found.gave_way:.1%} give way, {found.without} got no plan.{flown}"
     )
 
 

@@ -28,7 +28,9 @@ _FILE_WIDTH = 120
 class Common:
     """Options of every command that takes a configuration."""
 
-    config: Annotated[str, Parameter(help="preset (paper, room) or TOML file")] = "room"
+    config: Annotated[
+        str, Parameter(help="preset (paper, room, room-px4, room-ardupilot, room-hahn-stursberg) or TOML file")
+    ] = "room"
     overrides: Annotated[
         tuple[str, ...],
         Parameter(

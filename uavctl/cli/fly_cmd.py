@@ -69,9 +69,7 @@ def fly(
         Path | None,
         Parameter(help="folder of the socket for `uavctl ctl`; else $UAVCTL_CONTROL or the user's own"),
     ] = None,
-    realtime: Annotated[
-        bool, Parameter(negative=(), help="SCHED_FIFO, locked memory, garbage collected between ticks only")
-    ] = False,
+    realtime: Annotated[bool, Parameter(negative=(), help="SCHED_FIFO and locked memory, as far as permitted")] = False,
     live: Live = False,
     live_port: LivePort = None,
 ) -> int:
@@ -132,6 +130,7 @@ def fly(
                         stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
                             lambda *_: tenure.note(loop.leaves_vehicle),
+                            lambda *_: recorder.catch_up(),
                             lambda *_: engagement.follow(loop),
                             *beside,
                             *collect,

@@ -46,6 +46,7 @@ from uavctl.daemon import fly
 from uavctl.data import Outgoing, Sink, Truth
 from uavctl.errors import UavctlError, UsageError
 from uavctl.loop import ControlLoop
+from uavctl.realtime import collected_between_ticks
 from uavctl.sealed import connected
 
 START_LIMIT_S = 60.0
@@ -179,6 +180,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            collector = simulator.enter_context(collected_between_ticks())
             begun = time.perf_counter()
             fly(
                 loop,
@@ -187,7 +189,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                 stopped,
                 duration_s=config.duration_s,
                 stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
-                after_tick=(lambda *_: engagement.follow(loop),),
+                after_tick=(lambda *_: recorder.catch_up(), lambda *_: engagement.follow(loop), collector.after_tick),
             )
             wall_s = time.perf_counter() - begun
             simulator.close()  # its last words go into the recording

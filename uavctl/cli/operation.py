@@ -8,7 +8,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from logs.journal import RecorderStatus
@@ -20,7 +20,7 @@ from uavctl.control_socket import ControlServer
 from uavctl.health import HealthWatch, RecorderHealth
 from uavctl.loop import ControlLoop
 from uavctl.notify import Notifier
-from uavctl.realtime import Collector, realtime
+from uavctl.realtime import collected_between_ticks, realtime
 
 AfterTick = Callable[[Due, int], None]
 _UNREAD_LINES = 10  # health lines that wait for a slow terminal or log
@@ -59,14 +59,11 @@ def operation(
 @contextmanager
 def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
     """Real-time scheduling and memory if wanted, with what was not permitted told; what to call after each tick."""
-    if not wanted:
-        yield ()
-        return
-    with realtime() as outcomes:
-        for outcome in outcomes:
+    with ExitStack() as stack:
+        for outcome in stack.enter_context(realtime()) if wanted else ():
             style = "" if outcome.ok else "[bold yellow]warning:[/] "
             messages().print(f"{style}--realtime: {outcome.part}: {outcome.text}", soft_wrap=True)
-        yield (Collector().after_tick,)
+        yield (stack.enter_context(collected_between_ticks()).after_tick,)
 
 
 @contextmanager

@@ -16,10 +16,10 @@ _HEAD = """# Configuration
 
 This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
 
-A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`, `room-px4`, `room-ardupilot`:
-complete examples in
-`uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides any key, with a value as TOML writes
-it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string needs no quotes.
+A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`, `room-px4`, `room-ardupilot`,
+`room-hahn-stursberg`: complete examples in `uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides
+any key, with a value as TOML writes it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string
+needs no quotes.
 Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are refused before anything starts,
 all at once, each with file, line and key (exit code 2). So is what is beyond all bounds: every number has a range,
 and every list and text a longest length, whether it is told below or not (1e7 at most, 1000 characters).

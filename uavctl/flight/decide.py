@@ -339,6 +339,9 @@ def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
 
 def _vec3(plant: Plant, mean: Vector, index: Sequence[int], missing: float) -> Vec3:
     """Entries of a state (n_x,) as north, east, down."""
+    if plant.axes == AXES:
+        first, second, third = index
+        return mean[first], mean[second], mean[third]
     values = dict(zip(plant.axes, (mean[place] for place in index), strict=True))
     north, east, down = (values.get(axis, missing) for axis in AXES)
     return north, east, down

@@ -19,8 +19,8 @@ The answer is a `Breach` that names the cause. What follows needs no position: l
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -71,6 +71,7 @@ MISLEADS = 4.0  # disagreements of a prediction that gusts alone do not make
 WITNESS_S = 10.0  # of a flight: as long as what was sent says something of the velocity
 GRAVITY_MPS2 = 9.81
 LEAST_LAG_S = 1e-3  # for a plant without one
+_TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 
 @dataclass(frozen=True)
@@ -310,7 +311,7 @@ def _told(watching: Watching, seen: Observation) -> Watching:
     sent = watching.sent
     if not sent or sent[-1][1] != seen.sent_mps2:
         sent = (*sent, (watching.tick_ns or seen.at_ns, seen.sent_mps2))
-    first = max((i for i, (at_ns, _) in enumerate(sent) if at_ns <= horizon_ns), default=0)
+    first = max(bisect_right(sent, horizon_ns, key=_TIME) - 1, 0)
     watching = replace(watching, tick_ns=seen.at_ns, sent=sent[first:])
     velocity, way = own_words(seen.motion, seen.at_ns), watching.way
     if velocity is None:
@@ -319,7 +320,7 @@ def _told(watching: Watching, seen: Observation) -> Watching:
         return replace(watching, way=((seen.at_ns, np.zeros(3)),), offsets=(), places=())
     last_ns, distance = way[-1]
     distance = distance + (seen.at_ns - last_ns) * 1e-9 * np.array(velocity)
-    kept = (one for one in way if one[0] > horizon_ns)
+    kept = way[bisect_right(way, horizon_ns, key=_TIME) :]
     return replace(watching, way=(*kept, (seen.at_ns, distance)))
 
 
@@ -404,9 +405,10 @@ def _predicted(
     """Fly on by what was sent, behind the vehicle's lag; the unexplained acceleration wanders."""
     lag_s = np.maximum(parameters.lag_s, LEAST_LAG_S)
     (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
-    ends_ns = [min(max(begin_ns, observer.at_ns), at_ns) for begin_ns, _ in sent]
-    spans = zip([observer.at_ns, *ends_ns], [*ends_ns, at_ns], [ZERO, *(u for _, u in sent)], strict=True)
-    for begin_ns, end_ns, setpoint in spans:
+    first = bisect_right(sent, observer.at_ns, key=_TIME)
+    last = bisect_left(sent, at_ns, lo=first, key=_TIME)
+    acts = sent[first - 1][1] if first else ZERO
+    for begin_ns, end_ns, setpoint in _spans(observer.at_ns, at_ns, acts, sent[first:last]):
         if end_ns <= begin_ns:
             continue
         s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
@@ -420,6 +422,14 @@ def _predicted(
     q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
     cov = f @ observer.cov @ f.T + parameters.unexplained_mps2**2 * q
     return Observer(at_ns=at_ns, mean=np.array([position, velocity, unexplained]), cov=cov, accel_mps2=accel)
+
+
+def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec3]]) -> Iterator[tuple[int, int, Vec3]]:
+    """Spans of a time, each with the setpoint that acts: one from before, then those sent within."""
+    for at_ns, setpoint in sent:
+        yield begin_ns, at_ns, acts
+        begin_ns, acts = at_ns, setpoint
+    yield begin_ns, end_ns, acts
 
 
 def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
@@ -519,11 +529,11 @@ def _off(
 ) -> tuple[tuple[float, Array] | None, tuple[tuple[int, Array], ...]]:
     """In which time (s) positions have left the vehicle's own way too far, and how far (3,) [m]; and the places."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
-    place: Array = np.mean([one for _, one in offsets], axis=0)
-    places = tuple(one for one in places if one[0] > at_ns - WAYS_NS)
+    place: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
+    places = places[bisect_right(places, at_ns - WAYS_NS, key=_TIME) :]
     for since_ns, before in places:
         s, off = (at_ns - since_ns) * 1e-9, place - before
-        if math.hypot(*off) > (WAYS_S + WAYS_PART * s) * parameters.disagreement_mps:
+        if math.hypot(*off.tolist()) > (WAYS_S + WAYS_PART * s) * parameters.disagreement_mps:
             return (s, off), places
     if not places or at_ns - places[-1][0] >= WAY_NS:
         places = (*places, (at_ns, place))
@@ -535,7 +545,7 @@ def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameter
     if len(offsets) < 3 or offsets[-1][0] - offsets[0][0] < SHORTEST * parameters.window_ns:
         return None
     times_s = np.array([(at_ns - offsets[0][0]) * 1e-9 for at_ns, _ in offsets])
-    centred = times_s - times_s.mean()
+    centred = times_s - np.add.reduce(times_s) / len(times_s)
     slope: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
     return slope
 
@@ -558,7 +568,7 @@ def _explained(apart: Array, way: tuple[tuple[int, Array], ...], offsets: tuple[
 
 def _flown(way: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
     """Distance flown by the vehicle's own velocity at `at_ns`; None where that is not known."""
-    place = bisect_left(way, at_ns, key=itemgetter(0))
+    place = bisect_left(way, at_ns, key=_TIME)
     if not 0 < place < len(way):
         return None
     (begin_ns, begin), (end_ns, end) = way[place - 1 : place + 1]

@@ -144,7 +144,7 @@ def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) ->
     at_ns = sum(one.at_ns for one in told) // len(told)
     if at_ns <= history.horizon_ns:
         return history
-    accel = np.array([one.accel_mps2 for one in told]).mean(axis=0)[list(kalman.axes)]
+    accel = np.add.reduce([one.accel_mps2 for one in told], axis=0)[list(kalman.axes)] / len(told)
     key = (at_ns, _FELT, "", at_ns)
     new = Entry(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
     return _inserted(kalman, history, new, None)
@@ -227,8 +227,13 @@ def belief_ahead(kalman: Kalman, history: History, coming: Coming, at_ns: int, a
     if belief is None or not ahead_ns:
         return belief
     u = _known(history, at_ns).input
-    acted = [(entry.key[0], entry.input) for entry in history.entries if entry.key[1] == _INPUT]
-    for due_ns, after in (*acted, *coming):
+    acted: list[tuple[int, Array | None]] = []
+    for entry in reversed(history.entries):  # of a window, a few are newer
+        if entry.key[0] <= at_ns:
+            break
+        if entry.key[1] == _INPUT:
+            acted.append((entry.key[0], entry.input))
+    for due_ns, after in (*acted[::-1], *coming):
         if at_ns < due_ns < at_ns + ahead_ns:
             belief, u = predicted(kalman, history.origin_ns, belief, u, due_ns), after
     return predicted(kalman, history.origin_ns, belief, u, at_ns + ahead_ns)

@@ -36,6 +36,10 @@ FELT_SIGMA = 3.0
 REFUSED, CONTRADICTED = 3, 40.0
 DOUBTED_NS = 3_000_000_000
 AGREES_NS = 1_000_000_000  # after the position before, a position that agrees says something
+# A bias that may drift fast is what inertial data show. Positions alone show it late and with their noise and the
+# model's errors in it: in a silence a vehicle that said nothing itself was flown 6 m out against a wind that was none.
+# So it drifts a tenth as fast while no inertial data are used, and from so long after the newest ones on.
+UNFELT_DRIFT, UNFELT_NS = 0.1, 1_000_000_000
 RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
 
 
@@ -77,6 +81,7 @@ class Kalman:
     Attributes:
         propagation: F and G of z = (x, w).
         w: Covariance W (n_w, n_w).
+        unfelt_w: The same while the filter could use inertial data and has none (n_w, n_w).
         n_x: Number of states: the plant's, the biases, and what inertial data are off.
         n_u: Number of inputs.
         n_bias: Number of biases, behind the plant's states: n_u, or 0 where none is estimated.
@@ -86,10 +91,13 @@ class Kalman:
         parameters: Noise and window.
         felt_z: What inertial data show of z (n_felt, n_x + n_w).
         felt_u: What they show of the input (n_felt, n_u).
+        felt_noise: Covariance of their noise (n_felt, n_felt).
+        identity: Of the size of z.
     """
 
     propagation: Propagation
     w: Array
+    unfelt_w: Array
     n_x: int
     n_u: int
     n_bias: int
@@ -99,6 +107,8 @@ class Kalman:
     parameters: EstimatorParameters
     felt_z: Array
     felt_u: Array
+    felt_noise: Array
+    identity: Array
 
     @property
     def bias(self) -> slice:
@@ -139,9 +149,14 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
     slopes = seen.generator[list(plant.velocity_index)] if feels else np.zeros((0, seen.n_x + seen.n_u + seen.n_w))
     felt_z = np.delete(slopes, slice(seen.n_x, seen.n_x + seen.n_u), axis=1)
     felt_z[:, seen.n_x - n_felt : seen.n_x] += np.eye(n_felt)
+    unfelt_w = seen.w.copy()
+    if n_felt and n_bias:
+        drift = slice(plant.n_w, plant.n_w + n_bias)
+        unfelt_w[drift, drift] *= UNFELT_DRIFT**2
     return Kalman(
         propagation=make_propagation(seen, dt_ns),
         w=seen.w,
+        unfelt_w=unfelt_w,
         n_x=seen.n_x,
         n_u=plant.n_u,
         n_bias=n_bias,
@@ -151,6 +166,8 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
         parameters=parameters,
         felt_z=felt_z,
         felt_u=slopes[:, seen.n_x : seen.n_x + seen.n_u],
+        felt_noise=np.eye(n_felt) * parameters.inertial_std_mps2**2,
+        identity=np.eye(seen.n_x + seen.n_w),
     )
 
 
@@ -178,17 +195,23 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
         boundary_ns = now_ns - (now_ns - origin_ns) % propagation.dt_ns + propagation.dt_ns
         stop_ns = min(at_ns, boundary_ns)
         f, g = propagation.over(stop_ns - now_ns)
-        mean = f @ mean + g @ acting
-        cov = _symmetric(f @ cov @ f.T)
+        mean = f.dot(mean)
+        mean += g.dot(acting)
+        cov = _symmetric(f.dot(cov).dot(f.T))
         if stop_ns == boundary_ns:
             mean[n_x:] = 0.0
             cov[:n_x, n_x:] = 0.0
             cov[n_x:, :n_x] = 0.0
-            cov[n_x:, n_x:] = kalman.w
+            cov[n_x:, n_x:] = kalman.w if _feels(belief, stop_ns) else kalman.unfelt_w
             if u is None and kalman.n_bias:
                 _forget_bias(kalman, mean, cov)
         now_ns = stop_ns
     return replace(belief, at_ns=now_ns, mean=mean, cov=cov)
+
+
+def _feels(belief: Belief, at_ns: int) -> bool:
+    """Whether inertial data are used at a time."""
+    return belief.doubted_ns is None and belief.felt_ns is not None and at_ns - belief.felt_ns <= UNFELT_NS
 
 
 def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
@@ -211,7 +234,7 @@ def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     diagonal[index] = variances
     cov = np.zeros((n_x + n_w, n_x + n_w))
     cov[:n_x, :n_x] = np.diag(diagonal)
-    cov[n_x:, n_x:] = kalman.w
+    cov[n_x:, n_x:] = kalman.unfelt_w
     if kalman.n_bias:
         _forget_bias(kalman, mean, cov)
     if kalman.n_felt:
@@ -225,31 +248,40 @@ def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
     """Kalman update; the covariance in Joseph's form, which stays symmetric and positive semidefinite."""
     values, variances = shown_by(kalman, sample)
     index = kalman.shown[: len(values)]
-    noise = np.diag(variances)
+    noise = kalman.identity[: len(values), : len(values)] * variances
     if kalman.n_felt:
-        belief = _confronted(kalman, belief, values, noise)
+        belief = _confronted(kalman, belief, values, variances)
     ph = belief.cov[:, index]
     gain = np.linalg.solve(ph[index] + noise, ph.T).T
-    keep = np.eye(len(belief.mean))
+    keep = kalman.identity.copy()
     keep[:, index] -= gain
     return replace(
         belief,
         captured_ns=captured_ns(sample),
-        mean=belief.mean + gain @ (values - belief.mean[index]),
-        cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+        mean=belief.mean + gain.dot(values - belief.mean[index]),
+        cov=_symmetric(keep.dot(belief.cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
     )
 
 
-def _confronted(kalman: Kalman, belief: Belief, values: Array, noise: Array) -> Belief:
-    """The belief before an update, with its inertial data doubted, or not any more, by what a sample shows."""
+def contradicted(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
+    """Whether the squared distance of what a sample shows from what is believed, by its covariance, is too large."""
     index = kalman.shown[: len(values)]
     off = values - belief.mean[index]
-    contradicted = float(off @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, off)) > CONTRADICTED
+    # By the sample's own noise alone it is larger yet: where even that is well within, nothing has to be solved.
+    if float(off.dot(off)) <= 0.9 * CONTRADICTED * float(variances.min()):
+        return False
+    noise = kalman.identity[: len(values), : len(values)] * variances
+    return float(off @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, off)) > CONTRADICTED
+
+
+def _confronted(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> Belief:
+    """The belief before an update, with its inertial data doubted, or not any more, by what a sample shows."""
+    off = contradicted(kalman, belief, values, variances)
     if belief.doubted_ns is not None:
         knows = belief.at_ns - belief.captured_ns <= AGREES_NS  # with whatever came, nearly all agrees after a silence
-        ended = knows and not contradicted and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
+        ended = knows and not off and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
         return replace(belief, refused=0, doubted_ns=None) if ended else belief
-    if not contradicted or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
+    if not off or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
         return belief
     cov = belief.cov.copy()
     _widen(cov, kalman.shown[len(kalman.axes) :], RELEARNT_MPS**2)
@@ -273,21 +305,21 @@ def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> 
         raise ValueError("this filter uses no inertial data")
     if belief.doubted_ns is not None:
         return belief
-    of_z, noise = kalman.felt_z, np.eye(kalman.n_felt) * kalman.parameters.inertial_std_mps2**2
-    off = accel_mps2 - of_z @ belief.mean
+    of_z, noise = kalman.felt_z, kalman.felt_noise
+    off = accel_mps2 - of_z.dot(belief.mean)
     if u is not None:
-        off -= kalman.felt_u @ u
-    ph = belief.cov @ of_z.T
-    shown = of_z @ ph + noise
+        off -= kalman.felt_u.dot(u)
+    ph = belief.cov.dot(of_z.T)
+    shown = of_z.dot(ph) + noise
     if not bool((np.square(off) <= FELT_SIGMA**2 * np.diagonal(shown)).all()):
         refused = belief.refused + 1
         return replace(belief, refused=refused, doubted_ns=belief.at_ns if refused >= REFUSED else None)
     gain = np.linalg.solve(shown, ph.T).T
-    keep = np.eye(len(belief.mean)) - gain @ of_z
+    keep = kalman.identity - gain.dot(of_z)
     return replace(
         belief,
-        mean=belief.mean + gain @ off,
-        cov=_symmetric(keep @ belief.cov @ keep.T + gain @ noise @ gain.T),
+        mean=belief.mean + gain.dot(off),
+        cov=_symmetric(keep.dot(belief.cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
         felt_ns=belief.at_ns,
         refused=0,
     )

@@ -35,7 +35,7 @@ class Propagation:
     parts: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, dt_ns: int) -> tuple[Array, Array]:
-        """(F, G) over `dt_ns`, 0 < dt_ns <= Δt."""
+        """(F, G) over `dt_ns`, 0 < dt_ns <= Δt; each by itself in memory, as products want it."""
         known = self.parts.get(dt_ns)
         if known is None:
             known = self._part(dt_ns)
@@ -49,9 +49,11 @@ class Propagation:
         else:
             angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
             joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
-            joint.flags.writeable = False
         n_z = joint.shape[0]
-        return joint[:, :n_z], joint[:, n_z:]
+        part = joint[:, :n_z].copy(), joint[:, n_z:].copy()
+        for array in part:
+            array.flags.writeable = False
+        return part
 
 
 _ORDERS = np.arange(_TERMS, dtype=np.float64)

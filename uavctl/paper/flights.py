@@ -51,9 +51,9 @@ class Watched:
         self._of_inputs = np.hstack([np.linalg.matrix_power(a, steps - 1 - t) @ b for t in range(steps)])
         self.missed = 0
 
-    def decide(self, x: Array, late: int) -> Decisions:
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
-        plans = self._decider.decide(x, late)
+        plans = self._decider.decide(x, late, cov)
         end = x @ self._of_x.T + plans.inputs.reshape(len(x), -1) @ self._of_inputs.T
         away = (np.abs(end - self._target) > _MISS).any(axis=1)
         self.missed += int((away & plans.solved).sum())

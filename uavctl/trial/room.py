@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build import build_conditioned, resting
+from uavctl.build import build_conditioned, build_plant, resting
 from uavctl.build_mission import build_rests, resting_places
 from uavctl.config import Config
 from uavctl.smpc.conditioned_design import AnyDesign
@@ -47,9 +47,9 @@ def usable_seen(config: Config, design: Design | None) -> float:
     """
     if design is not None:
         return _share(config, *resting_places(design.plant, design.state_set, build_rests(design)))
-    solver = build_conditioned(config).solver
-    plant, state_set = solver.problem.plant, solver.problem.state_set
-    return _share(config, *resting_places(plant, state_set, solver.rests(np.zeros((plant.n_x, plant.n_x)))))
+    n_x = build_plant(config).n_x
+    exact = build_conditioned(config, cov=np.zeros((n_x, n_x)))
+    return _share(config, *resting_places(exact.plant, exact.state_set, exact.rests))
 
 
 def _share(config: Config, least: Array, most: Array) -> float:
