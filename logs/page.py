@@ -62,7 +62,7 @@ main{padding:1.25rem .75rem 2rem}
 .grid{grid-template-columns:minmax(0,1fr)}
 figure:last-child:nth-child(odd):not(.wide){width:100%%}
 .broad{display:none}.narrow{display:block}
-.facts th,.facts td{display:block;width:auto;padding-right:0}
+.facts th,.facts td{display:block;width:auto;padding-right:0;white-space:normal}
 .facts td{border-top:0;padding-top:0}
 .many thead{display:none}
 .many{min-width:0!important}

@@ -8,6 +8,9 @@ from logs import page
 from logs.flight_data import FlightData
 from logs.page import Section
 
+# Numbers that say no more than that it hardly ever happens are told as one.
+_NEGLIGIBLE = 1e-6
+
 _DESIGN = {
     "horizon": "Horizon H [steps]",
     "dt_s": "Step Δt [s]",
@@ -57,7 +60,7 @@ def _text(value: object) -> str:
         return str(value)
     runs: list[tuple[str, int]] = []
     for one in value:
-        text = _text(one)
+        text = f"< {_NEGLIGIBLE:g}" if isinstance(one, float) and 0 < one < _NEGLIGIBLE else _text(one)
         if runs and runs[-1][0] == text:
             runs[-1] = (text, runs[-1][1] + 1)
         else:
