@@ -34,15 +34,16 @@ def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
     plans = flight.of(Plan)
     assert {plan.method for plan in plans} == {METHOD}
     assert {plan.status for plan in plans} == {SolveStatus.OPTIMAL}
-    # Most of them on the way, at the limit of speed: the bias that moves meanwhile is in no margin.
+    # Most of them on the way, at the limit of speed.
     assert sum(bool(plan.gave_way) for plan in plans) <= 0.05 * len(plans)
     assert {decision.mode for decision in flight.of(Decision)} <= {ControlMode.WAIT, ControlMode.TRACK}
     target = np.array(load_config("room").target.position_m)
     assert np.linalg.norm(np.array(flight.of(Truth)[-1].position_m) - target) < 0.2
 
 
-def test_the_setpoints_play_the_plans_out(flight: Memory) -> None:
+def test_without_inertial_data_the_setpoints_play_the_plans_out() -> None:
     """What is decided at a boundary is the plan's input of that step."""
+    flight = lockstep("room", 20.0, "sim.seed=4", "estimator.inertial_std_mps2=0")
     plans = {plan.seq: plan for plan in flight.of(Plan)}
     played = [one for one in flight.of(Decision) if one.boundary and one.plan_index]
     assert len(played) > 10
@@ -78,6 +79,17 @@ def test_a_fence_that_closes_in_is_kept() -> None:
     last = found.of(Plan)[-1]
     assert last.reference[0] < 1.2  # the target itself is outside
     assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
+
+
+def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
+    found = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
+    rests = resting(build_conditioned(load_config("room")))[0]
+    settled = [plan for plan in found.of(Plan) if plan.base_ns > 12e9]
+    assert [plan.reference[0] for plan in settled] == pytest.approx([rests] * len(settled), abs=0.03)
+    assert sum(bool(plan.gave_way) for plan in settled) <= 0.05 * len(settled)
+    places = [truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 12e9]
+    assert np.mean(places) == pytest.approx(settled[-1].reference[0], abs=0.04)
+    assert max(places) < 3.0
 
 
 def test_a_design_may_rest_nearer_to_the_walls() -> None:

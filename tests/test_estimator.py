@@ -19,6 +19,7 @@ from flight_rig import (
     sample,
     small_plant,
 )
+from msgspec.structs import replace as changed
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
@@ -122,6 +123,7 @@ def test_an_update_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...
     for _ in range(200):
         root, u = rng.normal(size=(n_z, n_z)), rng.normal(size=kalman.n_u)
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=rng.normal(size=n_z), cov=root @ root.T)
+        belief = changed(belief, felt_ns=START_NS)  # not the first one
         accel = kalman.felt_z @ belief.mean + kalman.felt_u @ u + 0.01 * rng.normal(size=kalman.n_felt)
         off = accel - kalman.felt_z @ belief.mean - kalman.felt_u @ u
         mean, cov = joseph(belief, kalman.felt_z, off, np.eye(kalman.n_felt) * 0.2**2)

@@ -110,7 +110,8 @@ def conditioned(
     draws = (at_ns - START_NS) // DT_NS - first + 1
     keep = math.exp(-DT_S / OFF_S)
     of_draw = [WIND**2, DRIFT**2 * DT_S, OFF**2 * (1.0 + keep) / (1.0 - keep)]
-    prior = np.diag([0.005**2, 0.3**2, 0.3**2, (0.25 * MOST) ** 2, OFF**2, *of_draw * draws])
+    # The last one is a push of the force where inertial data begin.
+    prior = np.diag([0.005**2, 0.3**2, 0.3**2, (0.25 * MOST) ** 2, OFF**2, *of_draw * draws, MOST**2])
     offset, linear = np.array([places[first_ns], 0.0, 0.0, 0.0, 0.0]), np.eye(5, len(prior))
     grid = {START_NS + (first + n) * DT_NS for n in range(draws + 1)}
     times = sorted(t for t in {at_ns, *places, *accels, *inputs, *grid} if first_ns <= t <= at_ns)
@@ -124,6 +125,8 @@ def conditioned(
             rows.append(linear[0])
             off.append(places[earlier] - offset[0])
             variances.append(0.005**2)
+        if earlier == min(accels):
+            linear[:, -1] += [0.0, 0.0, 1.0, 1.0, 0.0]
         if earlier in accels:
             before = next((value for when, value in sorted(inputs.items(), reverse=True) if when < earlier), 0.0)
             rows.append(g[1, :5] @ linear + g[1, 5:8] @ drawn + linear[4])
@@ -250,6 +253,15 @@ def followed(kalman: Kalman, seconds: float, told_mps2: Callable[[int], float], 
         assert belief is not None
         beliefs.append(belief)
     return beliefs
+
+
+def test_a_flight_that_begins_in_a_wind_does_not_doubt_what_it_feels_first_but_later() -> None:
+    """A push of twice the largest bias that is counted on, from the first inertial data on, and all of a sudden."""
+    first = followed(make(), 2.0, lambda tick: 2.0 * MOST)
+    later = followed(make(), 2.0, lambda tick: 2.0 * MOST if tick >= 20 else 0.0)
+    assert all(belief.doubted_ns is None and not belief.refused for belief in first[:3])
+    assert first[2].mean[3] > MOST
+    assert later[20 + REFUSED - 1].doubted_ns is not None
 
 
 def test_data_that_cannot_be_are_doubted_and_believed_again_when_positions_agree_for_long() -> None:

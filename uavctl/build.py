@@ -18,13 +18,14 @@ from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
 from uavctl.flight.envelope import EnvelopeParameters
 from uavctl.flight.fallback import FallbackParameters
-from uavctl.flight.kalman import EstimatorParameters
+from uavctl.flight.kalman import EstimatorParameters, make_kalman, settled_cov
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.reach import GateParameters
 from uavctl.library_store import library_for
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.baselines.problem import Problem
+from uavctl.smpc.bias import with_bias
 from uavctl.smpc.conditioned import ConditionedSolver
 from uavctl.smpc.conditioned_design import (
     AnyDesign,
@@ -168,27 +169,33 @@ def build_problem(config: Config) -> Problem:
 
 
 def build_conditioned(
-    config: Config, *, gated: bool = True, cov: NDArray[np.float64] | None = None
+    config: Config, *, flown: bool = True, cov: NDArray[np.float64] | None = None
 ) -> ConditionedDesign:
     """What flights of the scheme with risk conditioned on the age are planned with.
 
     Args:
         config: The configuration.
-        gated: Whether the last gate limits how fast what is planned may change; in a campaign nothing does.
-        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost; None: what the
-            configuration says of it.
+        flown: Whether the flight's own filter estimates, biases included, and the last gate limits how fast what is
+            planned may change; in a campaign neither is there.
+        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost, if it is not flown;
+            None: what the configuration says of it.
 
     Raises:
         DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
     link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
-    slew_mps3 = config.limits.slew_mps3 if gated else math.inf
-    if cov is None:
+    slew_mps3 = config.limits.slew_mps3 if flown else math.inf
+    plant, estimator, seen = problem.plant, config.estimator, None
+    if flown and estimator.bias_drift:
+        seen = with_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
+    if cov is None and flown:
+        cov = _settled(config, plant)
+    elif cov is None:
         exact = config.risk.estimate == "exact"
-        cov = np.zeros((problem.plant.n_x,) * 2) if exact else _innovations(config, problem.plant, 0).estimate_cov
-    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov)
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov))
+        cov = np.zeros((plant.n_x,) * 2) if exact else _innovations(config, plant, 0).estimate_cov
+    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov, seen=seen)
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov, seen))
 
 
 def _planned_inputs(config: Config) -> Polytope:
@@ -200,11 +207,25 @@ def _planned_inputs(config: Config) -> Polytope:
 
 def _innovations(config: Config, plant: Plant, losses: int) -> Innovations:
     """The plant as the configured filter sees it, and what that does not know after so many losses in a row."""
-    link, dt_s, estimator = config.link, config.plant.dt_s, config.estimator
-    # A step's position may be from its very begin, unless others follow it.
-    since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
-    age_s = min(dt_s, since_s + link.delay_s + link.jitter_s)
+    estimator = config.estimator
+    age_s = _position_age_s(config)
     return innovations(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
+
+
+def _position_age_s(config: Config) -> float:
+    """Age of a step's position at its end, up to a step [s]."""
+    link, dt_s = config.link, config.plant.dt_s
+    # It may be from the very begin, unless others follow it.
+    since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
+    return min(dt_s, since_s + link.delay_s + link.jitter_s)
+
+
+def _settled(config: Config, plant: Plant) -> NDArray[np.float64]:
+    """What the flight's filter does not know where a plan begins, with a position and inertial data in every step."""
+    dt_ns = round(plant.dt_s * NANOSECONDS)
+    kalman = make_kalman(plant, build_estimator(config), dt_ns)
+    dead_ns = round(config.plant.dead_time_s * NANOSECONDS)
+    return settled_cov(kalman, dt_ns, round(_position_age_s(config) * NANOSECONDS), dead_ns)
 
 
 def design_of(config: Config) -> AnyDesign:

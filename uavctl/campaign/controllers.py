@@ -159,7 +159,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.conditioned:
-        solver, steps = build_conditioned(config, gated=False, cov=recipe.cov).solver, config.smpc.horizon
+        solver, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
         return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
     if design is None:
         raise ValueError("an SMPC without a design")

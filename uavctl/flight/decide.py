@@ -13,9 +13,9 @@ from uavctl.data import ControlMode, Estimate, Plan, PositionSample, SolveStatus
 from uavctl.flight import envelope
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.estimator import History, belief_ahead, belief_at, estimated, newest_capture_ns
+from uavctl.flight.estimator import History, belief_ahead, belief_at, estimated, newest_capture_ns, uncertain
 from uavctl.flight.fallback import End, Fallback
-from uavctl.flight.kalman import Belief
+from uavctl.flight.kalman import Array, Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance, ask_for, lead, over
 from uavctl.flight.orders import obey, told, unready
@@ -127,15 +127,16 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     if state.fallback is not None and state.fresh < controller.fallback.recover_samples:
         reason = f"{state.fresh} of {controller.fallback.recover_samples} fresh samples in a row"
         return _fall(state, state.fallback, tick, inp, controller, reason)
-    base = _base(state, tick, inp, controller)
-    if base is None:
+    begins = _begins(state, tick, inp, controller)
+    if begins is None:
         return Choice(state, "no estimate of this boundary")
+    base = estimated(controller.kalman, begins)
     mission = advance(controller.mission, state.mission, base.mean, tick.boundary_ns)
     state = replace(state, mission=mission)
     if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, End.LAND, at_ns)
         return _fall(state, landing, tick, inp, controller, MISSION_OVER)
-    choice = _replan(state, mission, base, tick, inp, controller)
+    choice = _replan(state, mission, base, uncertain(controller.kalman, begins), tick, inp, controller)
     plan = choice.state.plan
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
@@ -143,17 +144,21 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     return replace(choice, state=fallen.state, reason=fallen.reason)
 
 
-def _base(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Estimate | None:
-    """The estimate that a plan begins with: where the first input that is sent now begins to act."""
+def _begins(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Belief | None:
+    """What a plan begins with: what is believed of where the first input that is sent now begins to act."""
     if inp.at_ns == tick.boundary_ns and not controller.dead_ns:
-        return tick.estimate
-    kalman = controller.kalman
-    belief = belief_ahead(kalman, tick.history, state.coming, tick.boundary_ns, controller.dead_ns)
-    return None if belief is None else estimated(kalman, belief)
+        return tick.belief
+    return belief_ahead(controller.kalman, tick.history, state.coming, tick.boundary_ns, controller.dead_ns)
 
 
 def _replan(
-    state: ControlState, mission: MissionState, base: Estimate, tick: Tick, inp: StepInput, controller: Controller
+    state: ControlState,
+    mission: MissionState,
+    base: Estimate,
+    cov: Array,
+    tick: Tick,
+    inp: StepInput,
+    controller: Controller,
 ) -> Choice:
     """Ask for a plan if there is news, as ordered; else, or if that fails, the old one plays out."""
     news = state.plan is None or base.captured_ns > state.plan.captured_ns
@@ -173,7 +178,7 @@ def _replan(
         limits=outlook.limits,
         path=outlook.path,
         late=late,
-        cov=np.array(base.cov),
+        cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
     )
     shape = (controller.horizon, controller.plant.n_u)
@@ -232,7 +237,7 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
         math.hypot(*moving),
         state.accel_mps2,
         controller.fallback,
-        held_mps2(state, fallback, controller),
+        held_mps2(state, fallback, tick, inp, controller),
         measured=measured,
         blind=not (measured or reckons(fallback, tick))
         and (tick.age_steps is None or tick.age_steps >= controller.horizon),
@@ -253,10 +258,14 @@ def reckons(fallback: Fallback, tick: Tick) -> bool:
     return belief.at_ns - belief.felt_ns <= RECKONS_NS
 
 
-def held_mps2(state: ControlState, fallback: Fallback, controller: Controller) -> Vec3:
+def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Vec3:
     """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
-    # A bias of while no position came may be an error of the inertial data, and would be flown for seconds.
     bias = fb.learnt(state.biases)
+    # A bias of while no position came may be an error of the inertial data, and would be flown for seconds: it counts
+    # where the vehicle's own velocity would contradict.
+    told = envelope.witness(state.watching, inp.motion, inp.at_ns) is not None
+    if told and tick.estimate is not None and reckons(fallback, tick):
+        bias = tick.estimate.bias
     # What the vehicle keeps when nothing more is sent is zero itself.
     if not bias or (fallback.final and fallback.mode is ControlMode.HOLD) or fallback.end is End.LET_GO:
         return ZERO

@@ -260,6 +260,12 @@ def estimated(kalman: Kalman, belief: Belief) -> Estimate:
     )
 
 
+def uncertain(kalman: Kalman, belief: Belief) -> Array:
+    """Covariance (n, n) of the states and, behind them, of the biases."""
+    n = kalman.bias.stop
+    return np.ascontiguousarray(belief.cov[:n, :n])
+
+
 def newest_capture_ns(history: History, at_ns: int) -> int | None:
     """Capture time of the newest sample from up to `at_ns`; None where there is no estimate."""
     belief = _known(history, at_ns).belief

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from uavctl.data import PositionSample, Vec3
 from uavctl.flight.limits import AXES
 from uavctl.flight.propagation import Propagation, make_propagation
-from uavctl.smpc.bias import with_bias, with_wander
+from uavctl.smpc.bias import at_once, with_bias, with_wander
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -40,6 +40,8 @@ AGREES_NS = 1_000_000_000  # after the position before, a position that agrees s
 # model's errors in it: in a silence a vehicle that said nothing itself was flown 6 m out against a wind that was none.
 # So it drifts a tenth as fast while no inertial data are used, and from so long after the newest ones on.
 UNFELT_DRIFT, UNFELT_NS = 0.1, 1_000_000_000
+# The first ones are not refused for a bias that nobody could know: a flight that begins in a wind would doubt them.
+SETTLES_NS = 40_000_000_000  # in which covariances settle
 RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
 
 
@@ -92,6 +94,7 @@ class Kalman:
         felt_z: What inertial data show of z (n_felt, n_x + n_w).
         felt_u: What they show of the input (n_felt, n_u).
         felt_noise: Covariance of their noise (n_felt, n_felt).
+        pushed: Covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w).
         identity: Of the size of z.
     """
 
@@ -108,6 +111,7 @@ class Kalman:
     felt_z: Array
     felt_u: Array
     felt_noise: Array
+    pushed: Array
     identity: Array
 
     @property
@@ -149,6 +153,11 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
     slopes = seen.generator[list(plant.velocity_index)] if feels else np.zeros((0, seen.n_x + seen.n_u + seen.n_w))
     felt_z = np.delete(slopes, slice(seen.n_x, seen.n_x + seen.n_u), axis=1)
     felt_z[:, seen.n_x - n_felt : seen.n_x] += np.eye(n_felt)
+    n_z = seen.n_x + seen.n_w
+    push = np.zeros((n_z, n_bias))
+    if n_bias and n_felt:
+        push[: plant.n_x] = at_once(plant)
+        push[plant.n_x : plant.n_x + n_bias] = np.eye(n_bias)
     unfelt_w = seen.w.copy()
     if n_felt and n_bias:
         drift = slice(plant.n_w, plant.n_w + n_bias)
@@ -167,8 +176,36 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
         felt_z=felt_z,
         felt_u=slopes[:, seen.n_x : seen.n_x + seen.n_u],
         felt_noise=np.eye(n_felt) * parameters.inertial_std_mps2**2,
-        identity=np.eye(seen.n_x + seen.n_w),
+        pushed=parameters.bias_max**2 * push @ push.T,
+        identity=np.eye(n_z),
     )
+
+
+def settled_cov(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
+    """Covariance (n, n) of states and biases that a filter settles at, with a position and inertial data in every step.
+
+    Args:
+        kalman: The filter.
+        dt_ns: Δt [ns].
+        age_ns: Age of a step's position at the step's end, up to Δt [ns].
+        dead_ns: How long after that end it is asked for [ns].
+    """
+
+    def position(at_ns: int) -> PositionSample:
+        return PositionSample(
+            captured_ns=at_ns, received_ns=at_ns, position_m=(0.0, 0.0, 0.0), std_m=0.0, source="", seq=0
+        )
+
+    still, belief = np.zeros(kalman.n_u), first_belief(kalman, position(0))
+    n, steps = kalman.bias.stop, SETTLES_NS // dt_ns
+    for end_ns in range(dt_ns, (steps + 1) * dt_ns, dt_ns):
+        at_ns = end_ns - age_ns
+        belief = predicted(kalman, 0, belief, still, at_ns)
+        belief = updated(kalman, belief, position(at_ns))
+        belief = predicted(kalman, 0, belief, still, end_ns)
+        if kalman.n_felt:
+            belief = felt(kalman, belief, kalman.felt_z.dot(belief.mean), still)
+    return predicted(kalman, 0, belief, still, steps * dt_ns + dead_ns).cov[:n, :n]
 
 
 def captured_ns(sample: PositionSample) -> int:
@@ -305,11 +342,13 @@ def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> 
         raise ValueError("this filter uses no inertial data")
     if belief.doubted_ns is not None:
         return belief
-    of_z, noise = kalman.felt_z, kalman.felt_noise
+    of_z, noise, cov = kalman.felt_z, kalman.felt_noise, belief.cov
+    if belief.felt_ns is None and kalman.n_bias:
+        cov = cov + kalman.pushed
     off = accel_mps2 - of_z.dot(belief.mean)
     if u is not None:
         off -= kalman.felt_u.dot(u)
-    ph = belief.cov.dot(of_z.T)
+    ph = cov.dot(of_z.T)
     shown = of_z.dot(ph) + noise
     if not bool((np.square(off) <= FELT_SIGMA**2 * np.diagonal(shown)).all()):
         refused = belief.refused + 1
@@ -319,7 +358,7 @@ def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> 
     return replace(
         belief,
         mean=belief.mean + gain.dot(off),
-        cov=_symmetric(keep.dot(belief.cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
+        cov=_symmetric(keep.dot(cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
         felt_ns=belief.at_ns,
         refused=0,
     )

@@ -361,7 +361,7 @@ def _setpoint(
     if state.fallback is not None:
         moving, _ = moving_mps(state, tick, inp, controller)
         brake = fb.acceleration(state.fallback, inp.at_ns, moving, controller.fallback)
-        held = held_mps2(state, state.fallback, controller)
+        held = held_mps2(state, state.fallback, tick, inp, controller)
         back = back_mps2(state, tick, controller)
         want = (brake[0] + held[0] + back[0], brake[1] + held[1] + back[1], brake[2] + held[2] + back[2])
     elif state.plan is not None:

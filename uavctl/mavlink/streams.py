@@ -36,6 +36,8 @@ class Streams:
         self._seen: set[int] = set()
         self._next_ns: int | None = None
         self._tries = 0
+        self._felt_next_ns = 0
+        self._felt_tries = 0
 
     def saw(self, message: Message) -> None:
         """Take a message of the vehicle."""
@@ -49,25 +51,30 @@ class Streams:
             case Battery():
                 self._seen.add(SYS_STATUS)
             case Inertial():
-                self._feels = self._tries > 0
+                self._feels = self._felt_tries > 0
 
     def restart(self) -> None:
         """The vehicle has started anew and may have forgotten them."""
         self._seen.clear()
         self._feels = False
         self._next_ns, self._tries = None, 0
+        self._felt_next_ns, self._felt_tries = 0, 0
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
         """(message id, rate [1/s]) of what is to be asked for now; to be called once a vehicle is heard."""
+        wanted: dict[int, float] = {}
         if self._next_ns is None:
             self._next_ns = at_ns + SETTLE_NS
-        if at_ns < self._next_ns or self._tries >= TRIES:
-            return ()
-        self._next_ns = at_ns + AGAIN_NS
-        self._tries += 1
-        wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
-        if self._inertial and not self._feels:
-            wanted.update(dict.fromkeys(INERTIAL.get(autopilot, ()), INERTIAL_HZ))
+        if at_ns >= self._next_ns and self._tries < TRIES:
+            self._next_ns = at_ns + AGAIN_NS
+            self._tries += 1
+            wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
+        # Not waited for: no vehicle sends them as often by itself, and a flight may have begun.
+        kinds = INERTIAL.get(autopilot, ()) if self._inertial and not self._feels else ()
+        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
+            self._felt_next_ns = at_ns + AGAIN_NS
+            self._felt_tries += 1
+            wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
         return tuple(wanted.items())
 
 

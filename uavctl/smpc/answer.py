@@ -37,7 +37,8 @@ class Outlook:
             last τ + 1 stages holds for the reference.
         path: Trajectory to follow; None: stay at the target.
         late: Age of the position that the state was predicted from [steps].
-        cov: Covariance of the state estimate's error (n_x, n_x); None: it is exact. A design with its own uses that.
+        cov: Covariance of the state estimate's error (n_x, n_x), with those of the inputs' biases behind the states if
+            the solver counts on biases (n_x + n_u, n_x + n_u); None: it is exact. A design with its own uses that.
         sent: Input (n_u,) that acts until the plan begins, in the plan's own count; None: nothing is known of it.
     """
 

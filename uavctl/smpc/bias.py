@@ -40,7 +40,7 @@ def with_bias(plant: Plant, drift: float, *, force: bool = False) -> Plant:
     parts = [plant.transition(0.5 * plant.dt_s * (1.0 + float(node))) for node in nodes]
     mean_b = 0.5 * np.tensordot(weights, np.array([b for _, b, _ in parts]), axes=1)
     if force:
-        mean_b += 0.5 * np.tensordot(weights, np.array([a for a, _, _ in parts]), axes=1) @ _at_once(plant)
+        mean_b += 0.5 * np.tensordot(weights, np.array([a for a, _, _ in parts]), axes=1) @ at_once(plant)
     return Plant(
         a=np.block([[plant.a, plant.b], [np.zeros((n_u, n_x)), np.eye(n_u)]]),
         b=np.vstack([plant.b, np.zeros((n_u, n_u))]),
@@ -77,7 +77,7 @@ def with_wander(plant: Plant, std: Array, time_s: float) -> Plant:
     )
 
 
-def _at_once(plant: Plant) -> Array:
+def at_once(plant: Plant) -> Array:
     """J (n_x, n_u): the steady acceleration of each input in the state that lags behind it, where there is one."""
     slope, push = plant.slope
     jump = np.zeros((plant.n_x, plant.n_u))

@@ -39,6 +39,7 @@ from uavctl.smpc.link import AgeModel
 from uavctl.smpc.lqg_bound import lqr
 from uavctl.smpc.part_program import PartProgram
 from uavctl.smpc.places import Places
+from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN
 from uavctl.smpc.regulated_rows import RegulatedRows
 from uavctl.smpc.rest_backoffs import rest_backoffs
@@ -92,7 +93,8 @@ class ConditionedSolver:
         allowed: 1 - δ_x, the share of time in which the state may be outside of its limits.
         price: See `age_risk`.
         slew_mps3: How far the acceleration setpoint may go in a second [m/s³], see `SlewRows`; infinite: anywhere.
-        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost; None: it is exact.
+        cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
+        seen: The plant as the filter sees it, of n states: the plant's, then biases of its inputs; None: as it is.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -107,6 +109,7 @@ class ConditionedSolver:
         price: float = PRICE,
         slew_mps3: float = math.inf,
         cov: Array | None = None,
+        seen: Plant | None = None,
     ) -> None:
         self.problem = problem
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
@@ -118,7 +121,7 @@ class ConditionedSolver:
             adrift = sorted(set(range(plant.n_x)) - moved)
             raise DesignError("plant.b", f"states {adrift} are reached by no input", "give each state an input")
         self._regulated = RegulatedRows(problem, law, found, self._slew)
-        self._deviations = Deviations(problem, found)
+        self._deviations = Deviations(problem, found, plant if seen is None else seen)
         self._rows = self._regulated.rows
         width, hard = self._rows.size, self._regulated.hard[-1].stop
         self._parts = [
@@ -148,7 +151,7 @@ class ConditionedSolver:
         # By how many rows are in the way of a target: what a plan that rests keeps from each.
         self._rest = np.zeros((len(self._parts), width))
         self._rest[:, self._resting] = rest_backoffs(
-            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts)
+            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts), seen
         )
         self._last: tuple[tuple[int, bytes], _Margins] | None = None
 

@@ -26,7 +26,8 @@ class ConditionedDesign:
 
     Attributes:
         solver: The solver.
-        estimate_cov: Covariance (n_x, n_x) of the estimate's error after a position, which `rests` counts on.
+        estimate_cov: Covariance (n, n) of the estimate's error after a position, which `rests` counts on; with biases
+            of the inputs behind the states where the filter estimates them.
         design_id: Hash of all that its answers depend on; the target, which every question brings, is none of it.
         rests: Right sides (m_x,) of the state rows, less what a plan keeps from them that rests; from the others.
     """
@@ -68,10 +69,12 @@ class ConditionedDesign:
 AnyDesign = Design | ConditionedDesign  # what a flight is planned with, of either scheme
 
 
-def conditioned_id(problem: Problem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array) -> str:
+def conditioned_id(
+    problem: Problem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array, seen: Plant | None
+) -> str:
     """Hash of what `ConditionedSolver` is made from."""
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
-    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov))
+    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov, seen))
 
 
 def conditioned_record(design: ConditionedDesign) -> dict[str, object]:

@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 from uavctl.smpc.age_risk import AgeRisk
 from uavctl.smpc.allocation import quantile, spent
 from uavctl.smpc.baselines.problem import Problem, unseen
+from uavctl.smpc.plant import Plant
 from uavctl.smpc.slew import SlewRows
 
 Array = NDArray[np.float64]
@@ -27,7 +28,14 @@ SLACK = 0.7  # of 1 - δ_x: share of new plans that may need slack beside a limi
 
 
 def rest_backoffs(
-    problem: Problem, risk: AgeRisk, allowed: float, slew: SlewRows, c: Array, cov: Array | None, most: int
+    problem: Problem,
+    risk: AgeRisk,
+    allowed: float,
+    slew: SlewRows,
+    c: Array,
+    cov: Array | None,
+    most: int,
+    seen: Plant | None = None,
 ) -> Array:
     """What plans that rest keep from the rows `c` (m, n_x), where 1 … `most` of them share the risk (most, m).
 
@@ -37,10 +45,12 @@ def rest_backoffs(
         allowed: 1 - δ_x.
         slew: How far setpoints may go in a step.
         c: The rows.
-        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost; None: it is exact.
+        cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         most: See above.
+        seen: The plant as the filter sees it, of n states, the plant's before biases of its inputs; None: as it is. A
+            bias that is found to be another one is no news to a plan, which counts all that acts.
     """
-    asked = _asked(problem, risk, slew, c, cov)
+    asked = _asked(problem, risk, slew, c, cov, problem.plant if seen is None else seen)
     rooms = np.zeros((most, len(c)))
     for share in range(1, most + 1):
         for row in range(len(c)):
@@ -92,11 +102,12 @@ class _RestingRows:
         return found
 
 
-def _asked(problem: Problem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None) -> _RestingRows:
+def _asked(
+    problem: Problem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None, filtered: Plant
+) -> _RestingRows:
     plant, steps = problem.plant, problem.horizon
     late = int(risk.weights.argmax())
-    known = np.zeros((plant.n_x, plant.n_x)) if cov is None else cov
-    spread = unseen(plant, late + steps, known)[late:]
+    spread = unseen(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
     # How long plans are flown, by how old what they are made from becomes in the share of time π.
     flown = np.minimum.accumulate(risk.weights[late:] / risk.weights[late])
     gaps = flown - np.append(flown[1:], 0.0)

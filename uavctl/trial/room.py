@@ -48,7 +48,7 @@ def usable_seen(config: Config, design: Design | None) -> float:
     if design is not None:
         return _share(config, *resting_places(design.plant, design.state_set, build_rests(design)))
     n_x = build_plant(config).n_x
-    exact = build_conditioned(config, cov=np.zeros((n_x, n_x)))
+    exact = build_conditioned(config, flown=False, cov=np.zeros((n_x, n_x)))
     return _share(config, *resting_places(exact.plant, exact.state_set, exact.rests))
 
 
