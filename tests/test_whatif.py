@@ -14,9 +14,9 @@ from uavctl.build import build_controller, build_design
 from uavctl.data import Datagram, Decision, Plan, PositionSample, Record, Setpoint, StepInput, Truth
 from uavctl.errors import RecordingError
 from uavctl.whatif.compare import departure_m, model_fit, reproduction, until
-from uavctl.whatif.departure import Departure
+from uavctl.whatif.departure import Departure, Response
 from uavctl.whatif.fly import fly
-from uavctl.whatif.history import Entry, history_of
+from uavctl.whatif.history import Entry, history_of, response_of
 from uavctl.whatif.other_link import Relinked, captures
 
 
@@ -102,7 +102,9 @@ def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
     moved = departure_m(flight(flown(QUADROTOR)), real)
     wrong = departure_m(flight(memory), real)
     assert moved > 0.5 and 1e-3 < wrong < 0.2 * moved
-    fits = [model_fit(history(case), linear_model(config_of(case).plant), "own") for case in (ROOM, QUADROTOR)]
+    fits = [
+        model_fit(history(case), response_of(history(case), config_of(case).plant), "own") for case in (ROOM, QUADROTOR)
+    ]
     assert all(fit.r2 is not None and fit.moves > 20 for fit in fits)
     assert (fits[0].r2 or 0.0) > (fits[1].r2 or 1.0) > 0.8
     assert (fits[0].rms_m or 1.0) < (fits[1].rms_m or 0.0)
@@ -111,7 +113,7 @@ def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
 def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     config = config_of(ROOM)
     one, other = (Vehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
-    departure = Departure(one.model)
+    departure = Departure(Response(one.model))
     assert departure.begun_ns is None
     rng = np.random.default_rng(1)
     for tick in range(40):
@@ -132,7 +134,25 @@ def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     np.testing.assert_allclose(
         departure.velocity_mps(at_ns), np.subtract(other.velocity_mps, one.velocity_mps), atol=1e-12
     )
-    assert not departure.state(400_000_000).any()
+    np.testing.assert_allclose(
+        departure.acceleration_mps2(at_ns), np.subtract(other.acceleration_mps2, one.acceleration_mps2), atol=1e-12
+    )
+    assert not departure.state(400_000_000).any() and departure.acceleration_mps2(400_000_000) == (0.0, 0.0, 0.0)
+
+
+def test_what_is_sent_acts_after_the_dead_time() -> None:
+    model = linear_model(config_of(ROOM).plant)
+    at_once, late = Departure(Response(model)), Departure(Response(model, 120_000_000))
+    for at_ns, accel in ((0, (1.0, -0.5, 0.2)), (50_000_000, (0.3, 0.0, -0.1)), (900_000_000, (0.0, 0.0, 0.0))):
+        at_once.steer(at_ns, accel)
+        late.steer(at_ns, accel)
+        np.testing.assert_array_equal(late.input(at_ns), at_once.input(at_ns))  # it is sent all the same
+    assert late.begun_ns == 120_000_000
+    for at_ns in (0, 33_000_000, 50_000_000, 700_000_000, 2_000_000_000):
+        then_ns = at_ns + 120_000_000
+        np.testing.assert_allclose(late.state(then_ns), at_once.state(at_ns), atol=1e-15)
+        np.testing.assert_allclose(late.acceleration_mps2(then_ns), at_once.acceleration_mps2(at_ns), atol=1e-15)
+    assert late.acceleration_mps2(119_999_999) == (0.0, 0.0, 0.0)
 
 
 def test_too_few_positions_and_no_setpoints_are_refused() -> None:
@@ -153,9 +173,9 @@ def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
     cut = [entry for entry in flown(PAPER).entries if not (isinstance(entry[2], Setpoint) and entry[1] > end_ns)]
     memory = Memory()
     config = config_of(PAPER)
-    course = fly(
-        history_of(cut, config, "x"), config, build_controller(config), linear_model(config.plant), memory, lambda: 0
-    )
+    shortened = history_of(cut, config, "x")
+    response = response_of(shortened, config.plant)
+    course = fly(shortened, config, build_controller(config), response, memory, lambda: 0)
     assert course.end_ns == end_ns and course.ended == "no setpoint of the recording flies the vehicle any more"
     assert memory.entries[-1][1] < end_ns + 1_000_000_000
     assert max(at_ns for _, at_ns, _ in until(memory.entries, end_ns)) == end_ns
@@ -194,18 +214,18 @@ def test_captures_know_the_simulated_cameras_clock() -> None:
 def test_without_the_truth_estimates_and_a_spline_take_its_place() -> None:
     config = config_of(ROOM)
     blind = history_of(stripped(ROOM, Truth), config, "x")
-    controller, model = build_controller(config), linear_model(config.plant)
+    controller, response = build_controller(config), response_of(blind, config.plant)
     same, other = Memory(), Memory()
-    fly(blind, config, controller, model, same, lambda: 0)
+    fly(blind, config, controller, response, same, lambda: 0)
     assert [encode(one) for one in same.of(Decision)] == [encode(one) for one in flown(ROOM).of(Decision)]
     link = msgspec.structs.replace(config.link, loss=0.0)
-    fly(blind, config, controller, model, other, lambda: 0, Relinked(blind, link, 2, 0.005))
+    fly(blind, config, controller, response, other, lambda: 0, Relinked(blind, link, 2, 0.005))
     for memory in (same, other):
         memory.put("/uavctl/header", 0, header(config, build_design(config)))
     assert not other.of(Truth)
     assert 0.001 < departure_m(flight(same), flight(other)) < 0.5
     assert sum(one.accepted for one in other.of(Decision)) > sum(one.accepted for one in same.of(Decision)) + 5
-    fit = model_fit(blind, model, "own")
+    fit = model_fit(blind, response, "own")
     assert fit.moves > 20 and fit.r2 is not None and fit.r2 > 0.8
     put_back = [one for one in captures(blind, lambda: np.zeros(3)) if one.stamp_us is not None]
     known = {one.stamp_us or 0: one for one in captures(history(ROOM), lambda: np.zeros(3)) if one.stamp_us is not None}

@@ -9,7 +9,6 @@ import pytest
 from loopback_rig import Memory
 from whatif_rig import PAPER, config_of, far, flown, history
 
-from sim.vehicle import linear_model
 from uavctl.build import build_controller, build_problem
 from uavctl.campaign.controllers import build, recipe_for
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
@@ -17,6 +16,7 @@ from uavctl.data import Plan, Truth
 from uavctl.smpc.batch import News
 from uavctl.whatif.baseline import BaselineSolver
 from uavctl.whatif.fly import fly
+from uavctl.whatif.history import response_of
 
 
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
@@ -59,7 +59,7 @@ def test_a_baseline_flies_and_its_plans_say_so() -> None:
         history(PAPER),
         config,
         dataclasses.replace(controller, solver=solver),
-        linear_model(config.plant),
+        response_of(history(PAPER), config.plant),
         memory,
         lambda: 0,
     )

@@ -55,6 +55,8 @@ def worse_link(summary: FlightSummary) -> WhatIf:
         compared_s=6.0,
         ended="the recording ends",
         largest_departure_m=0.0,
+        inertial_moved=0,
+        inertial_left_out=0,
         recorded=summary,
         reproduced=summary,
         what_if=summary,
@@ -97,6 +99,14 @@ def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
     (said,) = (text for text in story(worse_link(summary)) if "link: loss=0.5" in text)
     assert "nothing" not in said
+
+
+def test_inertial_messages_that_are_left_out_are_told(recorded: FlightData) -> None:
+    found = worse_link(summarise(recorded, wall_s=None))
+    assert not any("inertial" in text for text in story(found))
+    lacking = msgspec.structs.replace(found, inertial_moved=30, inertial_left_out=12)
+    (said,) = (text for text in story(lacking) if "inertial" in text)
+    assert said.startswith("12 of 42 inertial messages of the vehicle are left out")
 
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:

@@ -7,11 +7,10 @@ from functools import cache
 import numpy as np
 from loopback_rig import Memory, header, lockstep, shared
 
-from sim.vehicle import linear_model
 from uavctl.config import Config, load_config
 from uavctl.data import Record, Truth
 from uavctl.whatif.fly import Course, OtherLink, fly
-from uavctl.whatif.history import Entry, History, history_of
+from uavctl.whatif.history import Entry, History, history_of, response_of
 
 EXACT = ("solver.method=exact",)
 PAPER = ("paper", 20.0, EXACT)
@@ -43,8 +42,8 @@ def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Me
     config, memory = config_of(case, *changes), Memory()
     design, controller = shared(config)
     memory.put("/uavctl/header", 0, header(config, design))
-    model = linear_model(config_of(case).plant)
-    course = fly(history(case), config, controller, model, memory, lambda: 0, other)
+    response = response_of(history(case), config_of(case).plant)
+    course = fly(history(case), config, controller, response, memory, lambda: 0, other)
     return memory, course
 
 

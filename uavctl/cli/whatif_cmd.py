@@ -27,21 +27,21 @@ from logs.recorder import SyncRecorder
 from logs.summary import count, summarise
 from logs.topics import HEADER, RecorderNote
 from logs.views import Views
-from sim.vehicle import LinearModel
 from uavctl.campaign.spec import Kind
 from uavctl.cli.common import SEED, Common, Flight, Json, messages, warn
 from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.recorded import changed_flyer, recorded_flyer
 from uavctl.cli.replaying import check_first, other_versions
-from uavctl.cli.whatif_config import baseline_flyer, changed, model_of
+from uavctl.cli.whatif_config import baseline_flyer, changed, plant_of
 from uavctl.config.link import LinkConfig
 from uavctl.config.load import parse
 from uavctl.data import Header, Record
 from uavctl.errors import UsageError
 from uavctl.whatif.compare import WhatIf, departure_m, model_fit, reproduction, until
+from uavctl.whatif.departure import Response
 from uavctl.whatif.fly import Course, OtherLink, Watch, fly
-from uavctl.whatif.history import Entry, History, history_of
+from uavctl.whatif.history import Entry, History, history_of, response_of
 from uavctl.whatif.other_link import Relinked
 from uavctl.whatif.page import HEADINGS, side_by_side, story, write_page
 
@@ -92,10 +92,11 @@ def whatif(
     loaded = changed(before, recorded.config_toml, flight, config, overrides)
     keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
     on = changed(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link
-    answers, source = model_of(model, before)
+    plant, source = plant_of(model, before)
     with _progress() as progress:
         entries = progress.track(read(flight), total=known_number(flight), description="reading")
         history = history_of(entries, before, str(flight))
+    response = response_of(history, plant)
     _warn(flight, recorded, history)
     was = recorded_flyer(flight, before)
     if controller == "smpc":
@@ -105,9 +106,9 @@ def whatif(
     other = None if over == RECORDED else _relinked(history, on, seed)
     begun = time.perf_counter()
     with new_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
-        again = _reproduced(history, was, answers, _watch(progress, "reproducing the flight"))
+        again = _reproduced(history, was, response, _watch(progress, "reproducing the flight"))
         course, status = _recorded(
-            history, now, answers, other, path, recorded, _watch(progress, "flying it otherwise")
+            history, now, response, other, path, recorded, _watch(progress, "flying it otherwise")
         )
         progress.add_task("writing the pages", total=None)
         conclude(path, time.perf_counter() - begun, status)
@@ -123,13 +124,15 @@ def whatif(
         result = WhatIf(
             flight=str(flight),
             reproduction=reproduction(sides[0], sides[1]),
-            model=model_fit(history, answers, source),
+            model=model_fit(history, response, source),
             controller=controller,
             link=over,
             changed=given,
             compared_s=(course.end_ns - sides[0].origin_ns + sides[0].tick_ns) * 1e-9,
             ended=course.ended,
             largest_departure_m=departure_m(sides[0], sides[2]),
+            inertial_moved=course.inertial_moved,
+            inertial_left_out=course.inertial_left_out,
             recorded=summarise(sides[0], wall_s=None),
             reproduced=summarise(sides[1], wall_s=None),
             what_if=summarise(sides[2], wall_s=None),
@@ -204,18 +207,18 @@ class _Memory:
         self.entries.append((topic, at_ns, record))
 
 
-def _reproduced(history: History, was: Prepared, model: LinearModel, watch: Watch) -> tuple[Entry, ...]:
+def _reproduced(history: History, was: Prepared, response: Response, watch: Watch) -> tuple[Entry, ...]:
     """The recorded flight again, nothing changed."""
     memory = _Memory()
     memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
-    fly(history, was.config, was.controller, model, memory, lambda: 0, watch=watch)
+    fly(history, was.config, was.controller, response, memory, lambda: 0, watch=watch)
     return tuple(memory.entries)
 
 
 def _recorded(
     history: History,
     now: Prepared,
-    model: LinearModel,
+    response: Response,
     other: OtherLink | None,
     path: Path,
     recorded: Header,
@@ -225,7 +228,7 @@ def _recorded(
     recorder = SyncRecorder(path, now.config.log, onlookers=Onlookers(Views()))
     try:
         put_header(recorder, now, recorded.started_ns)
-        course = fly(history, now.config, now.controller, model, recorder, time.perf_counter_ns, other, watch)
+        course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
     except BaseException:
         recorder.close()
         path.unlink(missing_ok=True)

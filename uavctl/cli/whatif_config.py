@@ -10,7 +10,6 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from sim.vehicle import LinearModel, linear_model
 from uavctl.build import build_problem, design_of
 from uavctl.campaign.controllers import build, recipe_for
 from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
@@ -78,18 +77,18 @@ def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
         raise UsageError(f"{what} has {told[0]}, the recorded flight {told[1]}; give one of the same kind")
 
 
-def model_of(path: Path | None, before: Config) -> tuple[LinearModel, str]:
-    """The model that answers to other setpoints, and what it is called.
+def plant_of(path: Path | None, before: Config) -> tuple[PlantConfig, str]:
+    """The plant that answers to other setpoints, and what it is called.
 
     Raises:
         ConfigError: The file is no configuration.
         UsageError: It is of another kind than the recorded plant.
     """
     if path is None:
-        return linear_model(before.plant), "the recording's [plant]"
+        return before.plant, "the recording's [plant]"
     plant = load(str(path)).config.plant
     check_plant(plant, before.plant, f"--model {path}: plant")
-    return linear_model(plant), f"[plant] of {path}"
+    return plant, f"[plant] of {path}"
 
 
 def baseline_flyer(loaded: Loaded, kind: Kind, start: Array) -> Prepared:

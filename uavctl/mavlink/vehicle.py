@@ -8,7 +8,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
-from uavctl.frames import from_euler, rotate
+from uavctl.frames import Quaternion, from_euler, rotate
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
 
@@ -142,6 +142,12 @@ class VehicleWatch:
         """How long ago it started, by its own clock [s]; None if it does not tell."""
         return None if self._boot_ms is None else self._boot_ms / 1e3 + (at_ns - self._boot_read_ns) / 1e9
 
+    def attitude(self, at_ns: int) -> Quaternion | None:
+        """What turns a specific force of that time into local NED (w, x, y, z); None where it is old or unknown."""
+        if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
+            return None
+        return from_euler(self._turned[0])
+
     def _clock(self, boot_ms: int, at_ns: int) -> tuple[VehicleStatus, ...]:
         """Watch its time since boot, modulo 2**32 ms; a status tells at once that it has started anew."""
         last_ms, self._boot_ms, self._boot_read_ns = self._boot_ms, boot_ms, at_ns
@@ -187,9 +193,7 @@ class VehicleWatch:
         if not self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.specific_force_mps2, at_ns):
             self._bad(UNPUNCTUAL)
             return ()
-        if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
-            return ()
-        attitude = from_euler(self._turned[0])
+        attitude = self.attitude(at_ns)
         turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
         if turned is None:
             return ()

@@ -14,8 +14,9 @@ from logs.encoding import encode
 from logs.flight_data import FlightData
 from logs.summary import FlightSummary
 from logs.topics import RecorderNote
-from sim.vehicle import CACHED_TRANSITIONS, LinearModel
+from sim.vehicle import CACHED_TRANSITIONS
 from uavctl.data import Decision, Estimate, Plan, Record, Setpoint, Truth
+from uavctl.whatif.departure import Response
 from uavctl.whatif.history import Entry, History
 
 Array = NDArray[np.float64]
@@ -56,6 +57,8 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
     compared_s: float  # up to here both can be told
     ended: str  # why not further
     largest_departure_m: float  # of the position, from the recorded one
+    inertial_moved: int  # messages of the vehicle's inertial sensors with the other course's acceleration
+    inertial_left_out: int  # and those left out of it: without an attitude of their time, late, or frozen
     recorded: FlightSummary  # up to compared_s, as the others
     reproduced: FlightSummary
     what_if: FlightSummary
@@ -84,17 +87,17 @@ def reproduction(recorded: FlightData, again: FlightData) -> Reproduction:
     )
 
 
-def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
+def model_fit(history: History, response: Response, source: str) -> ModelFit:
     """Predict the motion of the next second from each boundary of the recorded flight.
 
     From the true states where they are known, else from the estimates; in stretches without a setpoint nothing is.
 
     Args:
         history: The recorded flight.
-        model: The model, of as many states as the recorded plant.
+        response: The model, of as many states as the recorded plant, and its dead time.
         source: What it is called.
     """
-    flight = history.flight
+    flight, model = history.flight, response.model
     known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
     states = {one.at_ns: np.array(one.state if isinstance(one, Truth) else one.mean) for one in known}
     steps = max(1, round(AHEAD_S * 1e9 / model.dt_ns))
@@ -105,7 +108,7 @@ def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
     moved, told = [], []
     transition = lru_cache(maxsize=CACHED_TRANSITIONS)(model.transition)
     for at_ns in boundaries:
-        predicted = _predicted(history, model, transition, states[at_ns], at_ns, at_ns + ahead_ns)
+        predicted = _predicted(history, response, transition, states[at_ns], at_ns, at_ns + ahead_ns)
         if predicted is not None:
             index = list(model.position_index)
             moved.append((states[at_ns + ahead_ns] - states[at_ns])[index])
@@ -122,16 +125,18 @@ def model_fit(history: History, model: LinearModel, source: str) -> ModelFit:
 
 
 def _predicted(
-    history: History, model: LinearModel, transition: _Transition, x: Array, begin_ns: int, end_ns: int
+    history: History, response: Response, transition: _Transition, x: Array, begin_ns: int, end_ns: int
 ) -> Array | None:
     """State at the end under the setpoints that were flown; None if any was not."""
-    tick_ns = max(1, history.flight.tick_ns)
-    for at_ns in range(begin_ns, end_ns, tick_ns):
-        accel = history.setpoints.get(at_ns)
-        if accel is None or not history.taken.get(at_ns, False):
+    tick_ns, model = max(1, history.flight.tick_ns), response.model
+    late = -(-response.dead_ns // tick_ns)  # ticks in which what acts at the begin was sent
+    for sent_ns in range(begin_ns - late * tick_ns, end_ns - response.dead_ns, tick_ns):
+        accel = history.setpoints.get(sent_ns)
+        if accel is None or not history.taken.get(sent_ns, False):
             return None
+        acts_ns = sent_ns + response.dead_ns
         u = np.array([accel[axis] for axis in model.axes]) / model.accel_per_input
-        a, b, _ = transition(min(tick_ns, end_ns - at_ns))
+        a, b, _ = transition(min(acts_ns + tick_ns, end_ns) - max(acts_ns, begin_ns))
         x = a @ x + b @ u
     return x
 

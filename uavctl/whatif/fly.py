@@ -10,13 +10,14 @@ from typing import Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from sim.vehicle import LinearModel
 from uavctl.config import Config
 from uavctl.data import Datagram, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3
 from uavctl.flight.controller import Controller
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
-from uavctl.whatif.departure import Departure
+from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.whatif.departure import Departure, Response
 from uavctl.whatif.history import Entry, History
+from uavctl.whatif.inertial import InertialFrames
 from uavctl.whatif.rewrite import Axes
 
 TRUTH = "/sim/truth"
@@ -46,6 +47,8 @@ class Course:
 
     Attributes:
         departure: From the recorded one.
+        inertial_moved: Inertial frames of the vehicle's that were given its other acceleration.
+        inertial_left_out: Inertial frames that were left out, because none can be told of them.
         end_ns: Tick up to which both were flown on setpoints [ns].
         ended: Why not further.
     """
@@ -53,13 +56,15 @@ class Course:
     departure: Departure
     end_ns: int = 0
     ended: str = _WHOLE
+    inertial_moved: int = 0
+    inertial_left_out: int = 0
 
 
 def fly(
     history: History,
     config: Config,
     controller: Controller,
-    model: LinearModel,
+    response: Response,
     sink: Sink,
     stopwatch: Callable[[], int],
     other: OtherLink | None = None,
@@ -71,7 +76,7 @@ def fly(
         history: The recorded flight.
         config: What flies in it now; connections, frame and source are those of the recording.
         controller: Its controller.
-        model: How the vehicle answers to setpoints that differ from the recorded ones.
+        response: How the vehicle answers to setpoints that differ from the recorded ones.
         sink: Gets what a recording of this flight holds, but for its header.
         stopwatch: Time for the timing records [ns].
         other: The link that positions come over; else they come when they came.
@@ -79,7 +84,7 @@ def fly(
     """
     tap = _Tap(sink)
     loop = ControlLoop(config, controller, tap, stopwatch)
-    flight = _Flight(history, loop, tap, Course(Departure(model)), other)
+    flight = _Flight(history, loop, tap, Course(Departure(response)), other)
     for _, _, record in watch(history.entries):
         if isinstance(record, StepInput):
             flight.tick(record)
@@ -120,12 +125,13 @@ class _Flight:
         daemon = history.config.daemon
         self._positions_link = VEHICLE if daemon.vehicle == daemon.mocap else MOCAP
         self._axes = Axes(history.config.frame)
+        self._inertial = InertialFrames(daemon)
         self._begun = False
         self._apart_ns: int | None = None  # since when one of the two is not flown on setpoints
 
     def arrive(self, record: Datagram) -> None:
         """Let a recorded datagram come, its positions moved, or taken out where another link carries them."""
-        data = self._moved(record.data, record.at_ns)
+        data = self._moved(record.data, record.at_ns, of_vehicle=record.link == VEHICLE)
         if data or not record.data:
             self._loop.receive(record.link, data, record.at_ns)
 
@@ -177,24 +183,43 @@ class _Flight:
         else:
             self.over = at_ns - self._apart_ns > LONGEST_PAUSE_NS
 
-    def _moved(self, data: bytes, at_ns: int) -> bytes:
+    def _moved(self, data: bytes, at_ns: int, *, of_vehicle: bool) -> bytes:
+        """The bytes as they would have come: positions, own velocity and inertial data of the other course."""
         departure = self.course.departure
-        if self._other is None and departure.begun_ns is None:
+        begun = departure.begun_ns is not None
+        if not (begun or of_vehicle or self._other is not None):
             return data
         parts: list[bytes] = []
         done = 0
-        for seen in self._axes.seen(data):
-            captured_ns = self._history.captured_ns(seen, at_ns)
-            own = captured_ns is None and seen.position.local_ned  # the vehicle's word of itself, on its own connection
-            if captured_ns is None and not own:
-                continue
-            begin = data.index(seen.frame.data, done)
-            parts.append(data[done:begin])
-            done = begin + len(seen.frame.data)
-            if self._other is None or own:
-                when_ns = at_ns if captured_ns is None else captured_ns
-                parts.append(self._axes.moved(seen, departure.position_m(when_ns), departure.velocity_mps(when_ns)))
+        for frame in scan(data, final=True).frames:
+            now = self._shown(frame, at_ns, begun=begun)
+            if of_vehicle:  # it follows the recorded vehicle, so it hears of positions too
+                other = self._inertial.heard(frame, at_ns, departure.acceleration_mps2(at_ns) if begun else None)
+                now = other if now is frame.data else now
+            if now is not frame.data:
+                begin = data.index(frame.data, done)
+                parts += (data[done:begin], now)
+                done = begin + len(frame.data)
+        self.course.inertial_moved = self._inertial.moved
+        self.course.inertial_left_out = self._inertial.left_out
         return b"".join((*parts, data[done:]))
+
+    def _shown(self, frame: RawFrame, at_ns: int, *, begun: bool) -> bytes:
+        """A frame, its position moved; nothing where another link carries it."""
+        seen = self._axes.position(frame) if begun or self._other is not None else None
+        if seen is None:
+            return frame.data
+        captured_ns = self._history.captured_ns(seen, at_ns)
+        own = captured_ns is None and seen.position.local_ned  # the vehicle's word of itself, on its own connection
+        if captured_ns is None and not own:
+            return frame.data
+        if self._other is not None and not own:
+            return b""
+        if not begun:
+            return frame.data
+        departure = self.course.departure
+        when_ns = at_ns if captured_ns is None else captured_ns
+        return self._axes.moved(seen, departure.position_m(when_ns), departure.velocity_mps(when_ns))
 
 
 def _plus(a: Vec3, b: Vec3) -> Vec3:

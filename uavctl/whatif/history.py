@@ -10,14 +10,17 @@ from msgspec.structs import replace
 
 from logs.flight_data import FlightData
 from sim.mocap import COMPONENT_ID, SYSTEM_ID, UPTIME_S
+from sim.vehicle import linear_model
 from uavctl.config import Config
 from uavctl.config.peers import DaemonConfig
+from uavctl.config.types import PlantConfig
 from uavctl.data import Datagram, PositionSample, Record, Setpoint, StepInput, Vec3
 from uavctl.errors import RecordingError
 from uavctl.loop import MOCAP, VEHICLE
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.link import STREAM_SCHEMES
 from uavctl.mavlink.messages import Position
+from uavctl.whatif.departure import Response
 from uavctl.whatif.rewrite import Seen
 
 Entry = tuple[str, int, Record]
@@ -104,6 +107,16 @@ def history_of(entries: Iterable[Entry], config: Config, name: str) -> History:
             f"{name}: the vehicle never took a setpoint in it, so there is nothing that could have gone otherwise"
         )
     return History(kept, flight, config, setpoints, taken, dict(samples))
+
+
+def response_of(history: History, plant: PlantConfig) -> Response:
+    """How the recorded vehicle answers to setpoints if this is its plant; the simulator's linear one has no dead time.
+
+    Raises:
+        DesignError: There is no motion between its steps.
+    """
+    at_once = bool(history.flight.truths) and history.config.sim.plant == "linear"
+    return Response(linear_model(plant), 0 if at_once else round(plant.dead_time_s * 1e9))
 
 
 def _whole_frames(entries: Iterable[Entry], daemon: DaemonConfig) -> Iterator[Entry]:

@@ -18,6 +18,7 @@ _HEIGHT_IN = 2.6
 RECORDED, MIGHT = "truth", "plan"  # roles of the colours
 HEADINGS = ("", "recorded", "reproduced", "what-if")
 _NOT_FLOWN = ("Decision time", "Clock", "Tick lateness")  # of the computer, which was another, or did something else
+_WORTH_TELLING = 0.01  # of the inertial messages: a few are always older than the first attitude, or late
 _MARKS = (
     Mark("line", RECORDED, "recorded"),
     Mark("line", MIGHT, "what-if"),
@@ -57,12 +58,20 @@ def story(found: WhatIf) -> list[str]:
     within = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
     explained = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{within}"
     changed = f"Changed: {', '.join(found.changed)}" if found.changed else "No key of the configuration was changed"
+    inertial = []
+    total = found.inertial_moved + found.inertial_left_out
+    if found.inertial_left_out > _WORTH_TELLING * total:
+        inertial.append(
+            f"{found.inertial_left_out} of {total} inertial messages of the vehicle are left out of the other course: "
+            "late, frozen, or without an attitude that turns its acceleration."
+        )
     return [
         f"Reproduced with nothing changed, {same}.",
         f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times{explained}.",
         f"{changed}; controller {found.controller}; link: {found.link}.",
         f"Compared over {found.compared_s:.1f} s: {found.ended}. The flights came {found.largest_departure_m:.3g} m "
         "apart.",
+        *inertial,
     ]
 
 

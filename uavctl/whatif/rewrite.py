@@ -35,9 +35,16 @@ class Axes:
     def seen(self, data: bytes) -> Iterator[Seen]:
         """The positions in some bytes, in order."""
         for frame in scan(data, final=True).frames:
-            for message in decode(frame.data).messages:
-                if isinstance(message, Position):
-                    yield Seen(frame, message, self._to_ned(message))
+            seen = self.position(frame)
+            if seen is not None:
+                yield seen
+
+    def position(self, frame: RawFrame) -> Seen | None:
+        """The position that a frame holds, if any."""
+        for message in decode(frame.data).messages:
+            if isinstance(message, Position):
+                return Seen(frame, message, self._to_ned(message))
+        return None
 
     def moved(self, seen: Seen, by_m: Vec3, by_mps: Vec3, *, stamp_us: int | None = None) -> bytes:
         """The frame with its position and velocity moved.
@@ -60,10 +67,7 @@ class Axes:
             message.vx, message.vy, message.vz = message.vx + vx, message.vy + vy, message.vz + vz
         if stamp_us is not None:
             _stamp(message, stamp_us)
-        sender = mavlink.MAVLink(None, seen.position.system, seen.position.component)
-        sender.seq = message.get_seq()
-        first_version = seen.frame.data[0] == mavlink.PROTOCOL_MARKER_V1
-        return bytes(message.pack(sender, force_mavlink1=first_version))
+        return packed(message, seen.frame)
 
     def _to_ned(self, position: Position) -> Vec3:
         return position.position_m if position.local_ned else self._frame(position).to_ned(position.position_m)
@@ -74,6 +78,18 @@ class Axes:
     def _frame(self, position: Position) -> Frame:
         config = self._config
         return Frame(position.convention or config.convention, config.origin_m, config.yaw_deg)
+
+
+def packed(message: Any, frame: RawFrame) -> bytes:
+    """Pack a message as the sender of a frame did: in its version of MAVLink, with its address and number."""
+    sender = mavlink.MAVLink(None, message.get_srcSystem(), message.get_srcComponent())
+    sender.seq = message.get_seq()
+    return bytes(message.pack(sender, force_mavlink1=frame.data[0] == mavlink.PROTOCOL_MARKER_V1))
+
+
+def system(frame: RawFrame) -> int:
+    """Which system sent a frame."""
+    return frame.data[3 if frame.data[0] == mavlink.PROTOCOL_MARKER_V1 else 5]
 
 
 def _stamp(message: Any, stamp_us: int) -> None:

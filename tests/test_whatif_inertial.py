@@ -1,0 +1,267 @@
+"""Inertial data of the flight that might have been: what its sensors would have said, as a flight then really shows."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from inertial_rig import ATTITUDE, HIGHRES, QUATERNION
+from loopback_rig import Memory
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from whatif_rig import Case, again, config_of, flown, history
+
+from logs.encoding import encode
+from uavctl.build import build_controller
+from uavctl.data import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
+from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.mavlink.vehicle import VehicleWatch
+from uavctl.whatif.compare import model_fit
+from uavctl.whatif.departure import Response
+from uavctl.whatif.fly import fly
+from uavctl.whatif.history import history_of, response_of
+from uavctl.whatif.inertial import InertialFrames, shifted
+from uavctl.whatif.other_link import Relinked
+
+MILLI_G_MPS2 = 9.80665e-3
+BY: Vec3 = (0.7, -1.3, 0.4)
+LEANING: Vec3 = (0.21, -0.13, 2.4)  # roll, pitch, yaw [rad]
+HOLDS_FROM_NS = 10_000_000_000
+PX4: Case = ("room-px4", 20.0, ())
+ARDUPILOT: Case = ("room-ardupilot", 20.0, ())
+LINEAR: Case = ("room", 10.0, ())
+LINEAR_ARDUPILOT: Case = ("room", 10.0, ("sim.autopilot=ardupilot",))
+TARGET: Vec3 = (0.5, 0.5, -1.0)
+ELSEWHERE = "target.position_m=[0.5, 0.5, -1.0]"
+
+
+@dataclass
+class Speaker:
+    """A vehicle that says what it is told to."""
+
+    autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    number: int = 0
+
+    def says(self, name: str, *fields: Any, first_version: bool = False) -> RawFrame:
+        mav = mavlink.MAVLink(None, 1, 1)
+        mav.seq, self.number = self.number, self.number + 1
+        packed = getattr(mavlink, f"MAVLink_{name}_message")(*fields).pack(mav, force_mavlink1=first_version)
+        (frame,) = scan(bytes(packed), final=True).frames
+        return frame
+
+    def beat(self) -> RawFrame:
+        return self.says("heartbeat", mavlink.MAV_TYPE_QUADROTOR, self.autopilot, 0, 0, 4, 3)
+
+    def leans(self, stamp_ms: int, *, quaternion: bool, angles: Vec3 = LEANING) -> RawFrame:
+        if quaternion:
+            return self.says("attitude_quaternion", stamp_ms, *turn(angles), 0.0, 0.0, 0.0)
+        return self.says("attitude", stamp_ms, *angles, 0.0, 0.0, 0.0)
+
+    def feels(self, kind: str, stamp_us: int, force: Vec3, *, first_version: bool = False) -> RawFrame:
+        if kind == "highres_imu":
+            return self.says(kind, stamp_us, *force, *(0.01, 0.02, 0.03), *(0.0,) * 7, 63, first_version=first_version)
+        whole = [round(one / MILLI_G_MPS2) for one in force]
+        stamp = stamp_us if kind == "raw_imu" else stamp_us // 1000
+        return self.says(kind, stamp, *whole, 1, 2, 3, 0, 0, 0, first_version=first_version)
+
+
+def turn(angles: Vec3) -> Quaternion:
+    found = from_euler(angles)
+    assert found is not None
+    return found
+
+
+def force_of(frame: bytes) -> Vec3:
+    message: Any = mavlink.MAVLink(None).decode(bytearray(frame))
+    unit = 1.0 if message.get_type() == "HIGHRES_IMU" else MILLI_G_MPS2
+    return unit * message.xacc, unit * message.yacc, unit * message.zacc
+
+
+@pytest.mark.parametrize("first_version", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "resolution"),
+    [("highres_imu", 2e-6), ("raw_imu", MILLI_G_MPS2 / 2), ("scaled_imu2", MILLI_G_MPS2 / 2)],
+)
+def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution: float, first_version: bool) -> None:
+    speaker, attitude = Speaker(number=200), turn(LEANING)
+    frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
+    moved = shifted(frame, attitude, BY)
+    was, now = (rotate(attitude, force_of(one)) for one in (frame.data, moved))
+    assert was is not None and now is not None
+    # The rounding of three fields, turned.
+    np.testing.assert_allclose(np.subtract(now, was), BY, atol=math.sqrt(3.0) * resolution)
+    before, after = (mavlink.MAVLink(None).decode(bytearray(one)) for one in (frame.data, moved))
+    assert moved[0] == frame.data[0] and after.get_seq() == 200 and after.get_srcSystem() == 1
+    for name in set(before.fieldnames) - {"xacc", "yacc", "zacc"}:
+        assert getattr(before, name) == getattr(after, name)
+    assert shifted(frame, attitude, (0.0, 0.0, 0.0)) == frame.data
+
+
+def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
+    frame = Speaker().feels("raw_imu", 5_000_000, (310.0, 0.0, -310.0))
+    assert force_of(shifted(frame, (1.0, 0.0, 0.0, 0.0), (50.0, 0.0, -50.0))) == pytest.approx(
+        (32767 * MILLI_G_MPS2, 0.0, -32768 * MILLI_G_MPS2)
+    )
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "quaternion", "kind", "resolution"),
+    [
+        (mavlink.MAV_AUTOPILOT_PX4, True, "highres_imu", 2e-6),
+        (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, False, "raw_imu", MILLI_G_MPS2 / 2),
+    ],
+    ids=["px4", "ardupilot"],
+)
+def test_the_controller_reads_the_acceleration_more(
+    autopilot: int, quaternion: bool, kind: str, resolution: float
+) -> None:
+    speaker = Speaker(autopilot)
+    frames = InertialFrames(config_of(LINEAR).daemon)
+    recorded, other = (VehicleWatch(lambda _: None, (245, 191), inertial=True) for _ in range(2))
+    read: tuple[list[InertialSample], list[InertialSample]] = ([], [])
+    said = [speaker.beat()]
+    for i in range(20):
+        said.append(speaker.leans(1000 + 20 * i, quaternion=quaternion, angles=(0.01 * i, -0.02 * i, 0.3 * i)))
+        said.append(speaker.feels(kind, 1_000_000 + 20_000 * i, (0.3 + 0.1 * i, -0.1 * i, -9.8)))
+    for place, frame in enumerate(said):
+        at_ns = 10_000_000 * place
+        data = frames.heard(frame, at_ns, BY)
+        for bytes_of, watch, heard in ((frame.data, recorded, read[0]), (data, other, read[1])):
+            for message in decode(bytes_of).messages:
+                heard += [one for one in watch.take(message, at_ns) if isinstance(one, InertialSample)]
+    assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.left_out == 0
+    more = [np.subtract(now.accel_mps2, was.accel_mps2) for was, now in zip(*read, strict=True)]
+    np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)
+
+
+def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> None:
+    speaker, frames = Speaker(), InertialFrames(config_of(LINEAR).daemon)
+
+    def heard(frame: RawFrame, at_ms: int, by: Vec3 | None = BY) -> bool:
+        return bool(frames.heard(frame, at_ms * 1_000_000, by))
+
+    assert heard(speaker.beat(), 0) and heard(speaker.feels("raw_imu", 5000, (0.1, 0.0, -9.8)), 5, None)
+    assert not heard(speaker.feels("raw_imu", 10_000, (0.2, 0.0, -9.8)), 10)  # no attitude yet
+    assert heard(speaker.leans(12, quaternion=False), 12)
+    assert heard(speaker.feels("raw_imu", 20_000, (0.3, 0.0, -9.8)), 20)
+    assert not heard(speaker.feels("raw_imu", 20_000, (0.3, 0.0, -9.8)), 25)  # said again
+    assert not heard(speaker.feels("raw_imu", 40_000, (0.3, 0.0, -9.8)), 40)  # frozen
+    assert not heard(speaker.feels("raw_imu", 45_000, (0.5, 0.0, -9.8)), 145)  # late
+    assert not heard(speaker.feels("scaled_imu2", 200_000, (0.5, 0.0, -9.8)), 200)  # the attitude is old
+    assert not heard(speaker.feels("highres_imu", 200_000, (0.5, 0.0, math.nan)), 200)
+    assert (frames.moved, frames.left_out) == (1, 6)
+    other = mavlink.MAVLink_raw_imu_message(220_000, 9, 9, 9, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, 2, 1))
+    (frame,) = scan(bytes(other), final=True).frames  # nobody follows that vehicle
+    assert frames.heard(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.left_out) == (1, 6)
+
+
+@pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
+def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
+    memory, course = again(case)
+    for kind in (StepInput, Decision, Plan, Setpoint, Datagram, Truth):
+        mine, recorded = memory.of(kind), flown(case).of(kind)
+        assert len(mine) == len(recorded) > 0
+        assert [encode(one) for one in mine] == [encode(one) for one in recorded]
+    assert sum(len(one.inertial) for one in memory.of(StepInput)) > 500
+    assert course.departure.begun_ns is None and course.inertial_moved == course.inertial_left_out == 0
+
+
+@pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
+@pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
+def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Case, change: str) -> None:
+    memory, course = again(case, change)
+    real = flown(case, change)
+    feels, truly, recorded = (felt(side) for side in (memory, real, flown(case)))
+    assert feels.shape == truly.shape == recorded.shape and course.inertial_left_out <= 1  # one before any attitude
+    assert np.abs(recorded - truly).max() > 0.25  # the recorded ones would have been wrong
+    # The attitude that is told errs by a few thousandths; RAW_IMU is rounded twice.
+    assert np.abs(feels - truly).max() < 0.03
+    own, truly_own = (velocities(side) for side in (memory, real))
+    assert len(own) > 100 and np.abs(own - truly_own).max() < 5e-3
+    assert largest_m(memory, real) < 3e-3
+
+
+@pytest.mark.parametrize(("case", "most"), [(PX4, 0.02), (ARDUPILOT, 0.04)], ids=["px4", "ardupilot"])
+@pytest.mark.parametrize(
+    ("change", "target"),
+    [(ELSEWHERE, TARGET), ("cost.input=[3.0, 3.0, 3.0]", None), ("link.loss=0.6", None)],
+    ids=["target", "cost", "loss"],
+)
+def test_the_true_quadrotor_holds_as_it_then_really_does(
+    case: Case, most: float, change: str, target: Vec3 | None
+) -> None:
+    other = None
+    if change.startswith("link."):
+        before = config_of(case).sim
+        other = Relinked(history(case), config_of(case, change).link, before.seed, before.camera.noise_std_m)
+    memory, course = again(case, change, other=other)
+    real = flown(case, change)
+    place = target or config_of(case).target.position_m
+    assert not inertial_events(real) and not inertial_events(memory)
+    assert 0.9 < hold_m(memory, place) / hold_m(real, place) < 1.1
+    assert hold_m(memory, place) < 0.02
+    assert largest_m(memory, real) < most < largest_m(real, flown(case)) + most
+    assert course.inertial_moved > 500 and course.inertial_left_out <= 1
+
+
+def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
+    def blind(data: bytes) -> bytes:
+        return b"".join(
+            one.data for one in scan(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
+        )
+
+    entries = [
+        (topic, at_ns, msgspec.structs.replace(one, data=blind(one.data)) if isinstance(one, Datagram) else one)
+        for topic, at_ns, one in flown(PX4).entries
+    ]
+    config, memory = config_of(PX4, ELSEWHERE), Memory()
+    recorded = history_of(entries, config_of(PX4), "x")
+    course = fly(recorded, config, build_controller(config), response_of(recorded, config.plant), memory, lambda: 0)
+    assert course.inertial_moved == 0 and course.inertial_left_out > 500
+    came = [frame for one in memory.of(Datagram) if not one.outgoing for frame in scan(one.data, final=True).frames]
+    parted_ns = course.departure.begun_ns
+    assert parted_ns is not None and sum(frame.message_id == HIGHRES for frame in came) < 20
+    assert not any(one.inertial for one in memory.of(StepInput))
+    assert "inertial-doubted" not in inertial_events(memory) and hold_m(memory, TARGET) < 0.2
+
+
+@pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
+def test_the_dead_time_belongs_to_the_model(case: Case) -> None:
+    response = response_of(history(case), config_of(case).plant)
+    assert response.dead_ns == round(config_of(case).plant.dead_time_s * 1e9) > 0
+    late, at_once = (model_fit(history(case), one, "own") for one in (response, Response(response.model)))
+    assert late.rms_m is not None and at_once.rms_m is not None
+    assert late.rms_m < at_once.rms_m and late.moves > 300
+    assert response_of(history(LINEAR), config_of(LINEAR).plant).dead_ns == 0
+
+
+def inertial_events(memory: Memory) -> Counter[str]:
+    return Counter(one.code for one in memory.of(Event) if one.code.startswith("inertial-"))
+
+
+def felt(memory: Memory) -> NDArray[np.float64]:
+    """Accelerations (n, 3) that the controller read of inertial data."""
+    return np.array([sample.accel_mps2 for one in memory.of(StepInput) for sample in one.inertial])
+
+
+def velocities(memory: Memory) -> NDArray[np.float64]:
+    """The vehicle's own velocities (n, 3), as ticks knew them."""
+    return np.array([one.motion.velocity_mps for one in memory.of(StepInput) if one.motion and one.motion.velocity_mps])
+
+
+def hold_m(memory: Memory, place: Vec3) -> float:
+    """Distance of the true positions from a place, root mean square."""
+    held = [one.position_m for one in memory.of(Truth) if one.at_ns >= HOLDS_FROM_NS]
+    return float(np.sqrt(np.mean(np.sum(np.square(np.array(held) - np.array(place)), axis=1))))
+
+
+def largest_m(some: Memory, others: Memory) -> float:
+    """Largest distance of the true positions."""
+    return max(math.dist(a.position_m, b.position_m) for a, b in zip(some.of(Truth), others.of(Truth), strict=True))
