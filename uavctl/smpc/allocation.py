@@ -50,10 +50,15 @@ def shifted(
         binds: Which rows bind (S, m).
         away: Standard deviations (S, 1) beyond which a row that does not bind keeps no more.
     """
-    farthest = np.maximum(backoff, away * sigma)
-    kept = np.minimum(backoff + _KEEPS * np.maximum(room - backoff, 0.0), farthest)
-    count = binds.sum(axis=1)
-    left = budgets - np.where(binds, 0.0, spent(kept, sigma)).sum(axis=1)
+    kept = room - backoff
+    np.maximum(kept, 0.0, out=kept)
+    kept *= _KEEPS
+    kept += backoff
+    np.minimum(kept, np.maximum(backoff, away * sigma), out=kept)
+    risk = spent(kept, sigma)
+    risk *= ~binds
+    count = np.add.reduce(binds, axis=1)
+    left = budgets - np.add.reduce(risk, axis=1)
     share = quantile(left / np.maximum(count, 1))
-    moved = np.where(binds, share[:, None] * sigma, kept)
-    return np.where(count[:, None] > 0, moved, backoff)
+    np.copyto(kept, share[:, None] * sigma, where=binds)
+    return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0, kept, backoff)

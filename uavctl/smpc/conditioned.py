@@ -268,7 +268,7 @@ class ConditionedSolver:
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
         near = over.any(axis=0)
         if np.count_nonzero(near):
-            backoff = shifted(backoff, room, sigma, budgets, np.broadcast_to(near, over.shape), margins.distant)
+            backoff = shifted(backoff, room, sigma, budgets, over | near, margins.distant)
             over = room < backoff
         todo = [one for one in self._parts if tight[one.hard].any() or np.count_nonzero(over[:, one.columns])]
         left: dict[PartProgram, Array] = {}
@@ -315,6 +315,8 @@ class ConditionedSolver:
         if slack == 0.0:
             return float(cost), 0.0, ()
         cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
+        if slack <= KEPT:  # rounding
+            return float(cost), slack, ()
         gave_way = tuple(
             GaveWay(constraint="state", stage=t + 1, index=int(self._rows[i]), amount=float(over[t, i]))
             for t, i in np.argwhere(over > KEPT).tolist()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from uavctl.smpc.baselines.mpc import regulated
 from uavctl.smpc.baselines.problem import Part, Problem
+from uavctl.smpc.first_rows import FirstRows
 from uavctl.smpc.layout import pairs_of
 from uavctl.smpc.lqg_bound import Lqr
 from uavctl.smpc.qp import ACTIVE, BELOW, SOFT, QuadraticProgram, Sense
@@ -47,7 +48,7 @@ class PartProgram:
         self._steps = steps = problem.horizon
         states, inputs = (of[:, :, part.states.size :] for of in regulated(problem, law, part))
         n = states.shape[2]
-        self._plan, self._motion = inputs.reshape(-1, n), states[1:].reshape(-1, n)
+        self._plan = np.vstack([inputs.reshape(-1, n), states[1:].reshape(-1, n)])
         self._inputs, self._states = _slice(part.inputs), _slice(part.states)
         # A path (p_t, r_t) to follow adds -2 Σ (x_t' Q p_t + u_t' R r_t) to the cost, which z = Σ … is the least of.
         q_x, q_u = problem.q_x[np.ix_(part.states, part.states)], problem.q_u[np.ix_(part.inputs, part.inputs)]
@@ -75,6 +76,7 @@ class PartProgram:
         self._width = above_u.size  # of the hard rows of a stage
         self._slews = range(len(rows_x) + pairs_u[0].size, len(rows_x) + self._width)  # those of the first stage
         soft = np.arange(len(rows)) < len(rows_x)
+        by_stage = rows_x.reshape(steps, -1, n), rows_u.reshape(steps, -1, n)
         self._program = QuadraticProgram(
             2.0 * np.eye(n),
             np.ascontiguousarray(rows),
@@ -83,6 +85,8 @@ class PartProgram:
             np.where(soft, problem.slack_quadratic, 0.0),
             most=MOST_ITERATIONS,
         )
+        suits = FirstRows.suits(*by_stage, len(d))
+        self._first = FirstRows(*by_stage, self._program.sense).of if suits else self._ramps
 
     def along(self, path_x: Array, path_u: Array) -> Array:
         """z (n,) that follows a path of the whole plant (H, n_x), (H, n_u) at the least cost, without limits."""
@@ -98,7 +102,8 @@ class PartProgram:
 
     def take_states(self, z: Array, room_x: Array) -> None:
         """The same of the state rows alone."""
-        room_x[:, self.columns] -= self._x_of_z.dot(z).reshape(self._steps, -1)
+        own = room_x[:, self.columns]
+        own -= self._x_of_z.dot(z).reshape(self._steps, -1)
 
     @property
     def iterations(self) -> int:
@@ -113,11 +118,13 @@ class PartProgram:
             again: Whether to begin with the rows that bound in the last program: it must be of the same question.
         """
         upper, lower = rooms.take(self._upper), -rooms.take(self._lower)
-        begin = None if again else self._ramps(upper, lower)
+        begin = None if again else self._first(upper, lower)
         # Where two back-offs meet no mean keeps both: it stays between them.
         crossed = upper < lower
         if np.count_nonzero(crossed):
-            upper[crossed] = lower[crossed] = 0.5 * (upper + lower)[crossed]
+            middle = 0.5 * (upper + lower)
+            np.copyto(upper, middle, where=crossed)
+            np.copyto(lower, middle, where=crossed)
         return self._program.solve_sides(upper, lower, begin, again)
 
     def _ramps(self, upper: Array, lower: Array) -> Sense | None:
@@ -138,8 +145,10 @@ class PartProgram:
 
     def add(self, z: Array, inputs: Array, states: Array) -> None:
         """Add what z does to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""
-        inputs[:, self._inputs] += self._plan.dot(z).reshape(self._steps, -1)
-        states[1:, self._states] += self._motion.dot(z).reshape(self._steps, -1)
+        plan = self._plan.dot(z)
+        count = self._steps * self.part.inputs.size
+        _add(plan[:count].reshape(self._steps, -1), inputs, self._inputs)
+        _add(plan[count:].reshape(self._steps, -1), states[1:], self._states)
 
 
 def _slice(index: Index) -> slice | Index:
@@ -147,6 +156,15 @@ def _slice(index: Index) -> slice | Index:
     if not index.size or index[-1] - index[0] + 1 != index.size:
         return index
     return slice(int(index[0]), int(index[-1]) + 1)
+
+
+def _add(change: Array, to: Array, columns: slice | Index) -> None:
+    """Add to some columns of a matrix; with a slice, without writing them twice."""
+    if isinstance(columns, slice):
+        own = to[:, columns]
+        own += change
+    else:
+        to[:, columns] += change
 
 
 def _sides(c: Array) -> tuple[Index, Index]:

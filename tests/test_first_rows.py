@@ -1,0 +1,72 @@
+"""Which rows a program begins with changes how long it takes, and not what comes out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from uavctl.bench.decisions import questions
+from uavctl.build import build_controller
+from uavctl.config import load_config
+from uavctl.smpc.answer import Answer
+from uavctl.smpc.conditioned import ConditionedSolver
+from uavctl.smpc.first_rows import FirstRows
+
+
+def asked(name: str) -> list[Answer]:
+    """Answers to states from anywhere, of which most are on their way out faster than inputs can brake."""
+    solver = build_controller(load_config(name)).solver
+    assert isinstance(solver, ConditionedSolver)
+    return [solver.solve(seq, *question) for seq, question in enumerate(questions(solver, 60, 4))]
+
+
+@pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])
+def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    guessed = asked(name)
+    monkeypatch.setattr(FirstRows, "suits", lambda *_: False)
+    without = asked(name)
+    compared = 0
+    for one, other in zip(guessed, without, strict=True):
+        assert one.status == other.status
+        if max(one.iterations, other.iterations) > 300:
+            continue  # one of them may have ended its rounds early
+        compared += 1
+        assert one.inputs == pytest.approx(other.inputs, abs=1e-6)
+        assert one.slack == pytest.approx(other.slack, abs=1e-6)
+    assert compared > 20
+    assert sum(one.iterations for one in guessed) < 0.8 * sum(one.iterations for one in without)
+
+
+def chain(steps: int, lag: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (H, 1, H) of a lagged sum of the inputs, and those of an input and of its change (H, 2, H)."""
+    states = np.tril(1.0 - lag ** (np.arange(steps)[:, None] - np.arange(steps) + 1.0))[:, None]
+    inputs = np.eye(steps)
+    return states, np.stack([inputs, inputs - np.eye(steps, k=-1)], axis=1)
+
+
+def test_where_the_fastest_brake_leaves_a_row_it_gives_way() -> None:
+    steps = 6
+    of_x, of_u = chain(steps, 0.5)
+    first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
+    upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
+    upper[7::2], lower[7::2] = 1.0, -1.0
+    assert first.of(upper, lower) is None
+    upper[:2] = -3.0  # the brake makes -0.5 and -1.75 of it
+    begin = first.of(upper, lower)
+    assert begin is not None
+    assert begin.tolist() == [1, 1, 0, 0, 0, 0] + [0, 3, 0, 3] + [0] * 8
+    begin = first.of(-lower, -upper)
+    assert begin is not None
+    assert begin.tolist() == [3, 3, 0, 0, 0, 0] + [0, 1, 0, 1] + [0] * 8
+
+
+def test_a_setpoint_far_from_the_regulators_goes_there_as_fast_as_it_may() -> None:
+    steps = 6
+    of_x, of_u = chain(steps, 0.5)
+    first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
+    upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
+    upper[7::2], lower[7::2] = 1.0, -1.0
+    upper[7] = -2.0  # what was sent last is two steps behind
+    begin = first.of(upper, lower)
+    assert begin is not None
+    assert begin.tolist() == [0] * 6 + [0, 1, 0, 1] + [0] * 8
