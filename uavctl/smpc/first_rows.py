@@ -10,11 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.qp import ACTIVE, BELOW, Sense
+from uavctl.smpc.qp import ACTIVE, BELOW, KEEPS, Sense
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _EVERY = 2  # stages along a state row: from those of every one, more would have to be taken out than put in
+_LONGER = 1.0 / 3.0  # of the stages in which a plan without state rows is beyond one: how much longer it is kept to
 
 
 class FirstRows:
@@ -56,29 +58,26 @@ class FirstRows:
         high, low = upper[self._states], lower[self._states]
         braked, pushed = self._reach.dot(slow), self._reach.dot(fast)
         over, under = braked > high, pushed < low
-        if np.count_nonzero(over):
-            return self._gives_way(over, ACTIVE, BELOW)
-        if np.count_nonzero(under):
-            return self._gives_way(under, BELOW, ACTIVE)
-        if fast[0] < 0.0:
+        if np.count_nonzero(over) or (fast[0] < 0.0 and not np.count_nonzero(under)):
             cap = None if self._inputs is None else upper[self._inputs]
-            return self._transit(fast, slow, high, cap, braked, ACTIVE, BELOW)
-        if slow[0] > 0.0:
+            return self._begin(fast, slow, high, cap, braked, over, ACTIVE, BELOW)
+        if np.count_nonzero(under) or slow[0] > 0.0:
             cap = None if self._inputs is None else -lower[self._inputs]
-            return self._transit(-slow, -fast, -low, cap, -pushed, BELOW, ACTIVE)
+            return self._begin(-slow, -fast, -low, cap, -pushed, under, BELOW, ACTIVE)
         return None
 
-    def _gives_way(self, over: NDArray[np.bool_], beyond: int, against: int) -> Sense:
-        """State rows `over` (H,) that give way, and all slew rows against it until the last one."""
-        begin = self._sense.copy()
-        begin[self._states][over] += beyond
-        begin[self._slews][: _last(over) + 1] += against
-        return begin
-
-    def _transit(
-        self, fast: Array, slow: Array, high: Array, cap: Array | None, braked: Array, towards: int, against: int
+    def _begin(
+        self,
+        fast: Array,
+        slow: Array,
+        high: Array,
+        cap: Array | None,
+        braked: Array,
+        over: Flags,
+        towards: int,
+        against: int,
     ) -> Sense:
-        """Rows of a setpoint that has to go upwards to the regulator's, farther than a slew row lets it.
+        """Rows of a plan that goes upwards, after it has braked while state rows give way.
 
         Args:
             fast: Upper sides of the slew rows (H,).
@@ -86,43 +85,56 @@ class FirstRows:
             high: Upper sides of the state rows (H,).
             cap: Upper sides of the input rows (H,); None: there are none.
             braked: State rows by `slow` (H,).
+            over: Those that give way (H,).
             towards: DAQP's state of a row at its upper side.
             against: The same of its lower one.
         """
-        begin = self._sense.copy()
+        begin, since = self._sense.copy(), 0
         slews, states = begin[self._slews], begin[self._states]
+        if np.count_nonzero(over):
+            since = _last(over) + 1
+            states[over] += towards
+            slews[:since] += against
+            if since == self._steps:
+                return begin
+            fast = np.concatenate([slow[:since], fast[since:]])
         # To where the regulator asks for no more.
         z = self._z.dot(fast)
-        there = z >= 0.0
-        count = int(there.argmax()) or self._steps
-        over = self._of_z[:, :count].dot(z[:count]) > high
-        if not np.count_nonzero(over):
-            slews[:count] += towards
+        there = z[since:] >= 0.0
+        if there[0]:
+            return begin
+        count = since + (int(there.argmax()) or there.size)
+        left = self._of_z[since:, :count].dot(z[:count]) > high[since:]
+        if not np.count_nonzero(left):
+            slews[since:count] += towards
             return begin
         # That leaves a state row: as long as it can still be kept, and back.
         ramp = fast.cumsum()
         top = ramp if cap is None else np.minimum(ramp, cap * self._unit)
         gain = top - slow
         gain[1:] -= top[:-1]
-        room = high - braked
-        count, beyond = 0, self._steps + 1
+        room, reach = (high - braked)[since:], self._reach[since:]
+        count, beyond = since, self._steps + 1
         while beyond - count > 1:
             middle = (count + beyond) // 2
-            if np.count_nonzero(self._reach[:, :middle].dot(gain[:middle]) > room):
+            if np.count_nonzero(reach[:, :middle].dot(gain[:middle]) > room):
                 beyond = middle
             else:
                 count = middle
-        nearest = int((room - self._reach[:, :count].dot(gain[:count])).argmin())
-        slews[:count] += towards
+        nearest = since + int((room - reach[:, :count].dot(gain[:count])).argmin())
+        slews[since:count] += towards
         if cap is not None:
-            capped = ramp[:count] > top[:count]
+            capped = ramp[since:count] > top[since:count]
             if np.count_nonzero(capped):
-                slews[:count][capped] -= towards
-                begin[self._inputs][:count][capped] += towards
+                slews[since:count][capped] -= towards
+                begin[self._inputs][since:count][capped] += towards
         slews[count + 1 : nearest + 1] += against
-        states[nearest + 1 : _last(over) + 1 : _EVERY] += towards
+        # Along the row it takes longer than past it.
+        end = since + _last(left) + 1
+        end += int(_LONGER * (end - nearest))
+        states[nearest + 1 : end : _EVERY] += towards + KEEPS
         return begin
 
 
-def _last(flags: NDArray[np.bool_]) -> int:
+def _last(flags: Flags) -> int:
     return int(flags.size - 1 - flags[::-1].argmax())

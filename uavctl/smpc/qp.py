@@ -17,7 +17,8 @@ Sense = NDArray[np.int32]
 
 OPEN = 1e30  # DAQP's infinity
 SOFT, EQUAL = 8, 5
-ACTIVE, BELOW = 1, 3  # a row to begin with, at its upper side or at its lower one
+ACTIVE, BELOW = 1, 3  # a row to begin with, at its upper side or at its lower one; a soft one gives way at first
+KEEPS = 32  # added to a soft row to begin with that is kept at first
 TOLERANCE = 1e-10
 _MOST_ITERATIONS = 2000
 # Share of the largest curvature that a soft row has at least: without any, DAQP loses its way between equalities.
@@ -82,7 +83,7 @@ class QuadraticProgram:
         Args:
             upper: Upper sides (m,).
             lower: Lower sides (m,).
-            begin: `sense` with ACTIVE or BELOW added to the rows to begin with; None: with none.
+            begin: `sense` with ACTIVE or BELOW (and KEEPS) added to the rows to begin with; None: with none.
             again: Whether to begin with the rows, and their factors, at which the last solve ended. What comes out
                 depends on that solve too, in its last bits: only where it was of the same question.
         """
