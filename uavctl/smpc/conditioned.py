@@ -267,11 +267,13 @@ class ConditionedSolver:
             within = spent(room[stages], sigma[stages])
             if within.max() <= LARGEST_RISK and (within.sum(axis=1) <= budgets[stages]).all():
                 return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
-        near = over.any(axis=0)
+        near = np.logical_or.reduce(over, axis=0)
         if np.count_nonzero(near):
             backoff = shifted(backoff, room, sigma, budgets, over | near, margins.distant)
             over = room < backoff
-        todo = [one for one in self._parts if tight[one.hard].any() or np.count_nonzero(over[:, one.columns])]
+        todo = [
+            one for one in self._parts if np.count_nonzero(tight[one.hard]) or np.count_nonzero(over[:, one.columns])
+        ]
         left: dict[PartProgram, Array] = {}
         found, now = None, room
         iterations = 0
@@ -281,7 +283,7 @@ class ConditionedSolver:
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
                     break
-                stages = np.flatnonzero(binds.any(axis=1))
+                stages = np.logical_or.reduce(binds, axis=1).nonzero()[0]
                 span = slice(int(stages[0]), int(stages[-1]) + 1)
                 backoff = backoff.copy()
                 backoff[span] = shifted(backoff[span], now[span], sigma[span], budgets[span], binds[span])
@@ -293,8 +295,7 @@ class ConditionedSolver:
                 if z is None:
                     return found
                 left[one] = z
-                now[:, one.columns] = room[:, one.columns]
-                one.take_states(z, now)
+                one.leave(z, room, now)
             found = _Found(tuple(left.items()), backoff, now, iterations)
         return found
 

@@ -38,7 +38,7 @@ class FirstRows:
         direction = int(np.argmax(by_slew[:, 0, 0] / np.abs(by_slew[:, -1, 0])))
         self._states = slice(direction, last, of_x.shape[1])
         self._slews = slice(last + width - 1, None, width)
-        # Rows of the input set, in the slew row's unit, where they are of the same sign.
+        # From the unit of the rows of the input set to that of the slew row.
         self._inputs = slice(last, None, width) if width > 1 else None
         self._unit = of_u[0, -1, 0] / of_u[0, 0, 0]
         self._of_z = np.asfortranarray(of_x[:, direction])
@@ -114,13 +114,14 @@ class FirstRows:
         gain = top - slow
         gain[1:] -= top[:-1]
         room, reach = (high - braked)[since:], self._reach[since:]
-        count, beyond = since, self._steps + 1
+        # Where the regulator asks for no more is a good first try.
+        middle, count, beyond = count, since, self._steps + 1
         while beyond - count > 1:
-            middle = (count + beyond) // 2
             if np.count_nonzero(reach[:, :middle].dot(gain[:middle]) > room):
                 beyond = middle
             else:
                 count = middle
+            middle = (count + beyond) // 2
         nearest = since + int((room - reach[:, :count].dot(gain[:count])).argmin())
         slews[since:count] += towards
         if cap is not None:

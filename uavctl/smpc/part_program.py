@@ -100,10 +100,10 @@ class PartProgram:
         room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
         room_u[self.hard] -= self._u_of_z @ z
 
-    def take_states(self, z: Array, room_x: Array) -> None:
-        """The same of the state rows alone."""
-        own = room_x[:, self.columns]
-        own -= self._x_of_z.dot(z).reshape(self._steps, -1)
+    def leave(self, z: Array, room_x: Array, left: Array) -> None:
+        """Write what z leaves of the room of the part's state rows into `left` (H, m), of the whole plant both."""
+        taken = self._x_of_z.dot(z).reshape(self._steps, -1)
+        np.subtract(room_x[:, self.columns], taken, out=left[:, self.columns])
 
     @property
     def iterations(self) -> int:
