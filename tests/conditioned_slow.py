@@ -114,7 +114,7 @@ def plan_slowly(
     near = np.logical_or.reduce(now < backoff) & np.ones(now.shape, dtype=bool)
     for number in range(0 if free else ROUNDS):
         binds = now <= backoff + 1e-9 * sigma if number else near
-        away = np.full(steps, 1e-6) if number else np.minimum(0.5 * budgets / sigma.shape[1], 0.5)
+        away = np.full(steps, 1e-6) if number else np.minimum(0.1 * budgets / sigma.shape[1], 0.5)
         kept = np.minimum(
             backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, norm.isf(away)[:, None] * sigma)
         )

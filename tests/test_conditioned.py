@@ -213,7 +213,7 @@ def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> 
 def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
     """At 10 % loss, ages of ten steps are all but never met: they take as much risk as rows can, in corners too."""
     rare = bernoulli(np.array([0.9]))
-    alone, shared = (age_risk(rare, np.linspace(1.0, 6.0, 12), ALLOWED, corner=n) for n in (1, 2))
+    alone, shared = (age_risk(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
     for risk in (alone, shared):
         assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
     assert alone.budgets[-1] == pytest.approx(0.5)

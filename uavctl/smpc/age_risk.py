@@ -14,7 +14,7 @@ from uavctl.smpc.link import AgeModel
 
 Array = NDArray[np.float64]
 
-PRICE = 0.9  # h of π_t^h, what an age's back-off costs: 1 is best in transit, 0 at rest beside a limit
+PRICE = 1.0  # h of π_t^h, what an age's back-off costs: its share of time. More keeps plans back for ages seldom met
 LARGEST_RISK = 0.5  # of a row: a mean outside of its limit is no plan
 LEAST_RISK = 1e-9  # of an age's budget: what rounding may leave
 

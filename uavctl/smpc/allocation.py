@@ -13,7 +13,7 @@ Flags = NDArray[np.bool_]
 
 _KEEPS = 0.5  # of the room between a row that does not bind and its back-off: what it keeps
 _AWAY = -float(ndtri(1e-6))  # deviations beyond which a row that does not bind keeps no more
-DISTANT = 0.5  # of a budget: what rows share, before there is a plan, that the regulator's is not near
+DISTANT = 0.1  # of a budget: what rows share, before there is a plan, that the regulator's is not near
 _BINDS = 1e-9  # of a row's standard deviation: nearer than this to its back-off, it binds
 
 
