@@ -44,7 +44,7 @@ def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tupl
         seed: Of all draws.
     """
     problem, rng = solver.problem, np.random.default_rng(seed)
-    plant, noise = problem.plant, problem.plant.e @ problem.plant.w @ problem.plant.e.T
+    plant, noise = problem.plant, solver.seen.e @ solver.seen.w @ solver.seen.e.T
     low, high = problem.state_set.bounds
     limited = np.isfinite(low) & np.isfinite(high)
     sent_low, sent_high = problem.input_set.bounds

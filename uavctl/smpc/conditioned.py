@@ -113,6 +113,7 @@ class ConditionedSolver:
         seen: Plant | None = None,
     ) -> None:
         self.problem = problem
+        self.seen = problem.plant if seen is None else seen
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
         self._tail = law.p
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
@@ -122,7 +123,7 @@ class ConditionedSolver:
             adrift = sorted(set(range(plant.n_x)) - moved)
             raise DesignError("plant.b", f"states {adrift} are reached by no input", "give each state an input")
         self._regulated = RegulatedRows(problem, law, found, self._slew)
-        self._deviations = Deviations(problem, found, plant if seen is None else seen)
+        self._deviations = Deviations(problem, found, self.seen)
         self._rows = self._regulated.rows
         width, hard = self._rows.size, self._regulated.hard[-1].stop
         self._parts = [
@@ -152,7 +153,7 @@ class ConditionedSolver:
         # By how many rows are in the way of a target: what a plan that rests keeps from each.
         self._rest = np.zeros((len(self._parts), width))
         self._rest[:, self._resting] = rest_backoffs(
-            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts), seen
+            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts), self.seen
         )
         self._last: tuple[tuple[int, bytes], _Margins] | None = None
 

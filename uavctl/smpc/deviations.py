@@ -35,6 +35,7 @@ class Deviations:
         self._of_cov = np.zeros((len(parts), steps * most, entries))
         self._alone = np.zeros((len(parts), steps * most))
         self._entries = np.zeros((len(parts), entries, 1), dtype=np.intp)
+        self._squares = seen.n_x**2
         places = []
         for i, (part, (of_cov, alone, own)) in enumerate(zip(parts, found, strict=True)):
             count, squares = of_cov.shape[1:]
@@ -47,9 +48,15 @@ class Deviations:
         self._places = np.hstack(places)
 
     def of(self, cov: Array | None) -> Array:
-        """Deviations (H, m) by the covariance of the estimate's error, biases included (n, n); None: it is exact."""
+        """Deviations (H, m) by the covariance of the estimate's error, biases included (n, n); None: it is exact.
+
+        Raises:
+            ValueError: It is of another size.
+        """
         variance = self._alone
         if cov is not None:
+            if cov.size != self._squares:
+                raise ValueError(f"a covariance of shape {cov.shape}, wanted {self._squares} entries")
             variance = variance + (self._of_cov @ cov.ravel().take(self._entries))[:, :, 0]
             np.maximum(variance, 0.0, out=variance)
         return np.sqrt(variance).ravel().take(self._places)
