@@ -118,6 +118,7 @@ def plan_slowly(
         kept = np.minimum(
             backoff + 0.5 * np.maximum(now - backoff, 0.0), np.maximum(backoff, norm.isf(away)[:, None] * sigma)
         )
+        kept[np.isinf(budgets)] = 0.0
         left = budgets - np.where(binds, 0.0, norm.sf(kept / sigma)).sum(axis=1)
         share = norm.isf(np.minimum(left / np.maximum(binds.sum(axis=1), 1), 0.5))
         moved = np.where(binds, share[:, None] * sigma, kept)

@@ -142,7 +142,7 @@ def test_no_short_cut_changes_the_answer(
         if answer.iterations > MOST_SHIFTING:
             continue  # it has ended its rounds early
         compared += 1
-        slow = plan_slowly(given, solver.risk.budgets, x, answer.reference, outlook, SLEW_MPS3[name])
+        slow = plan_slowly(given, solver.risk.shares, x, answer.reference, outlook, SLEW_MPS3[name])
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
     assert compared > 8
@@ -170,7 +170,7 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
         assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
-            assert (spent(given, answer, cov) <= solver.risk.budgets + 1e-9).all()
+            assert (spent(given, answer, cov) <= solver.risk.shares + 1e-9).all()
             assert not answer.gave_way
         else:
             assert sum(way.amount for way in answer.gave_way) == pytest.approx(answer.slack, abs=1e-3)

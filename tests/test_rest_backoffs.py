@@ -50,7 +50,7 @@ def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: 
     cov = innovations(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
     risk = age_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
-    backoff = quantile(risk.budgets) * sigma(steps, cov)
+    backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
     spread = unseen(plant, steps, cov) - cov
     state = np.zeros((draws, 4))

@@ -34,6 +34,11 @@ class AgeRisk:
     beyond: float
     budgets: Array
 
+    @property
+    def shares(self) -> Array:
+        """What plans spread over their rows (H,): without bound where ε̄_t is 1, as nothing is more often than always."""
+        return np.where(self.budgets >= 1.0, np.inf, self.budgets)
+
 
 def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1) -> AgeRisk:
     """Spread the allowed risk so that Σ_t π_t^h β_t is least where n rows alike bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.

@@ -46,7 +46,7 @@ def shifted(
         backoff: Back-offs so far (S, m) of some stages.
         room: Room that the plan at hand leaves (S, m).
         sigma: Standard deviations (S, m).
-        budgets: ε̄ of the stages (S,).
+        budgets: ε̄ of the stages (S,); where it is infinite there are no back-offs.
         binds: Which rows bind (S, m).
         away: Standard deviations (S, 1) beyond which a row that does not bind keeps no more.
     """
@@ -55,6 +55,7 @@ def shifted(
     kept *= _KEEPS
     kept += backoff
     np.minimum(kept, np.maximum(backoff, away * sigma), out=kept)
+    kept *= np.isfinite(budgets)[:, None]
     risk = spent(kept, sigma)
     risk *= ~binds
     count = np.add.reduce(binds, axis=1)

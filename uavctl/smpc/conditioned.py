@@ -61,7 +61,7 @@ class _Margins:
 
     Attributes:
         sigma: Standard deviations (H, m).
-        budgets: ε̄ of the stages (H,).
+        budgets: ε̄ of the stages (H,), infinite where nothing is asked.
         backoff: Back-offs (H, m) of rows that share the budgets equally.
         distant: Standard deviations (H, 1) that rows keep at first which the regulator's plan is not near.
     """
@@ -147,7 +147,7 @@ class ConditionedSolver:
         self.risk = age_risk(link, self._pacing(), allowed, price, len(self._parts))
         # By how late the position was: budgets, and quantiles of rows that share them and of one that need not.
         ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-        self._budgets = self.risk.budgets[ages]
+        self._budgets = self.risk.shares[ages]
         self._shared = quantile(self._budgets / max(1, width))[:, :, None]
         self._distant = quantile(DISTANT * self._budgets / max(1, width))[:, :, None]
         # By how many rows are in the way of a target: what a plan that rests keeps from each.

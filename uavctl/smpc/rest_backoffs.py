@@ -82,7 +82,7 @@ class _RestingRows:
         """What a row is kept that shares the risk with `share` - 1 others."""
         weights, sigma = self.risk.weights[self.late :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.late + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
-        backoff = quantile(self.risk.budgets[ages] / share) * self.sigma[:, row]
+        backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
         before, off = backoff[: self.gaps.size, None], self.news[:, :, row]
 
         def resting(d: float) -> float:
