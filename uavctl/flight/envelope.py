@@ -254,9 +254,16 @@ def misled(watching: Watching, seen: Observation, age_s: float, parameters: Enve
     return velocity is not None and not _near(velocity, seen.velocity_mps, within_mps)
 
 
-def contradicts(watching: Watching, seen: Observation, parameters: EnvelopeParameters) -> bool:
-    """Whether a velocity that inertial data have carried on is not the vehicle's own, for which positions spoke."""
-    velocity = witness(watching, seen.motion, seen.at_ns)
+def contradicts(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> bool:
+    """Whether a velocity that inertial data have carried on is not the vehicle's own, which may be believed.
+
+    Args:
+        watching: After the tick before.
+        seen: The tick; with the velocity that was carried on to the time of the vehicle's own.
+        age_s: How old the newest position was then [s].
+        parameters: What is possible.
+    """
+    velocity = own_velocity(watching, seen, age_s, parameters)
     return velocity is not None and not _near(velocity, seen.velocity_mps, parameters.disagreement_mps)
 
 

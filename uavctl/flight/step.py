@@ -30,7 +30,7 @@ from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, moving_mps, place, seen_of
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
-from uavctl.flight.estimator import act, begin, doubted, feel, set_input, without
+from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
 from uavctl.flight.fallback import End
 from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
@@ -221,13 +221,18 @@ def _recalled(state: ControlState, tick: Tick, inp: StepInput, controller: Contr
 
 def _lies(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
     """Whether the vehicle's own velocity contradicts what inertial data have carried on without a position."""
-    belief, estimate = tick.belief, tick.estimate
-    if belief is None or estimate is None or controller.envelope is None or inp.motion is None:
+    belief, motion = tick.belief, inp.motion
+    if belief is None or controller.envelope is None or motion is None or motion.velocity_ns is None:
         return False
     if belief.doubted_ns is not None or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
         return False
-    seen = seen_of(tick, inp, state.accel_mps2, controller.plant)
-    return contradicts(state.watching, seen, controller.envelope)
+    # Both of one time: what the vehicle said a quarter of a second ago is no word on how it moves now.
+    then = belief_at(controller.kalman, tick.history, min(motion.velocity_ns, inp.at_ns))
+    if then is None:
+        return False
+    estimate = estimated(controller.kalman, then)
+    seen = seen_of(replace(tick, estimate=estimate), inp, state.accel_mps2, controller.plant)
+    return contradicts(state.watching, seen, estimate.age_s, controller.envelope)
 
 
 def _watched(

@@ -36,7 +36,7 @@ class AgeRisk:
 
     @property
     def shares(self) -> Array:
-        """What plans spread over their rows (H,): without bound where ε̄_t is 1, as nothing is more often than always."""
+        """What plans spread over their rows (H,): no bound where ε̄_t is 1, as nothing is more often than always."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
