@@ -48,9 +48,10 @@ from uavctl.smpc.slew import SlewRows
 Array = NDArray[np.float64]
 
 METHOD = "age-conditioned"
-# Programs of an allocation. Where the second plan gives way, a third one would take less than 2 % off its slack in 99 %
-# of all states, and from none would it keep everything.
-ROUNDS = 2
+ROUNDS = 2  # programs of an allocation
+MOST_ROUNDS = (
+    3  # of one whose plan does not keep its back-offs: between two walls of a narrow room half of them need it
+)
 MOST_SHIFTING = 300  # iterations of all programs so far, above which no more risk is shifted
 _OPEN = np.array([OPEN])
 
@@ -278,8 +279,10 @@ class ConditionedSolver:
         left: dict[PartProgram, Array] = {}
         found, now = None, room
         iterations = 0
-        for number in range(ROUNDS):
+        for number in range(MOST_ROUNDS):
             if number:
+                if number >= ROUNDS and (backoff - now).max() <= KEPT:
+                    break
                 binds = binding(backoff, now, sigma)
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
