@@ -62,6 +62,25 @@ USUAL_MS = {
     "px4": {**COMMON_MS, 31: 250, 105: 0, 111: 100, 141: 1000, 230: 1000, 242: 2000},
     "ardupilot": {**COMMON_MS, 27: 0, 116: 0, 193: 1000},
 }
+# What a PX4 was recorded to send unasked on an onboard link; an ArduPilot sends there what it is asked for.
+ONBOARD_MS = {
+    "px4": {
+        1: 200,
+        24: 125,
+        30: 10,
+        31: 20,
+        32: 33,
+        33: 200,
+        74: 100,
+        85: 100,
+        105: 20,
+        111: 90,
+        141: 100,
+        245: 200,
+        331: 33,
+    },
+    "ardupilot": {},
+}
 
 
 @dataclass(frozen=True)
@@ -77,6 +96,7 @@ class Vehicle:
     origin: Origin
     boot_ns: int
     radio: bool  # whether there is a stick
+    streams: str  # `sim.streams`
 
 
 class Telemetry:
@@ -89,7 +109,9 @@ class Telemetry:
 
     def __init__(self, vehicle: Vehicle, start_ns: int) -> None:
         self._v = vehicle
-        self._usual_ns = {kind: ms * 1_000_000 for kind, ms in USUAL_MS[vehicle.kind.name].items()}
+        name = vehicle.kind.name
+        usual_ms = USUAL_MS[name] | (ONBOARD_MS[name] if vehicle.streams == "onboard" else {})
+        self._usual_ns = {kind: ms * 1_000_000 for kind, ms in usual_ms.items()}
         self._period_ns = dict(self._usual_ns)
         self._due_ns = dict.fromkeys(self._usual_ns, start_ns)
         self.next_ns = self._soonest_ns()
@@ -116,6 +138,7 @@ class Telemetry:
             230: self._estimator,
             242: self._home,
             245: self._landed,
+            331: self._odometry,
         }
         self.streams = {kind: makers[kind] for kind in self._usual_ns}
 
@@ -236,6 +259,16 @@ class Telemetry:
             return None
         boot_ms = self._boot_ms(at_ns)
         return mavlink.MAVLink_local_position_ned_message(boot_ms, *estimator.position_m, *estimator.velocity_mps)
+
+    def _odometry(self, at_ns: int) -> Message | None:
+        """ODOMETRY of its own estimate: as recorded, all of it in local NED."""
+        estimator, inertial = self._v.estimator, self._v.inertial
+        if not estimator.begun:
+            return None
+        ned, unknown = mavlink.MAV_FRAME_LOCAL_NED, [math.nan] * 21
+        motion = *estimator.position_m, list(inertial.attitude()), *estimator.velocity_mps, *inertial.rates()
+        of_whom = mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT
+        return mavlink.MAVLink_odometry_message(self._boot_us(at_ns), ned, ned, *motion, unknown, unknown, 0, of_whom)
 
     def _heading_cdeg(self) -> int:
         return round(math.degrees(heading_rad(self._v.craft.attitude)) * 100.0) % 36000

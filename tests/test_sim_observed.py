@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from pathlib import Path
 
+import numpy as np
 import pytest
 from autopilot_rig import GUIDED, HOLD, OFFBOARD, Flight, Name
-from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF
+from quadrotor_rig import quadrotor, steady
+from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, decode
 
+from logs.tlog import read_tlog
+from sim.autopilot import Autopilot
+from uavctl.config import load_config
+
+DATA = Path(__file__).parent / "data"
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 WITH_YAW = 2111  # acceleration and heading; 3135: acceleration alone
 AS_SEEN = 0.15  # relative: "4.9 m/s ± 15 %"
@@ -318,3 +327,25 @@ def test_ardupilot_counts_positions_of_offset_frames_from_where_it_is() -> None:
     one.send(one.client.position(1.0, 0.0, -1.0, frame=9))
     one.wait(8.0)
     assert one.vehicle.position_m == pytest.approx((0.0, 1.0, -6.0), abs=0.2)
+
+
+# Streams
+
+
+def test_px4_sends_as_often_as_recorded_on_an_onboard_link() -> None:
+    """All that is simulated of what a real one sends unasked; rates of 5 Hz and more can be counted in 2 s."""
+    packets = read_tlog(DATA / "px4-rest.tlog").packets
+    recorded = Counter(int.from_bytes(one.data[7:10], "little") for one in packets if one.data[5] == 1)
+    seconds = (packets[-1].at_ns - packets[0].at_ns) / 1e9
+    config = load_config("room-hahn-stursberg", ["sim.streams=onboard"])
+    vehicle = quadrotor("px4", wind=steady((0.0, 0.0, 0.0)), at=(0.0, 0.0, -5.0))
+    autopilot = Autopilot(config, vehicle, 0, np.random.SeedSequence(1), airborne=True)
+    sent: Counter[int] = Counter()
+    while (at_ns := autopilot.next_ns) is not None and at_ns <= 2_000_000_000:
+        vehicle.advance(at_ns)
+        sent.update(msg.get_msgId() for data in autopilot.run(at_ns) for msg in decode(data))
+    often = {number for number, times in recorded.items() if times / seconds >= 5.0}
+    assert {30, 31, 32, 105, 331} <= often & set(sent)
+    for number in often & set(sent):
+        assert sent[number] / 2.0 == pytest.approx(recorded[number] / seconds, rel=0.2), number
+    assert sum(sent.values()) / 2.0 > 300

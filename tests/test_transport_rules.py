@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import pytest
 from attacker import WORDS
@@ -14,9 +15,11 @@ from mavlink_rig import Peer
 from patience import LIMIT_S
 from test_transport import FRAME, LIMIT_NS, Clock, port_of
 
+from logs.tlog import read_tlog
 from uavctl.mavlink import framing
 from uavctl.transport import PEER_SILENCE_NS, Connection, Rules, open_connection, wait
 from uavctl.transport.rules import (
+    FIRST_BURST,
     MAX_KNOWN,
     MAX_SENDERS,
     STRANGER_BURST,
@@ -30,6 +33,7 @@ from uavctl.transport.rules import (
 )
 
 SECOND = 1_000_000_000
+DATA = Path(__file__).parent / "data"
 BURST = round(STRANGER_BURST[0])
 ONE, VEHICLE, CAMERAS = ("192.0.2.1", 1), ("192.0.2.1", 14540), ("192.0.2.1", 14560)
 HEARTBEATS = Peer(99).heartbeat() * 195
@@ -84,8 +88,11 @@ def test_forged_addresses_do_not_fill_the_memory() -> None:
 
 
 def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[Budgets, Counter[str]]:
+    """Budgets in flight: somebody is known whom it needs."""
     refused: Counter[str] = Counter()
-    return Budgets(Rules((), per_s, frames_per_s), refused), refused
+    one = Budgets(Rules((), per_s, frames_per_s), refused)
+    one.trust(("192.0.2.9", 1), 0)
+    return one, refused
 
 
 def take(one: Budgets, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
@@ -102,6 +109,39 @@ def test_a_sender_gets_its_rate_and_the_newest_of_each_batch() -> None:
     assert take(cap, [ONE] * 100, 100 * SECOND).count(True) == BURST  # nothing is saved up beyond a burst
     assert take(cap, [], 0) == []
     assert set(refused) == {"too-many"}
+
+
+@pytest.mark.fault(39)
+@pytest.mark.parametrize("gap_s", [0.05, 0.3, 0.6, 1.2])
+def test_nothing_is_dropped_of_what_a_px4_says_before_it_is_known(gap_s: float) -> None:
+    """Its first heartbeat, by which it is known, comes up to a second after its first word."""
+    packets = [one for one in read_tlog(DATA / "px4-rest.tlog").packets if one.data[5] == 1]
+    for known in (False, True):
+        refused: Counter[str] = Counter()
+        cap = Budgets(Rules(), refused)
+        if known:
+            cap.answer(VEHICLE, 0)
+        gap_ns = round(gap_s * SECOND)
+        batches = Counter((one.at_ns - packets[0].at_ns) // gap_ns for one in packets)
+        words = iter(packets)
+        for number in sorted(batches):
+            data = [next(words).data for _ in range(batches[number])]
+            assert all(cap.take([VEHICLE] * len(data), data, (number + 1) * gap_ns))
+        assert not refused and len(packets) > 700
+
+
+@pytest.mark.fault(39)
+@pytest.mark.fault(46)
+def test_before_anybody_is_known_a_flood_of_strangers_is_bounded_too() -> None:
+    cap = Budgets(Rules(), Counter())
+    passed = 0
+    for n in range(1000):  # a second, twenty new ports a millisecond
+        batch: list[Address] = [("192.0.2.1", 20_000 + 20 * n + port) for port in range(20)]
+        passed += sum(take(cap, batch, n * 1_000_000))
+    assert passed <= 2 * FIRST_BURST[0] + Rules().max_per_s
+    cap.answer(VEHICLE, SECOND)  # and nothing of it is left then
+    strangers: list[Address] = [("192.0.2.2", port) for port in range(2000)]
+    assert sum(take(cap, strangers, SECOND)) <= 2 * BURST
 
 
 @pytest.mark.fault(39)
@@ -247,8 +287,12 @@ def test_a_flood_is_cut_and_counted_and_the_other_sender_is_heard() -> None:
         closing(open_connection("udpin://127.0.0.1:0", clock)) as connection,
         peer() as flooder,
         peer() as vehicle,
+        peer() as cameras,
     ):
         to = ("127.0.0.1", port_of(connection))
+        cameras.sendto(FRAME, to)
+        assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
+        connection.trust(0)
         got: list[bytes] = []
         for n in range(40):
             for k in range(25):

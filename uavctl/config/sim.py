@@ -183,6 +183,13 @@ class SimConfig(Section, frozen=True, kw_only=True):
     autopilot: Annotated[
         Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
     ] = "px4"
+    streams: Annotated[
+        Literal["few", "onboard"],
+        Meta(
+            description="messages that the autopilot sends unasked: `few`, or `onboard`: as many and as often as a PX4 "
+            "was recorded to on such a link, above 300 a second; an ArduPilot sends few on both"
+        ),
+    ] = "few"
     fault: Annotated[
         tuple[FaultConfig, ...], Meta(max_length=MOST_FAULTS, description="what happens in the course of a flight")
     ] = ()

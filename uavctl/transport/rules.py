@@ -96,6 +96,9 @@ class Allowance:
 
 # A link that was held up delivers what it kept. Of strangers little is taken, of what the flight needs a stall's worth.
 STRANGER_BURST = (64.0, 128.0, 32_768.0)
+# Of the one that will turn out to be the vehicle much is taken, until anybody is known whom the flight needs: a PX4 says
+# up to 420 messages in a second, and which of them is its first heartbeat shows only a look into them.
+FIRST_BURST = (1024.0, 2048.0, 131_072.0)
 TRUSTED_BURST = (512.0, 1024.0, 131_072.0)
 VEHICLE_BURST = (16_384.0, 16_384.0, 2_097_152.0)
 VEHICLE_TIMES, ALL_TRUSTED_TIMES = 4.0, 2.0
@@ -185,7 +188,8 @@ class Budgets:
 
     The flown vehicle has a budget of its own that nobody else can use up. Senders of what the flight needs have one
     each and one together, and so have all others. Those who have sent least come first, and of what is there together
-    only they can use the last half: so who comes later is heard beside any flood.
+    only they can use the last half: so who comes later is heard beside any flood. As long as nobody is known whom the
+    flight needs, a stranger may be the vehicle, and what a stall has kept of its words is taken.
 
     Args:
         rules: datagrams, frames and bytes a second of one sender (address and port).
@@ -194,22 +198,35 @@ class Budgets:
 
     def __init__(self, rules: Rules, refused: Counter[str]) -> None:
         self._refused = refused
-        self._stranger = Allowance.of(rules, 1.0, STRANGER_BURST)
+        self._rules = rules
         self._trusted = Allowance.of(rules, 1.0, TRUSTED_BURST)
         self._of_vehicle = Allowance.of(rules, VEHICLE_TIMES, VEHICLE_BURST)
         self._vehicle: tuple[Address, _Sender] | None = None
         self._known: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
         self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # who was heard last is last
         self._all_trusted = _Budget(Allowance.of(rules, ALL_TRUSTED_TIMES, _times(2.0, TRUSTED_BURST)), 0)
-        self._all_strangers = _Budget(Allowance.of(rules, 1.0, _times(2.0, STRANGER_BURST)), 0)
+        self._meet_strangers(FIRST_BURST)
+
+    def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
+        """Give those who are not known budgets with this burst, and twice that together."""
+        self._strangers.clear()
+        self._stranger = Allowance.of(self._rules, 1.0, burst)
+        self._all_strangers = _Budget(Allowance.of(self._rules, 1.0, _times(2.0, burst)), 0)
+
+    def _know_somebody(self) -> None:
+        """Take little of strangers from now on."""
+        if self._vehicle is None and not self._known:
+            self._meet_strangers(STRANGER_BURST)
 
     def answer(self, sender: Address, now_ns: int) -> None:
         """Take a sender for the flown vehicle's."""
+        self._know_somebody()
         if self._vehicle is None or self._vehicle[0] != sender:
             self._vehicle = sender, _Sender(self._of_vehicle, now_ns)
 
     def trust(self, sender: Address, now_ns: int) -> None:
         """Take a sender for one that the flight needs; who was so longest ago gives its place."""
+        self._know_somebody()
         known = self._known.pop(sender, None) or _Sender(self._trusted, now_ns)
         if len(self._known) >= MAX_TRUSTED:
             self._known.popitem(last=False)
