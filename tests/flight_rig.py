@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ def small_plant(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, dt_s
     )
 
 
-def estimator_parameters(**changes: float) -> EstimatorParameters:
+def estimator_parameters(**changes: Any) -> EstimatorParameters:
     base = EstimatorParameters(
         position_std_m=0.005,
         velocity_std_mps=0.05,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from uavctl.build import build_controller, build_design, build_spec
 from uavctl.config import load_config
 from uavctl.data import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.errors import ConfigError
+from uavctl.flight.bias_bound import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
@@ -123,11 +125,13 @@ class _Biased:
         self.state = initial_state()
         self.places: list[Array] = []
         self.inputs: list[Array] = []
+        self.events: list[str] = []
+        self.flown = 0  # ticks
 
     def fly(self, steps: int) -> None:
         plant, ticks = self.controller.plant, self.controller.ticks_per_step
         a, b, _ = plant.transition(self.controller.tick_ns * 1e-9)
-        for tick in range(steps * ticks):
+        for tick in range(self.flown, self.flown + steps * ticks):
             at_ns = START_NS + tick * self.controller.tick_ns
             samples: tuple[PositionSample, ...] = ()
             if tick % ticks == 0:
@@ -136,9 +140,11 @@ class _Biased:
                 self.places.append(self.x[list(plant.position_index)])
             inp = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle())
             self.state, output = step(self.state, inp, self.controller)
+            self.events += [event.code for event in output.events if event.code in (BIAS_AT_BOUND, BIAS_FREE)]
             u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
             self.inputs.append(u)
             self.x = a @ self.x + b @ (u + self.bias)
+        self.flown += steps * ticks
 
 
 @pytest.mark.parametrize("estimated", [True, False])
@@ -153,6 +159,25 @@ def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None
     away = np.abs(np.array(world.places[-20:]) - target).max(axis=0)
     assert np.all(away < 0.01) if estimated else np.all(away > 0.03)
     assert np.all(np.abs(world.inputs) <= np.array(config.sets.input_upper))
+
+
+@pytest.mark.parametrize(("share", "most_m"), [(0.6, 0.02), (0.0, math.inf)])
+def test_a_push_within_the_authority_is_flown_against_and_one_at_its_bound_is_told(share: float, most_m: float) -> None:
+    """1 m/s of wind at PX4's own simulated vehicle pushes with 1 m/s², half of what may be sent."""
+    config = load_config("room-hahn-stursberg", ["solver.method=exact", f"estimator.bias_share={share}"])
+    controller = build_controller(config)
+    bounds = controller.kalman.bias_bounds
+    assert bounds == tuple(max(0.4, share * high) for high in config.sets.input_upper)
+    start = controller.plant.equilibrium(config.target.position_m)
+    world = _Biased(controller, np.array([1.0, 0.0, 0.0]), start)
+    world.fly(150)
+    away_m = abs(float(world.places[-1][0]) - config.target.position_m[0])
+    told = share == 0.0
+    assert (away_m > 0.05) == told and away_m < most_m
+    assert world.events == [BIAS_AT_BOUND] * told
+    world.bias = np.zeros(3)
+    world.fly(150)
+    assert world.events == [BIAS_AT_BOUND, BIAS_FREE] * told
 
 
 def test_plans_leave_room_for_it_and_what_is_flown_keeps_the_input_limits() -> None:

@@ -309,10 +309,18 @@ def build_estimator(config: Config) -> EstimatorParameters:
         max_velocity_mps=estimator.max_velocity_mps,
         bias_drift=estimator.bias_drift,
         bias_max=estimator.bias_max,
+        bias_bounds=_bias_bounds(config),
         inertial_std_mps2=estimator.inertial_std_mps2,
         inertial_bias_mps2=estimator.inertial_bias_mps2,
         inertial_bias_s=estimator.inertial_bias_s,
     )
+
+
+def _bias_bounds(config: Config) -> tuple[float, ...]:
+    """What of each input may be spent against a bias: a share of its authority, and what plans leave free at least."""
+    sets, estimator = config.sets, config.estimator
+    half = [0.5 * (high - low) for low, high in zip(sets.input_lower, sets.input_upper, strict=True)]
+    return tuple(max(estimator.bias_max, estimator.bias_share * each) for each in half)
 
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:

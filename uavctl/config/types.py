@@ -350,10 +350,20 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=0,
             le=1000,
-            description="largest part of it that is flown against, and what plans leave free of each input for that; "
-            "with bias_drift above 0 [input units]",
+            description="part of it up to which plans keep what they promise: they leave so much of each input free "
+            "to be flown against it; with bias_drift above 0 [input units]",
         ),
     ] = 0.0
+    bias_share: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="share of each input's half range (sets.input_lower, input_upper) that may be spent against "
+            "it, bias_max at least: beyond bias_max the vehicle still comes to its target, while plans at their "
+            "limits are cut by the last gate",
+        ),
+    ] = 0.6
     inertial_std_mps2: Annotated[
         float,
         Meta(

@@ -100,6 +100,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
         link: What the boundaries so far have shown of the link.
         link_alarms: What was told of the link and still holds, by event code.
         inertial: How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly.
+        at_bounds: Inputs whose bias was told to be as large as what is flown against it.
         watching: What the envelope knows of this flight.
         breach: What it found that cannot be; None for nothing.
         recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
@@ -121,6 +122,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     link: LinkBelief = NOTHING_SEEN
     link_alarms: tuple[str, ...] = ()
     inertial: str = ""
+    at_bounds: tuple[int, ...] = ()
     watching: Watching = NOT_WATCHING
     breach: Breach | None = None
     recalled: bool = False

@@ -250,7 +250,7 @@ def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
 
 def estimated(kalman: Kalman, belief: Belief) -> Estimate:
     """What a belief says to others."""
-    bias, largest = kalman.bias, kalman.parameters.bias_max
+    bias, largest = kalman.bias, np.array(kalman.bias_bounds)
     return Estimate(
         at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,

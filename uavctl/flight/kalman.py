@@ -57,7 +57,8 @@ class EstimatorParameters:
         max_position_m: Largest plausible position, each axis [m].
         max_velocity_mps: Largest plausible velocity, each axis [m/s].
         bias_drift: Standard deviation of what an input's bias gains in a second [input units / √s]; 0: there is none.
-        bias_max: Largest bias that is counted on, each input [input units]; it begins with a quarter as deviation.
+        bias_max: Bias that plans leave room for, each input [input units]; it begins with a quarter as deviation.
+        bias_bounds: Largest bias that is flown against, of each input (n_u,) [input units]; empty: bias_max.
         inertial_std_mps2: Standard deviation of the inertial data of a tick, each axis [m/s²]; 0: they are not used.
         inertial_bias_mps2: Standard deviation of what they are off for longer [m/s²].
         inertial_bias_s: Time in which that comes and goes [s].
@@ -71,6 +72,7 @@ class EstimatorParameters:
     max_velocity_mps: float
     bias_drift: float = 0.0
     bias_max: float = 0.0
+    bias_bounds: tuple[float, ...] = ()
     inertial_std_mps2: float = 0.0
     inertial_bias_mps2: float = 0.1
     inertial_bias_s: float = 20.0
@@ -113,6 +115,11 @@ class Kalman:
     felt_noise: Array
     pushed: Array
     identity: Array
+
+    @property
+    def bias_bounds(self) -> tuple[float, ...]:
+        """Largest bias that is flown against, of each input that has one [input units]."""
+        return (self.parameters.bias_bounds or (self.parameters.bias_max,) * self.n_bias)[: self.n_bias]
 
     @property
     def bias(self) -> slice:

@@ -27,6 +27,7 @@ from uavctl.data import (
     VehicleStatus,
 )
 from uavctl.flight import fallback as fb
+from uavctl.flight.bias_bound import at_bound, bias_events
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, moving_mps, place, seen_of
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
@@ -40,6 +41,7 @@ from uavctl.flight.orders import take_orders, unready
 from uavctl.flight.samples import Intake, forget, take
 from uavctl.flight.stuck import REPEATED
 from uavctl.naming import Names, tell_all
+from uavctl.smpc.plant import Plant
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
@@ -153,9 +155,12 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
     inertial = _inertial(state, tick, inp, controller)
+    bias = _flown_against(state, tick, inp)
+    at_bounds = at_bound(bias, controller.kalman.bias_bounds, state.at_bounds) if bias else state.at_bounds
     after = replace(
         choice.state,
         inertial=inertial,
+        at_bounds=at_bounds,
         link=belief,
         link_alarms=alarms,
         history=history,
@@ -198,6 +203,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
             *_events(before, mode, choice, inp, tuple(why for _, why in intake.refused), controller.names),
             *_link_events(alarms, state.link_alarms, link),
             *_inertial_events(state.inertial, inertial, inp.at_ns),
+            *_bias_events(bias, state.at_bounds, at_bounds, inp.at_ns, controller.plant),
         ),
         refused=tuple(sample for sample, _ in intake.refused),
         link=link,
@@ -286,6 +292,19 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
     if not tick.boundary or tick.age_steps or tick.estimate is None or not tick.estimate.bias:
         return biases
     return fb.remember(biases, tick.boundary_ns, tick.estimate.bias)
+
+
+def _flown_against(state: ControlState, tick: Tick, inp: StepInput) -> tuple[float, ...]:
+    """The bias that is flown against; empty where there is none, or others fly."""
+    if tick.estimate is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
+        return ()
+    return tick.estimate.bias
+
+
+def _bias_events(
+    bias: tuple[float, ...], before: tuple[int, ...], now: tuple[int, ...], at_ns: int, plant: Plant
+) -> tuple[Event, ...]:
+    return bias_events(plant.to_accel(np.array(bias)), before, now, at_ns) if bias else ()
 
 
 _LINK_TEXTS = {
