@@ -32,6 +32,7 @@ from uavctl.data import (
     VehicleStatus,
     raw_topic,
 )
+from uavctl.flight.bias_bound import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
 from uavctl.mavlink.hand_over import HAND_OVER_ORDERS, HandOver
 from uavctl.mavlink.link import OVERRUN, Link
@@ -47,6 +48,8 @@ VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 MAX_ORDERS = 16  # that wait for one tick
+MAX_NEWS = 64  # events that wait for a person
+FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
@@ -104,6 +107,7 @@ class ControlLoop:
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
         self.link: LinkEstimate | None = None
+        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; who tells them takes them
         self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
         self._orders: deque[Command] = deque()
 
@@ -150,7 +154,7 @@ class ControlLoop:
         for item in source.receive(data, at_ns):
             self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
-                self._put("/uavctl/event", at_ns, item)
+                self._tell(item, at_ns)
             elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
@@ -279,7 +283,12 @@ class ControlLoop:
             self._put("/uavctl/plan", at_ns, out.plan)
         self._put("/uavctl/decision", at_ns, out.decision)
         for event in out.events:
-            self._put("/uavctl/event", at_ns, event)
+            self._tell(event, at_ns)
+
+    def _tell(self, event: Event, at_ns: int) -> None:
+        self._put("/uavctl/event", at_ns, event)
+        if event.code in FOR_A_PERSON:
+            self.news.append(event)
 
     def _command(self, inp: StepInput, out: StepOutput) -> Iterator[Outgoing]:
         """What the vehicle is told: a setpoint, a request, or nothing."""

@@ -31,9 +31,10 @@ from uavctl.build import record_of
 from uavctl.cli.common import FREE_PORT, messages
 from uavctl.cli.prepare import Prepared
 from uavctl.cli.provenance import cpu, versions
+from uavctl.cli.said import Said, waits_for
 from uavctl.config import Config
 from uavctl.config.load import dump_config
-from uavctl.data import Header, PolicyLibrary, Record
+from uavctl.data import ControlMode, Header, PolicyLibrary, Record
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 
@@ -187,9 +188,17 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
     done, told = threading.Event(), threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
         task = progress.add_task("waiting", total=duration_s)
+        said = Said()
+
+        def tell() -> None:
+            while loop.news:
+                line = said.line(loop.news.popleft(), loop.who_flies)
+                if line is not None:
+                    progress.console.print(f"[yellow]{escape(line)}[/]", soft_wrap=True)
 
         def show() -> None:
             while not done.wait(REFRESH_S):
+                tell()
                 decision = loop.decision
                 if loop.let_go and not told.is_set():
                     told.set()
@@ -205,6 +214,7 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
         finally:
             done.set()
             thread.join()
+            tell()
             sys.setswitchinterval(before_s)
 
 
@@ -215,6 +225,8 @@ def _line(loop: ControlLoop) -> str:
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
     accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
+    waiting = waits_for(loop.who_flies) if decision.mode is ControlMode.WAIT else ""
+    mode = f"{mode}, waiting for {waiting}" if waiting else mode
     return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"
 
 

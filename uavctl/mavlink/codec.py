@@ -221,8 +221,18 @@ def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
 
 def _text(raw: Fields) -> Text:
     # Control characters would act on the terminal that shows them; PX4 ends its texts with a tab.
-    text = "".join(character if character.isprintable() else "?" for character in text_of(raw.text).rstrip())
-    return Text(system=raw.src_system, component=raw.src_component, severity=raw.severity, text=text)
+    said = text_of(raw.text)
+    more = raw.id != 0 and b"\0" not in raw.text
+    shown = "".join(character if character.isprintable() else "?" for character in (said if more else said.rstrip()))
+    return Text(
+        system=raw.src_system,
+        component=raw.src_component,
+        severity=raw.severity,
+        text=shown,
+        number=raw.id,
+        chunk=raw.chunk_seq,
+        more=more,
+    )
 
 
 def _ack(raw: Fields) -> Ack:

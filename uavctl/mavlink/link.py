@@ -32,6 +32,7 @@ from uavctl.mavlink.modes import HABITS
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.request import COMMANDS, Ask
 from uavctl.mavlink.streams import GPS_GLOBAL_ORIGIN, SOURCE_PARAMETER, Globe, Streams
+from uavctl.mavlink.texts import Joiner
 from uavctl.mavlink.vehicle import SECOND_VEHICLE, VehicleWatch
 
 VEHICLE, MOCAP = "vehicle", "mocap"
@@ -89,7 +90,7 @@ class Link:
         self._intake = PositionIntake(frame, clock, source, estimator, self._count)
         feels = estimator.inertial_std_mps2 > 0.0
         self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
-        self._streams, self._globe = Streams(inertial=feels), Globe()
+        self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
@@ -145,6 +146,7 @@ class Link:
         for reason, count in decoded.bad.items():
             self._count(reason, count)
         items = [item for message in decoded.messages for item in self._take(message, at_ns)]
+        items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
         return (*items, *self._tell(at_ns))
 
     def answers(self) -> tuple[bytes, ...]:
@@ -306,6 +308,9 @@ class Link:
 
     def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         """What the vehicle tells of itself."""
+        if isinstance(message, Text):
+            whole = self._texts.take(message, at_ns)
+            return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
         boots = self._vehicle.boots
         items = self._vehicle.take(message, at_ns)
         if self._vehicle.boots != boots:

@@ -74,10 +74,21 @@ class Battery(Message, frozen=True, kw_only=True):
 
 
 class Text(Message, frozen=True, kw_only=True):
-    """STATUSTEXT; `severity` is MAV_SEVERITY, 0 the worst, 7 the least."""
+    """STATUSTEXT, or a piece of a long one.
+
+    Attributes:
+        severity: MAV_SEVERITY, 0 the worst, 7 the least.
+        text: what it says.
+        number: of the long text that it is a piece of; 0: it is whole.
+        chunk: which piece, from 0.
+        more: another piece follows.
+    """
 
     severity: int
     text: str
+    number: int = 0
+    chunk: int = 0
+    more: bool = False
 
 
 class Ack(Message, frozen=True, kw_only=True):

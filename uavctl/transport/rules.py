@@ -96,8 +96,8 @@ class Allowance:
 
 # A link that was held up delivers what it kept. Of strangers little is taken, of what the flight needs a stall's worth.
 STRANGER_BURST = (64.0, 128.0, 32_768.0)
-# Of the one that will turn out to be the vehicle much is taken, until anybody is known whom the flight needs: a PX4 says
-# up to 420 messages in a second, and which of them is its first heartbeat shows only a look into them.
+# Of the one that will turn out to be the vehicle much is taken, until anybody is known whom the flight needs: a PX4
+# says up to 420 messages in a second, and which of them is its first heartbeat shows only a look into them.
 FIRST_BURST = (1024.0, 2048.0, 131_072.0)
 TRUSTED_BURST = (512.0, 1024.0, 131_072.0)
 VEHICLE_BURST = (16_384.0, 16_384.0, 2_097_152.0)

@@ -1,0 +1,99 @@
+"""What the console is told of the vehicle's own words: each once, at once, and in one piece."""
+
+from __future__ import annotations
+
+from loopback_rig import Memory, make_loop
+from mavlink_rig import Peer, events, make_link, packets
+
+from uavctl.cli.said import AGAIN_NS, Said, waits_for
+from uavctl.config import load_config
+from uavctl.data import Event, Severity
+from uavctl.mavlink.mode import State
+from uavctl.mavlink.texts import LOST, MOST, WAIT_NS
+
+SECOND = 1_000_000_000
+NOT_NEUTRAL = "Arm: Throttle (RC3) is not neutral"
+
+
+def words(at_ns: int, text: str = NOT_NEUTRAL, severity: Severity = Severity.ERROR) -> Event:
+    return Event(at_ns=at_ns, severity=severity, code="vehicle-text", text=text)
+
+
+def test_a_refusal_that_goes_on_is_said_at_once_and_again_after_a_while() -> None:
+    """As observed: ArduPilot refused 26 times in 54 s."""
+    said = Said()
+    times = [round(n * 54 / 25 * SECOND) for n in range(26)]
+    told = [at_ns for at_ns in times if said.line(words(at_ns), State.ARMING)]
+    again = next(at_ns for at_ns in times if at_ns >= AGAIN_NS)
+    assert told == [0, again]
+
+
+def test_it_is_said_in_the_vehicle_s_words_with_what_is_waited_for() -> None:
+    line = Said().line(words(0), State.ARMING)
+    assert line is not None and NOT_NEUTRAL in line and waits_for(State.ARMING) in line
+    flying = Said().line(words(0), State.ENGAGED)
+    assert flying is not None and "waiting" not in flying
+
+
+def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:
+    said = Said()
+    assert said.line(words(0), State.ARMING) and said.line(words(0, "Arm: VisOdom: not healthy"), State.ARMING)
+    assert said.line(words(0, "Arming motors", Severity.INFO), State.ARMING) is None
+    for n in range(10_000):
+        said.line(words(n, f"text {n}"), State.ARMING)
+    assert len(said._said_ns) < 1000
+
+
+def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
+    loop = make_loop(load_config("room-hahn-stursberg"), Memory())
+    said = Said()
+    lines: dict[str, float] = {}
+    begun_ns = 0
+    for at_ns, data in packets("arducopter-refusal.tlog"):
+        begun_ns = begun_ns or at_ns
+        loop.receive("vehicle", data, at_ns)
+        while loop.news:
+            line = said.line(loop.news.popleft(), State.ARMING)
+            if line is not None:
+                lines[line] = (at_ns - begun_ns) * 1e-9
+    assert len(lines) == 1
+    ((line, at_s),) = lines.items()
+    assert "Arm: VisOdom: not healthy" in line and at_s < 2.0
+
+
+# Long texts come in pieces, as these of PX4 did.
+DENIED = b"Arming denied: Resolve system health failures firs", b"t\t"
+
+
+def test_the_pieces_of_a_long_text_are_one_event() -> None:
+    link, vehicle = make_link(), Peer(1, 1)
+    link.receive(vehicle.heartbeat(), 0)
+    told = []
+    for chunk, piece in enumerate(DENIED):
+        told += events(link.receive(vehicle.send("statustext", 2, piece, 7, chunk), SECOND))
+    assert [event.text for event in told] == ["Arming denied: Resolve system health failures first"]
+
+
+def test_what_has_come_of_a_text_is_told_when_the_rest_stays_out() -> None:
+    first, rest = DENIED
+    link, vehicle = make_link(), Peer(1, 1)
+    link.receive(vehicle.heartbeat(), 0)
+    assert events(link.receive(vehicle.send("statustext", 2, first, 7, 0), SECOND)) == []
+    late = events(link.receive(vehicle.heartbeat(), SECOND + WAIT_NS + 1))
+    assert [event.text for event in late] == [first.decode() + LOST]
+    only_rest = events(link.receive(vehicle.send("statustext", 2, rest, 8, 1), 5 * SECOND))
+    assert [event.text for event in only_rest] == [LOST + "t"]
+    link.receive(vehicle.send("statustext", 2, first, 9, 0), 6 * SECOND)
+    both = events(link.receive(vehicle.send("statustext", 4, b"another", 0, 0), 6 * SECOND))
+    assert [event.text for event in both] == [first.decode() + LOST, "another"]
+
+
+def test_texts_that_never_end_fill_no_memory() -> None:
+    link, vehicle = make_link(), Peer(1, 1)
+    link.receive(vehicle.heartbeat(), 0)
+    for component in range(2, 200):
+        link.receive(Peer(1, component).send("statustext", 2, DENIED[0], 7, 0), SECOND)
+    for n in range(1000):
+        link.receive(vehicle.send("statustext", 2, DENIED[0], 7, n % 250), SECOND)
+    assert len(link._texts._begun) <= MOST
+    assert all(len(begun.said) < 15_000 for begun in link._texts._begun.values())
