@@ -43,6 +43,7 @@ from uavctl.flight.envelope import BREACHES
 R = TypeVar("R", bound=Record)
 
 FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
+MOVES = 3  # successive boundaries with another target each: it moves, and was not only changed
 FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
 
 
@@ -218,10 +219,34 @@ class FlightData:
         told = told or [(self.origin_ns, self.design.target)]
         return self.seconds([at_ns for at_ns, _ in told]), np.array([target for _, target in told])
 
-    @property
+    @cached_property
     def moving_target(self) -> bool:
-        """Whether a trajectory was to be followed."""
-        return any(d.target is not None and d.waypoint is None for d in self.flown)
+        """Whether a trajectory was to be followed: a target that moves from one boundary to the next, and on.
+
+        A place that was ordered is no waypoint either, and stays where it is.
+        """
+        targets = [None if d.waypoint is not None else d.target for d in self.flown if d.boundary]
+        runs = zip(*(targets[n:] for n in range(MOVES)), strict=False)
+        return any(None not in run and len(set(run)) == MOVES for run in runs)
+
+    @cached_property
+    def ordered_places(self) -> tuple[tuple[int, tuple[float, ...]], ...]:
+        """When the vehicle was sent to a place by an order, and where that is: (time [ns], target (n_x,))."""
+        if self.moving_target:
+            return ()
+        told = [(d.at_ns, d.target, d.waypoint) for d in self.flown if d.boundary and d.target is not None]
+        before = [(None, 0), *((target, waypoint) for _, target, waypoint in told)]
+        return tuple(
+            (at_ns, target)
+            for (at_ns, target, waypoint), (last, last_waypoint) in zip(told, before, strict=False)
+            if waypoint is None and (target != last or last_waypoint is not None)
+        )
+
+    @cached_property
+    def last_flown(self) -> Estimate | None:
+        """The estimate at the last flown boundary."""
+        at_ns = self.steps.decisions[-1].at_ns if len(self.steps) else None
+        return next((one for one in reversed(self.estimates) if one.at_ns == at_ns), None)
 
     @cached_property
     def steps(self) -> Steps:

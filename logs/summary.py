@@ -23,6 +23,7 @@ RELATIVE_TOLERANCE = 1e-9
 WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
 SLACK_TOLERANCE = 1e-6
 SETTLED_SHARE = 0.25
+BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, what is told of the place is a prediction
 
 
 class Spread(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,9 +78,14 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     largest_gap: float | None  # of a plan's cost above its certified lower bound, relative; None without a plan
     missed_ticks: int
     max_age_s: float  # largest age of the newest sample at a flown tick
-    trajectory: bool  # whether the target of the moment was a trajectory's; else a waypoint, or a place to hold
+    dt_s: float  # length of a step
+    trajectory: (
+        bool  # whether the target of the moment was a trajectory's; else a waypoint, or an ordered place
+    )
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
     final_error_m: float | None  # distance from the target at the last flown boundary
+    final_age_s: float | None  # age of the newest position there
+    final_std_m: float | None  # largest standard deviation of the estimated position there, in any direction
     recorder_dropped: int  # records that the disk was too slow for
     ended: Ending
     let_go: str | None  # why the envelope let the vehicle go
@@ -134,14 +140,35 @@ def summarise(
         largest_gap=max((plan.gap for plan in flight.plans if np.isfinite(plan.gap)), default=None),
         missed_ticks=sum(d.missed_ticks for d in flight.decisions),
         max_age_s=max((e.age_s for e in flight.estimates if e.at_ns in flown_ns), default=0.0),
+        dt_s=flight.design.dt_s,
         trajectory=flight.moving_target,
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
         final_error_m=float(error_m[-1]) if len(error_m) else None,
+        final_age_s=None if flight.last_flown is None else flight.last_flown.age_s,
+        final_std_m=_position_std_m(flight),
         recorder_dropped=recorder_dropped,
         ended=_ending(flight),
         let_go=None if flight.breach is None else flight.breach.text,
         breaks_off=flight.breaks_off,
     )
+
+
+def _position_std_m(flight: FlightData) -> float | None:
+    """Largest standard deviation of the position at the last flown boundary, by the estimate itself [m]."""
+    if flight.last_flown is None:
+        return None
+    index = list(flight.design.position_index)
+    cov = np.array(flight.last_flown.cov)[np.ix_(index, index)]
+    return float(np.sqrt(max(np.linalg.eigvalsh(cov)[-1], 0.0)))
+
+
+def predicted_only(summary: FlightSummary) -> str:
+    """Why the last distance is a prediction, and how far it is trusted; empty where a position is behind it."""
+    s = summary
+    if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
+        return ""
+    trusted = "" if s.final_std_m is None else f", standard deviation {number(s.final_std_m)} m by its own account"
+    return f"predicted only: the newest position was {number(s.final_age_s)} s old{trusted}"
 
 
 def _channel(flight: FlightData) -> tuple[int, int | None]:
@@ -253,7 +280,9 @@ def _distance(s: FlightSummary) -> str:
     if s.final_error_m is None or s.settled_error_m is None:
         return "not flown"
     final, settled = number(s.final_error_m), number(s.settled_error_m)
-    return f"{final} m at the last flown step; {settled} m over the last quarter (rms)"
+    blind = predicted_only(s)
+    final = f"{final} m at the last flown step{f' ({blind})' if blind else ''}"
+    return f"{final}; {settled} m over the last quarter (rms)"
 
 
 def _share(part: int, whole: int) -> str:

@@ -9,7 +9,15 @@ import numpy as np
 from logs.digits import duration, number
 from logs.flight_data import FLOWN, FlightData
 from logs.moving_limits import box_at
-from logs.summary import Ending, FlightSummary, count, input_outside, position_error_m, state_outside
+from logs.summary import (
+    Ending,
+    FlightSummary,
+    count,
+    input_outside,
+    position_error_m,
+    predicted_only,
+    state_outside,
+)
 from logs.topics import GOES_ON, RECOVERED
 from uavctl.data import ControlMode
 from uavctl.naming import severity, tell, worst
@@ -86,7 +94,8 @@ def _engaged(flight: FlightData, s: FlightSummary, final_m: float, settled_m: fl
     if begun_s == 0 and flight.part:
         took = "was flying already, and flew"
     start_m = position_error_m(flight)[0]
-    seen = "" if s.state_source == "truth" else ", by the estimate"
+    blind = predicted_only(s)
+    seen = "" if s.state_source == "truth" else f", {blind}" if blind else ", by the estimate"
     return (
         f"The controller {took} {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
         f"It began {number(start_m)} m from the {_goal(s)} and ended {number(final_m)} m from it{seen}; "
@@ -206,10 +215,20 @@ def _waypoints(flight: FlightData) -> list[str]:
     """When the waypoints after the first were set out for."""
     told = [(d.at_ns, d.waypoint) for d in flight.flown if d.waypoint is not None]
     left = [(at_ns, then) for (_, now), (at_ns, then) in pairwise(told) if then != now]
+    ordered = ", ".join(
+        f"to {_place(flight, target)} at {_seconds(flight, at_ns)}" for at_ns, target in flight.ordered_places
+    )
+    sent = [f"It was ordered {ordered}."] if ordered else []
     if not left:
-        return []
+        return sent
     times = ", ".join(f"waypoint {then + 1} at {_seconds(flight, at_ns)}" for at_ns, then in left)
-    return [f"It set out for {times}."]
+    return [f"It set out for {times}.", *sent]
+
+
+def _place(flight: FlightData, target: tuple[float, ...]) -> str:
+    """A target's position, local NED."""
+    values = (f"{target[index]:.4g}" for index in flight.design.position_index)
+    return f"({', '.join(values)}) m ({', '.join(flight.design.axes)})"
 
 
 def _trajectory(flight: FlightData) -> list[str]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 import msgspec
+import numpy as np
 import pytest
 from report_rig import words_of
 from synthetic_flight import fly
 from synthetic_scene import room
 
+from logs.digits import number
 from logs.flight_data import FlightData
-from logs.summary import Spread, summarise
+from logs.summary import Spread, predicted_only, rows, summarise
 from logs.words import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
@@ -25,6 +27,7 @@ from uavctl.data import (
     Record,
     Severity,
     StepInput,
+    Truth,
 )
 from uavctl.flight.decide import MISSION_OVER
 
@@ -158,3 +161,72 @@ def test_the_ways_to_a_plan_and_slack_are_explained_where_they_stand() -> None:
     text = " ".join(words_of(dataclasses.replace(found, plans=plans)).text)
     assert [f"“{way}”: with " in text for way in ways] == [True, True, False]
     assert "Slack is what state limits give way by" in text
+
+
+def flown_blind(age_s: float, *, truth: bool = False) -> FlightData:
+    """A 4 s flight without positions for its last `age_s`, and, as a real one, without the truth."""
+    items = [item for item in fly(room(), 4.0, blackout=(4.0 - age_s, 4.0)) if truth or not isinstance(item[2], Truth)]
+    return FlightData.from_records(items)
+
+
+@pytest.mark.parametrize(("age_s", "truth", "blind"), [(2.0, False, True), (2.0, True, False), (0.0, False, False)])
+def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
+    age_s: float, truth: bool, blind: bool
+) -> None:
+    flight = flown_blind(age_s, truth=truth)
+    summary = summarise(flight, wall_s=1.0)
+    last = flight.estimates[-1]
+    assert summary.final_age_s == pytest.approx(last.age_s, abs=room().dt_s)
+    text = predicted_only(summary)
+    assert bool(text) == blind
+    for told in (story(flight, summary), [value for _, value in rows(summary)]):
+        assert any("predicted only" in one for one in told) == blind
+    if blind:
+        assert summary.final_age_s is not None and summary.final_std_m is not None
+        assert number(summary.final_age_s) in text and number(summary.final_std_m) in text
+
+
+def test_the_uncertainty_at_the_end_is_the_estimate_s_own() -> None:
+    flight = flown_blind(2.0)
+    steps = {one.at_ns for one in flight.steps.decisions}
+    index = list(flight.design.position_index)
+    cov = np.array(next(one for one in reversed(flight.estimates) if one.at_ns in steps).cov)[np.ix_(index, index)]
+    told = summarise(flight, wall_s=1.0).final_std_m
+    assert told == pytest.approx(float(np.sqrt(np.linalg.eigvalsh(cov).max())))
+
+
+def sent_to(places: list[float], waypoints: list[int | None]) -> FlightData:
+    """A flight whose target's first coordinate, and waypoint, are these, one a second."""
+
+    def change(record: Record) -> Record:
+        if not isinstance(record, Decision):
+            return record
+        n = min(int(record.tick * TICK_S), len(places) - 1)
+        target = (places[n], *room().target.tolist()[1:])
+        return msgspec.structs.replace(record, target=target, waypoint=waypoints[n])
+
+    return FlightData.from_records([(t, at, change(r)) for t, at, r in fly(room(), 4.0)])
+
+
+def test_a_place_that_was_ordered_is_no_trajectory() -> None:
+    flight = sent_to([0.5, 0.5, -0.7, -0.7], [0, 0, None, None])
+    summary = summarise(flight, wall_s=1.0)
+    assert not summary.trajectory
+    assert [target[0] for _, target in flight.ordered_places] == [-0.7]
+    text = " ".join(story(flight, summary))
+    assert "trajectory" not in text and "(-0.7, " in text
+    assert not any("trajectory" in name for name, _ in rows(summary))
+
+
+def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory() -> None:
+    assert sent_to([0.5, 0.2, -0.7, -0.7], [0, 1, 2, 2]).ordered_places == ()
+
+    def moving(record: Record) -> Record:
+        if not isinstance(record, Decision):
+            return record
+        target = (0.1 * record.tick * TICK_S, *room().target.tolist()[1:])
+        return msgspec.structs.replace(record, target=target, waypoint=None)
+
+    flight = FlightData.from_records([(t, at, moving(r)) for t, at, r in fly(room(), 4.0)])
+    assert flight.moving_target and flight.ordered_places == ()
+    assert "trajectory" in " ".join(story(flight, summarise(flight, wall_s=1.0)))
