@@ -79,9 +79,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     missed_ticks: int
     max_age_s: float  # largest age of the newest sample at a flown tick
     dt_s: float  # length of a step
-    trajectory: (
-        bool  # whether the target of the moment was a trajectory's; else a waypoint, or an ordered place
-    )
+    trajectory: bool  # whether the target of the moment was a trajectory's; else a waypoint, or an ordered place
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
     final_error_m: float | None  # distance from the target at the last flown boundary
     final_age_s: float | None  # age of the newest position there

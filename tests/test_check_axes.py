@@ -8,7 +8,7 @@ import struct
 
 import pytest
 from check_rig import Checked, Hand, S, look, twisted
-from mavlink_rig import packets
+from mavlink_rig import packets, read
 
 from uavctl.check.axes import axis_items, compared
 from uavctl.check.item import State
@@ -318,6 +318,26 @@ def test_a_resting_px4_has_a_position_of_its_own(autopilot: int, flags: int, the
     assert compared(seen) is there
     own = axis_items(seen, load_config("room-hahn-stursberg"), [])[0]
     assert own.name == "own position" and (own.state is State.GOOD) is there
+
+
+@pytest.mark.parametrize("seconds", [0.9, 1.9])
+def test_a_recorded_px4_at_rest_over_a_lossy_link_has_a_position_and_its_origin_is_compared(seconds: float) -> None:
+    """Its flags were 0x1ef, and 0xef from the second second on: for a while nothing told it where it was."""
+    same = "udpin://0.0.0.0:14540"
+    overrides = [f"daemon.vehicle={same}", f"daemon.mocap={same}", "source.system_id=20"]
+    flight, begun_ns, at_ns = Preflight(load_config("room-hahn-stursberg", overrides), make_links, 0), 0, 0
+    flags = []
+    for stamp_ns, data in packets("px4-rest.tlog"):
+        begun_ns = begun_ns or stamp_ns
+        at_ns = stamp_ns - begun_ns
+        if at_ns > seconds * S:
+            break
+        if data[5] == 1 and data[7:10] == bytes((230, 0, 0)):
+            flags.append(read(data)[0].flags)
+        flight.receive("vehicle", data, at_ns)
+    assert flags == [0x1EF, 0xEF][: len(flags)] and len(flags) == (1 if seconds < 1.0 else 2)
+    own = Checked(flight, at_ns)["own position"]
+    assert own.state is State.GOOD
 
 
 def test_another_origin_is_found_beside_a_resting_px4() -> None:

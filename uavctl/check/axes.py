@@ -10,7 +10,7 @@ import numpy as np
 from uavctl.check.fit import Evidence, Mistake, explain, misfit, possible, yaw_deg
 from uavctl.check.item import Item, State, item
 from uavctl.check.positions import CAMERA_AXES, from_cameras, spread_m
-from uavctl.check.seen import Seen
+from uavctl.check.seen import AIDED, HORIZONTAL, Seen
 from uavctl.config.types import Config
 from uavctl.data import Vec3
 from uavctl.frames import Quaternion, from_euler, multiply, to_euler
@@ -20,9 +20,7 @@ _OWN = ("LOCAL_POSITION_NED",)
 _TILT_DEG = 25.0  # between the two attitudes
 _MOVE_TOLERANCE_M, _MOVE_PART = 0.05, 0.15
 _ASKED_TOLERANCE_PART = 0.6  # of the way that a person was asked to move the body
-_HORIZONTAL = 8 | 16  # ESTIMATOR_STATUS_FLAGS: position relative, or absolute
 _CONSTANT = 128  # it assumes that it stands; PX4 says so of every vehicle that rests, whatever it knows
-_AIDED = 256  # PX4: something tells it where it is
 _PX4 = 12  # MAV_AUTOPILOT
 _WANT = "the same axes, unit and handedness as the vehicle's own"
 _MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
@@ -54,8 +52,8 @@ def _has_position(seen: Seen) -> bool:
     flags = seen.estimator
     if flags is None:
         return True
-    stands = flags & _CONSTANT and not (seen.autopilot == _PX4 and flags & _AIDED)
-    return bool(flags & _HORIZONTAL and not stands)
+    stands = flags & _CONSTANT and not (seen.autopilot == _PX4 and (flags & AIDED or seen.aided))
+    return bool(flags & HORIZONTAL and not stands)
 
 
 def _own(seen: Seen, pairs: list[tuple[Vec3, Vec3]]) -> Item:

@@ -29,6 +29,8 @@ MOST = 20_000  # samples kept; a check lasts minutes at most
 _FAR_NS = 500_000_000  # own positions further apart are not interpolated
 _LEVEL = (1.0, 0.0, 0.0, 0.0)
 _PX4, _EV_YAW, _EXTERNAL = 12, 8, 6  # MAV_AUTOPILOT; bit of EKF2_EV_CTRL; value of EK3_SRC1_YAW
+HORIZONTAL = 8 | 16  # ESTIMATOR_STATUS_FLAGS: position relative, or absolute
+AIDED = 256  # PX4: something tells it where it is
 BYTEWISE = 16  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
@@ -54,6 +56,9 @@ class Seen:
             bridges send that know none.
         own: (time in our clock [ns], position [m]) as the vehicle believes it.
         angles_rad: (time of arrival [ns], roll, pitch and yaw) as the vehicle tells its attitude.
+        estimator: newest flags of the vehicle's estimator.
+        aided: whether it has told, while a check listened, that it has a position and something that tells it where it
+            is: over a lossy link PX4 takes the latter back for a second again and again.
         parameters: values of the vehicle's parameters.
         stats: counters of each link at the end.
         trips: TIMESYNC with the vehicle and with the source of positions; None where nothing answered.
@@ -69,6 +74,7 @@ class Seen:
     landed: bool | None = None
     battery_v: float | None = None
     estimator: int | None = None
+    aided: bool = False
     version: AutopilotVersion | None = None
     parameters: dict[str, ParamValue] = field(default_factory=dict)
     stats: dict[str, LinkStats] = field(default_factory=dict)
@@ -109,6 +115,7 @@ class Seen:
                 self.battery_v = voltage_v
             case EstimatorFlags(flags=flags):
                 self.estimator = flags
+                self.aided = self.aided or bool(flags & HORIZONTAL and flags & AIDED)
             case AutopilotVersion():
                 self.version = message
             case ParamValue(name=name) if len(self.parameters) < _MOST_PARAMETERS:
