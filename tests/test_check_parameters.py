@@ -7,6 +7,7 @@ from itertools import product
 
 import pytest
 from check_rig import Checked, Hand, look
+from mavlink_rig import packets, read
 
 from sim.peers import Peers
 from uavctl.check.item import State
@@ -66,6 +67,30 @@ def test_a_relay_to_a_vehicle_that_does_not_listen_fails(autopilot: str, name: s
     assert with_parameters(autopilot, "relay.enabled=true")[name].state is State.BAD
 
 
+@pytest.mark.parametrize("name", ["FS_EKF_ACTION", "FS_EKF_THRESH"])
+def test_nothing_but_its_estimator_s_failsafe_ends_a_flight_whose_relay_has_stopped(name: str) -> None:
+    """Recorded: GUIDED for 8.1 s after the last position, however long GUID_TIMEOUT is."""
+    config = load_config("room-hahn-stursberg", ["relay.enabled=true"])
+    rule = next(one for one in RULES[3] if one.name == name)
+    assert rule.judge(0.0, {name: 0.0}.get, config).state is State.BAD
+    assert rule.judge(1.0, {name: 1.0}.get, config).state is State.GOOD
+
+
+def test_the_recorded_vehicle_stays_guided_for_8_s_after_its_last_position() -> None:
+    modes = {4: "GUIDED", 9: "LAND"}
+    told: list[tuple[str, float]] = []
+    last_pose_ns = 0
+    for at_ns, data in packets("arducopter-lost.tlog"):
+        (message,) = read(data)
+        if message.get_type() == "VISION_POSITION_ESTIMATE":
+            last_pose_ns = at_ns
+        elif message.get_type() == "HEARTBEAT" and message.get_srcSystem() == 1:
+            told.append((modes[message.custom_mode], (at_ns - last_pose_ns) * 1e-9))
+    lands_s = next(at_s for mode, at_s in told if mode == "LAND")
+    assert 7.2 < lands_s < 9.5
+    assert all(mode == "GUIDED" for mode, at_s in told if at_s < lands_s)
+
+
 @pytest.mark.parametrize(
     ("altitude_m", "take_off_m", "want"),
     [
@@ -110,6 +135,8 @@ def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
         return value != 0
     if "with a VISO_TYPE other than 0" in want:
         return value == 6 and told["VISO_TYPE"] != 0
+    if bounds := re.fullmatch(r"([\d.]+) to ([\d.]+)", want):
+        return float(bounds[1]) <= value <= float(bounds[2])
     numbers = re.findall(r"(?:^|or )(\d+)", want)
     assert numbers, want
     return value in map(float, numbers)

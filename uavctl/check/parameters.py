@@ -88,8 +88,18 @@ def _compass(value: float, get: Get, _config: Config) -> Verdict:
     return _only(get("EK3_SRC1_YAW") == _EXTERNAL, "0: off", "EK3_SRC1_YAW is not 6", good=value == 0)
 
 
-def _copter_failsafe(value: float, _get: Get, _config: Config) -> Verdict:
-    return _wanted("1 or 3: land", good=value in (1, 3))
+def _copter_failsafe(value: float, _get: Get, config: Config) -> Verdict:
+    return _wanted("1 or 3: land", good=value in (1, 3), otherwise=_without_positions(config))
+
+
+def _copter_threshold(value: float, _get: Get, config: Config) -> Verdict:
+    off = _without_positions(config) if value <= 0.0 else State.NOTE
+    return _wanted("0.6 to 1", good=0.6 <= value <= 1.0, otherwise=off)
+
+
+def _without_positions(config: Config) -> State:
+    """How bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
+    return State.BAD if config.relay.enabled else State.NOTE
 
 
 def _px4_external(value: float, _get: Get, config: Config) -> Verdict:
@@ -131,8 +141,13 @@ ARDUPILOT = (
     Rule("COMPASS_USE", "set it to 0: arming checks a compass that is not used", _compass),
     Rule(
         "FS_EKF_ACTION",
-        "when its position is lost the vehicle would fly on, or drift at constant height",
+        "set it to 1: without its position the vehicle would stay GUIDED and drift, whatever GUID_TIMEOUT is",
         _copter_failsafe,
+    ),
+    Rule(
+        "FS_EKF_THRESH",
+        "set it to 0.8, as shipped: 0 turns FS_EKF_ACTION off, which was seen to act 8 s after the last position",
+        _copter_threshold,
     ),
 )
 PX4 = (
