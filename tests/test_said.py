@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from loopback_rig import Memory, make_loop
 from mavlink_rig import Peer, events, make_link, packets
 
@@ -19,6 +20,7 @@ def words(at_ns: int, text: str = NOT_NEUTRAL, severity: Severity = Severity.ERR
     return Event(at_ns=at_ns, severity=severity, code="vehicle-text", text=text)
 
 
+@pytest.mark.fault(26)
 def test_a_refusal_that_goes_on_is_said_at_once_and_again_after_a_while() -> None:
     """As observed: ArduPilot refused 26 times in 54 s."""
     said = Said()
@@ -44,6 +46,7 @@ def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:
     assert len(said._said_ns) < 1000
 
 
+@pytest.mark.fault(26)
 def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
     loop = make_loop(load_config("room-hahn-stursberg"), Memory())
     said = Said()
