@@ -69,7 +69,7 @@ class Streams:
             self._next_ns = at_ns + AGAIN_NS
             self._tries += 1
             wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
-        # Not waited for: no vehicle sends them as often by itself, and a flight may have begun.
+        # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
         kinds = INERTIAL.get(autopilot, ()) if self._inertial and not self._feels else ()
         if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
             self._felt_next_ns = at_ns + AGAIN_NS
