@@ -26,6 +26,7 @@ SHORTEST_INTERVAL_NS = 1_000_000
 ARMED_FLAG = 128  # MAV_MODE_FLAG
 CAPACITY_MAH = 240.0
 HOME_POSITION, AUTOPILOT_VERSION, MESSAGE_INTERVAL = 242, 148, 244  # message ids
+CONSTANT = 128  # ESTIMATOR_CONST_POS_MODE
 FORCE_AND_RATES = 63  # HIGHRES_IMU_UPDATED_FLAGS: XACC to ZGYRO
 
 Message = Any  # pymavlink's classes have no types
@@ -353,10 +354,12 @@ class Telemetry:
         return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
 
     def _estimator(self, at_ns: int) -> Message:
+        """PX4's; it tells of every vehicle at rest that it assumes a constant position."""
         estimator = self._v.estimator
+        flags = estimator.flags | (CONSTANT if self._v.pilot.phase is Phase.GROUND else 0)
         ratio, accuracy = (0.1, 0.05) if estimator.position_ok else (2.0, 10.0)
         return mavlink.MAVLink_estimator_status_message(
-            self._boot_us(at_ns), estimator.flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
+            self._boot_us(at_ns), flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
         )
 
     def _landed(self, _at_ns: int) -> Message:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from autopilot_rig import GUIDED, HOLD, OFFBOARD, Flight, Name
+from mavlink_rig import read
 from quadrotor_rig import quadrotor, steady
 from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, decode
 
-from logs.tlog import read_tlog
+from logs.tlog import TlogPacket, read_tlog
 from sim.autopilot import Autopilot
 from uavctl.config import load_config
 
@@ -349,3 +350,18 @@ def test_px4_sends_as_often_as_recorded_on_an_onboard_link() -> None:
     for number in often & set(sent):
         assert sent[number] / 2.0 == pytest.approx(recorded[number] / seconds, rel=0.2), number
     assert sum(sent.values()) / 2.0 > 300
+
+
+def test_a_px4_at_rest_tells_a_constant_position_and_none_in_the_air() -> None:
+    packets = read_tlog(DATA / "px4-rest.tlog").packets
+    (resting,) = {read(one.data)[0].flags & 0x80 for one in packets if is_status(one)}
+    told = []
+    for airborne in (False, True):
+        one = Flight("px4", airborne=airborne)
+        one.wait(2.0)
+        told.append(one.of("ESTIMATOR_STATUS")[-1].flags & 0x80)
+    assert told == [resting, 0] == [0x80, 0]
+
+
+def is_status(packet: TlogPacket) -> bool:
+    return packet.data[5] == 1 and int.from_bytes(packet.data[7:10], "little") == 230
