@@ -363,7 +363,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
             "it, bias_max at least: beyond bias_max the vehicle still comes to its target, while plans at their "
             "limits are cut by the last gate",
         ),
-    ] = 0.6
+    ] = 0.0
     inertial_std_mps2: Annotated[
         float,
         Meta(
