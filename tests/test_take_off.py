@@ -171,8 +171,9 @@ def test_a_climb_that_never_ends_is_ended_by_landing() -> None:
 def test_a_vehicle_that_starts_anew_is_not_flown_on() -> None:
     flight = Flight("px4").take_off().run(6.0)
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    young = bytes(mavlink.MAVLink_local_position_ned_message(100, 0, 0, 0, 0, 0, 0).pack(mav))
-    flight.loop.receive("vehicle", young, flight.now_ns)
+    for boot_ms in (100, 150):
+        young = bytes(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0).pack(mav))
+        flight.loop.receive("vehicle", young, flight.now_ns)
     flight.run(0.1)
     assert flight.is_in(State.RELEASED) and "vehicle-reboot" in {event.code for event in flight.memory.of(Event)}
 

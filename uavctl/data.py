@@ -171,6 +171,7 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
     boots: int = 0  # times that it was seen to start anew
     own_climb: bool = False  # it climbs, or lands, by itself, whatever it is sent
     alone: bool = True  # no other vehicle has been heard lately
+    failsafe: bool = False  # it says that a failsafe of its own acts
 
 
 class VehicleMotion(Record, frozen=True, kw_only=True):

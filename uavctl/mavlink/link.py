@@ -311,13 +311,15 @@ class Link:
         if isinstance(message, Text):
             whole = self._texts.take(message, at_ns)
             return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
-        boots = self._vehicle.boots
+        boots, unready = self._vehicle.boots, self._vehicle.unready
         items = self._vehicle.take(message, at_ns)
         if self._vehicle.boots != boots:
             self._streams.restart()
             self._globe = Globe()
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
+        if self._vehicle.unready != unready:
+            self._streams.restart()  # those that go on will have been seen by the time they would be asked for
         if self.vehicle is not None and message.system == self.vehicle[0]:
             self._streams.saw(message)
             self._globe.saw(message)

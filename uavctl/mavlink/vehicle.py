@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.mavlink.boot_clock import BootClock
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.modes import autopilot_name, describe_mode
 
@@ -16,15 +17,17 @@ SECOND_VEHICLE = "second-vehicle"
 UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
-BACK_MS = 1000  # its clock goes back by more than this: it has started anew
-_WRAP_MS = 2**32
+BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
+FAILSAFE_NS = 2_000_000_000  # for which a word of a failsafe speaks for the modes that are shown
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
 LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
 CREEP = 1e-3  # by which two clocks may drift apart: ten times what bad oscillators do
 BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
-_STARTING = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
+# PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
+_UNREADY = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
+_IN_FAILSAFE = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
 _GROUND_STATION = int(mavlink.MAV_TYPE_GCS)
 
@@ -89,15 +92,17 @@ class VehicleWatch:
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
-        self._boot_ms: int | None = None
-        self._boot_read_ns = 0
-        self._started = False  # past its start-up
+        self._clock = BootClock()
+        self._ready = False  # by its last heartbeat
+        self._heard_ns = 0  # any word of it
+        self._failsafe_ns: int | None = None  # when it said that a failsafe acts
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
         self._punctual: dict[str, Punctual] = {}  # by stream
         self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
         self.boots = 0
+        self.unready = 0  # times that it ceased to be ready: its streams may be gone
         self.address: tuple[int, int] | None = None  # system, component
 
     @property
@@ -113,22 +118,28 @@ class VehicleWatch:
             return self._heartbeat(message, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
+        self._heard_ns = at_ns
         match message:
             case Landed(landed=landed, own_climb=own_climb):
                 return self._phase(landed, own_climb)
             case Battery(voltage_v=voltage_v):
                 self._battery_v = voltage_v
             case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
-                return (*self._clock(stamp_us // 1000, at_ns), *self._moves(at_ns, velocity=message.velocity_mps))
+                anew = self._tells_time("position", stamp_us, at_ns)
+                return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
+                kind = "quaternion" if message.quaternion else "angles"
+                anew = self._tells_time(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
                 if message.quaternion and not self._inertial:
-                    return ()
+                    return anew
                 self._turns(message, at_ns)
-                return self._moves(at_ns, attitude=angles_rad)
+                return (*anew, *self._moves(at_ns, attitude=angles_rad))
             case Inertial(raw=raw) if message.component == self.address[1]:
                 return self._accelerates(message, at_ns) if not raw or self.autopilot == "ardupilot" else ()
             case Text(severity=severity, text=text):
+                if "failsafe" in text.lower():
+                    self._failsafe_ns = None if "clear" in text.lower() else at_ns
                 return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
             case Ack() if self._is_ours(message):
                 return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
@@ -140,7 +151,7 @@ class VehicleWatch:
 
     def up_s(self, at_ns: int) -> float | None:
         """How long ago it started, by its own clock [s]; None if it does not tell."""
-        return None if self._boot_ms is None else self._boot_ms / 1e3 + (at_ns - self._boot_read_ns) / 1e9
+        return self._clock.up_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
         """What turns a specific force of that time into local NED (w, x, y, z); None where it is old or unknown."""
@@ -148,13 +159,9 @@ class VehicleWatch:
             return None
         return from_euler(self._turned[0])
 
-    def _clock(self, boot_ms: int, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Watch its time since boot, modulo 2**32 ms; a status tells at once that it has started anew."""
-        last_ms, self._boot_ms, self._boot_read_ns = self._boot_ms, boot_ms, at_ns
-        back_ms = 0 if last_ms is None else (last_ms - boot_ms) % _WRAP_MS
-        if not BACK_MS < back_ms < _WRAP_MS // 2:
-            return ()
-        return self._reboot()
+    def _tells_time(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Watch its time since boot; a status tells at once that it has started anew."""
+        return self._reboot() if self._clock.take(kind, stamp_us // 1000, at_ns) else ()
 
     def _phase(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
         """Whether it stands, climbs or lands by itself; a status tells at once when that changes in flight."""
@@ -203,12 +210,14 @@ class VehicleWatch:
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
         self._punctual, self._turned = {}, None
-        self._started = False
-        self._landed = None
+        self._landed = self._failsafe_ns = None
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
         return (self._status,)
+
+    def _has_told_of_failsafe(self, at_ns: int) -> bool:
+        return self._failsafe_ns is not None and at_ns - self._failsafe_ns <= FAILSAFE_NS
 
     def _has_gone(self, at_ns: int) -> bool:
         """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
@@ -219,7 +228,8 @@ class VehicleWatch:
         """Follow a vehicle; of another than before nothing is known, and nothing is armed yet."""
         if self.address is not None:
             self._reboot()
-            self._battery_v = self._boot_ms = None
+            self._battery_v = None
+            self._clock.forget()
             self._another_ns = at_ns
         self.address, self._status = address, None
 
@@ -233,11 +243,14 @@ class VehicleWatch:
                 self._bad(SECOND_VEHICLE)
                 self._another_ns = at_ns
             return ()
-        starting = message.system_status in _STARTING
-        if starting and self._started:
+        booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
+        if booting and self._ready and at_ns - self._heard_ns > BOOTING_NS:
             self._reboot()
-            self._boot_ms = None
-        self._started = self._started or not starting
+            self._clock.forget()
+        self._heard_ns = at_ns
+        ready = message.system_status not in _UNREADY
+        self.unready += self._ready and not ready
+        self._ready = ready
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
         self._status = VehicleStatus(
@@ -251,6 +264,7 @@ class VehicleWatch:
             battery_v=self._battery_v,
             boots=self.boots,
             alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
+            failsafe=message.system_status in _IN_FAILSAFE or self._has_told_of_failsafe(at_ns),
         )
         return (self._status,)
 
