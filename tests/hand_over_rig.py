@@ -104,8 +104,17 @@ class Rig:
         self.tick()
         if state is State.CLIMBING:
             return self
+        if state is State.FAILSAFE:
+            self.fail()
+            return self
         self.tick(up_m=1.9)
         return self
+
+    def fail(self, mode: str = "") -> Told:
+        """A failsafe of the vehicle's own lands it, or chooses this mode."""
+        px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
+        self.be(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)
+        return self.tick()
 
     def _beyond(self, state: State) -> Rig:
         if state in (State.RELEASED, State.RETURNING):

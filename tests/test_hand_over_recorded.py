@@ -38,12 +38,18 @@ class Flown:
         return [time_s for one, time_s in self.states if one is state][number]
 
 
-def fly(name: str, height_m: float, orders: dict[tuple[float, float, float], str], config: HandOverConfig) -> Flown:
+def fly(
+    name: str,
+    height_m: float,
+    orders: dict[tuple[float, float, float], str],
+    config: HandOverConfig,
+    client: int = CLIENT,
+) -> Flown:
     """Run a recording; `orders` are the client's modes (DO_SET_MODE's parameters) that become orders, first to last."""
     link = Link(
         "vehicle",
         roles=frozenset({"vehicle", "mocap"}),
-        daemon=DaemonConfig(tick_s=0.05, system_id=CLIENT),
+        daemon=DaemonConfig(tick_s=0.05, system_id=client),
         frame=FrameConfig(),
         clock=ClockConfig(),
         source=SourceConfig(messages=("LOCAL_POSITION_NED",)),
@@ -88,7 +94,7 @@ def fly(name: str, height_m: float, orders: dict[tuple[float, float, float], str
             if not flown.sent or flown.sent[-1][0] is not told.sending:
                 flown.sent.append((told.sending, boot_s))
         (message,) = read(data)
-        if message.get_srcSystem() == CLIENT:
+        if message.get_srcSystem() == client:
             if message.get_type() == "COMMAND_LONG" and message.command == SET_MODE:
                 order = orders.get((message.param2, message.param3, round((at_ns - booted_ns) * 1e-9)), "")
                 order = order or orders.get((message.param2, message.param3, 0.0), "")
@@ -152,23 +158,23 @@ def test_arducopter_gets_no_neutral_stream_between_the_order_and_the_height(gps:
 
 @pytest.mark.fault(25, 28)
 def test_arducopter_that_loses_its_cameras_is_let_go_when_its_failsafe_lands(vicon: Flown) -> None:
-    assert [state for state, _ in vicon.states] == [R, M, A, C, G, E, State.RELEASED, State.DONE]
+    assert [state for state, _ in vicon.states] == [R, M, A, C, G, E, State.FAILSAFE, State.DONE]
     assert (vicon.at(M), vicon.at(C)) == near(24.1, 26.0)
     assert vicon.at(E) == pytest.approx(31.4, abs=2.5)
-    assert (vicon.at(State.RELEASED), vicon.at(State.DONE)) == near(94.4, 104.9)
+    assert (vicon.at(State.FAILSAFE), vicon.at(State.DONE)) == near(94.4, 104.9)
     assert Ask.LAND not in [ask for ask, _ in vicon.asked]  # the vehicle's failsafe has precedence
 
 
 @pytest.mark.fault(8, 25)
 def test_px4_fails_over_when_setpoints_stop_and_comes_back_by_order_only(px4: Flown) -> None:
     states = [state for state, _ in px4.states]
-    back = [State.RELEASED, State.RETURNING, E]
+    back = [State.FAILSAFE, G, E]
     assert states == [R, M, A, C, G, E, *back, State.LANDING, State.SETTLING, State.DONE]
     assert (px4.at(M), px4.at(A), px4.at(C)) == near(9.3, 10.3, 10.3)
     assert px4.at(G) == pytest.approx(18.0, abs=1.5)  # on its way to 5 m, which it reaches at 19.3 s
-    assert (px4.at(E), px4.at(State.RELEASED)) == near(27.2, 78.3, within_s=0.6)
+    assert (px4.at(E), px4.at(State.FAILSAFE)) == near(27.2, 78.3, within_s=0.6)
     # HEARTBEAT shows OFFBOARD again at 87.3 s, because the stream came back: not for us, until ordered to at 88.2 s.
-    assert (px4.at(State.RETURNING), px4.at(E, 1)) == near(88.2, 88.2, within_s=0.6)
+    assert (px4.at(G, 1), px4.at(E, 1)) == near(88.2, 88.2, within_s=0.6)
     assert not [sending for sending, time_s in px4.sent if sending is not Sending.NOTHING and 78.5 < time_s < 87.8]
     assert (px4.at(State.LANDING), px4.at(State.DONE)) == near(94.2, 112.9)
 
@@ -177,3 +183,35 @@ def test_px4_that_refuses_offboard_is_asked_again(px4: Flown) -> None:
     asked = [time_s for ask, time_s in px4.asked if ask is Ask.EXTERNAL_MODE and time_s < 28.0]
     assert asked[0] == px4.at(G) and 5 <= len(asked) <= 16
     assert min(b - a for a, b in pairwise(asked)) > 0.3
+
+
+@pytest.mark.fault(61)
+def test_px4_whose_failsafe_ends_in_the_climb_is_flown_after_all_and_the_pilot_still_wins() -> None:
+    orders = {(4.0, 2.0, 0.0): "take off", (6.0, 0.0, 0.0): "engage"}
+    # Its client had let go for good, so it never went into OFFBOARD by itself: that is waited for.
+    flown = fly("px4-failsafe-in-climb.tlog", 1.2, orders, HandOverConfig(engage_s=60.0, tries=100), client=245)
+    taken_back = [State.FAILSAFE, C, G]
+    by_stick = [State.RELEASED, State.RETURNING, E, State.RELEASED]
+    assert [state for state, _ in flown.states] == [R, M, A, C, *taken_back, *by_stick]
+    failed_s, back_s = flown.at(State.FAILSAFE), flown.at(C, 1)
+    assert back_s - failed_s == pytest.approx(1.0, abs=0.2)
+    assert flown.at(G) - back_s < 8.0  # as soon as it has climbed
+    pilot_s = [flown.at(State.RELEASED, number) - failed_s for number in (0, 1)]
+    assert pilot_s == pytest.approx([41.0, 56.0], abs=0.3)
+    between = [sending for sending, time_s in flown.sent if failed_s <= time_s < back_s]
+    assert between == [Sending.NOTHING] and Ask.LAND not in [ask for ask, _ in flown.asked]
+
+
+@pytest.mark.fault(61)
+def test_px4_whose_failsafe_ends_and_which_does_not_give_offboard_is_landed() -> None:
+    flown = fly("px4-failsafe-in-climb.tlog", 1.2, {(4.0, 2.0, 0.0): "take off"}, HandOverConfig(), client=245)
+    assert [state for state, _ in flown.states][:8] == [R, M, A, C, State.FAILSAFE, C, G, State.LANDING]
+    assert flown.at(State.LANDING) - flown.at(G) == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.fault(60)
+def test_px4_whose_checks_come_and_go_is_asked_to_arm_again() -> None:
+    orders = {(4.0, 2.0, 0.0): "take off"}
+    flown = fly("px4-flickering-checks.tlog", 1.2, orders, HandOverConfig(retry_s=1.0), client=245)
+    assert [state for state, _ in flown.states] == [R, M, A]
+    assert [ask for ask, _ in flown.asked] == [Ask.TAKE_OFF_MODE, Ask.ARM, Ask.ARM]

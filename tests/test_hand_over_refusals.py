@@ -150,6 +150,8 @@ def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: State) -> None:
         (State.ENGAGING, "POSCTL", True),
         (State.LANDING, "POSCTL", True),
         (State.SETTLING, "POSCTL", True),
+        (State.FAILSAFE, "POSCTL", True),
+        (State.FAILSAFE, "ALTCTL", True),
     ],
 )
 @pytest.mark.fault(25)
@@ -183,6 +185,7 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
         (State.ARMING, State.LANDING, Ask.LAND),
         (State.CLIMBING, State.LANDING, Ask.LAND),
         (State.ENGAGING, State.LANDING, Ask.LAND),
+        (State.FAILSAFE, State.LANDING, Ask.LAND),
         (State.RETURNING, State.RELEASED, None),
     ],
 )
@@ -225,6 +228,7 @@ def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
         (State.ARMING, State.FAILED),
         (State.CLIMBING, State.FAILED),
         (State.ENGAGING, State.FAILED),
+        (State.FAILSAFE, State.FAILED),
         (State.RETURNING, State.RELEASED),
         (State.ENGAGED, State.RELEASED),
     ],

@@ -14,7 +14,7 @@ LAND_TRIES = 5
 FOREVER_NS = 2**62
 _OVER = frozenset({State.DONE, State.FAILED})
 _ON_THE_GROUND = frozenset({State.MODE, State.ARMING})
-_PLAIN = frozenset(State) - {State.RELEASED, State.LANDING, State.FAILED}
+_PLAIN = frozenset(State) - {State.FAILSAFE, State.RELEASED, State.LANDING, State.FAILED}
 _PROMISES = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
@@ -51,11 +51,12 @@ class HandOver:
 
     def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
         self._config = HandOverConfig() if config is None else config
-        self._now = Progress(config=self._config, request=Request(None, 0, self._patience(State.WAITING)))
+        self._now = Progress(config=self._config, request=Request(None, 0, Patience(0, 0, 0, FOREVER_NS)))
         self._sees_it_down = sees_it_down
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
         self._disarms = False
         self._silent = False
+        self._aloft_ns: int | None = None  # the last tick, if the vehicle was heard to be in the air
         self.failure = ""
 
     @property
@@ -75,12 +76,19 @@ class HandOver:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing more will be sent, whatever comes."""
-        return self.state in _OVER
+        """Whether nothing more will be sent, whatever comes.
+
+        A vehicle in the air that lands by the positions it gets from here gets them for the time of a landing.
+        """
+        if self.state not in _OVER or self._aloft_ns is None or not self._sees_it_down:
+            return self.state in _OVER
+        return self._aloft_ns - self._now.since_ns >= _ns(self._config.land_s)
 
     @property
     def busy(self) -> bool:
-        """Whether an answer of the vehicle is waited for."""
+        """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
+        if self.state is State.RELEASED:
+            return self._sees_it_down and self._aloft_ns is not None
         return self.state in ASKING or (self.state is State.SETTLING and (self.ours or self._sees_it_down))
 
     def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
@@ -106,6 +114,8 @@ class HandOver:
         events = self._take_orders(view)
         if now.heard_ns is None and view.vehicle is not None:
             now.heard_ns = view.at_ns
+        aloft = view.vehicle is not None and view.vehicle.armed and not view.vehicle.landed
+        self._aloft_ns = view.at_ns if aloft and not silent(view.at_ns, view.vehicle) else None
         sight = look(now, view)
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
         now.state, sending = TRANSITIONS[before, sight.seen]
@@ -154,10 +164,15 @@ class HandOver:
     def _enter(self, before: State, sight: Sight, view: View) -> None:
         now = self._now
         now.since_ns, now.stands_by = view.at_ns, False
-        now.request = Request(self._ask(view), view.at_ns, self._patience(now.state))
+        if now.state is State.FAILSAFE:
+            now.resumes, now.words = before is not State.ENGAGED, now.request.words
+        if now.state is State.CLIMBING and now.climb_ns is None:
+            now.climb_ns = view.at_ns
+        now.request = Request(self._ask(view), view.at_ns, self._patience(now.state, view.at_ns))
         if now.state is State.ARMING:
             now.ground_up_m = view.up_m
-        if now.state is State.RETURNING and view.vehicle is not None:
+        takes_back = now.state is State.ENGAGING and before is State.FAILSAFE
+        if (takes_back or now.state in (State.RETURNING, State.FAILSAFE)) and view.vehicle is not None:
             now.left_mode = view.vehicle.mode
         if sight.granted_ns is not None:
             now.granted_ns = sight.granted_ns
@@ -179,12 +194,13 @@ class HandOver:
         }
         return asks.get(self.state)
 
-    def _patience(self, state: State) -> Patience:
+    def _patience(self, state: State, at_ns: int) -> Patience:
         c = self._config
+        climbed_s = 0.0 if self._now.climb_ns is None else (at_ns - self._now.climb_ns) / 1e9
         limits_s = {
             State.MODE: c.ground_s,
             State.ARMING: c.ground_s,
-            State.CLIMBING: c.climb_s,
+            State.CLIMBING: max(c.climb_s - climbed_s, 0.0),  # one time for the climb, however often it is interrupted
             State.ENGAGING: c.engage_s,
             State.RETURNING: c.engage_s,
             State.LANDING: c.land_s,
@@ -192,7 +208,9 @@ class HandOver:
         }
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is State.LANDING:
-            return Patience(_ns(c.answer_s), _ns(c.answer_s), LAND_TRIES, limit_ns)
+            # What we took off is asked as long as it has time for a landing: nobody else would.
+            tries = max(LAND_TRIES, round(c.land_s / c.answer_s)) if self.ours else LAND_TRIES
+            return Patience(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
         # In the air there is no time for long pauses.
         retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
         return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
@@ -206,7 +224,7 @@ class HandOver:
             self._landed_ns = view.at_ns
         elif not self._disarms and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
             self._disarms = True
-            self._now.request = Request(Ask.DISARM, view.at_ns, self._patience(State.SETTLING))
+            self._now.request = Request(Ask.DISARM, view.at_ns, self._patience(State.SETTLING, view.at_ns))
 
     def _tell(self, view: View, before: State, sight: Sight) -> list[Event]:
         events = []
@@ -218,7 +236,8 @@ class HandOver:
         if self.state is not before:
             vehicle = view.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
-            severity = Severity.INFO if self.state in _PLAIN else Severity.WARNING
+            plain = self.state in _PLAIN and before is not State.FAILSAFE
+            severity = Severity.INFO if plain else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
             events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
             if sight.why:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from enum import Enum, StrEnum
 
+from uavctl.mavlink.modes import HABITS
+
 
 class State(StrEnum):
     """Who flies, or what is under way."""
@@ -22,6 +24,7 @@ class State(StrEnum):
     ENGAGING = "engaging"  # at height: the external mode is asked for
     RETURNING = "returning"  # the same from `released`, ordered to
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
+    FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
     RELEASED = "released"  # the pilot has taken over: nothing is sent unless ordered to
     LANDING = "landing"  # landing was asked for: no setpoints any more, for good
     SETTLING = "settling"  # the vehicle lands by itself
@@ -41,7 +44,8 @@ class Seen(StrEnum):
     ENGAGE = "engage"  # ordered, and the vehicle is in the air
     LEFT = "left"  # found armed, and a daemon before this one ended while it had it
     DISARMED = "disarmed"
-    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's or a failsafe's
+    FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
+    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's, or on the pilot's flight a failsafe's
     EXTERNAL = "external"  # armed, in the external mode
     PENDING = "pending"  # what was asked for is not there yet
 
@@ -57,7 +61,7 @@ class Sending(Enum):
 Target = tuple[State, Sending]
 _W, _R, _M, _A, _C = State.WAITING, State.READY, State.MODE, State.ARMING, State.CLIMBING
 _G, _B, _E, _X, _L = State.ENGAGING, State.RETURNING, State.ENGAGED, State.RELEASED, State.LANDING
-_S, _D, _F = State.SETTLING, State.DONE, State.FAILED
+_S, _D, _F, _V = State.SETTLING, State.DONE, State.FAILED, State.FAILSAFE
 _NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
 
 # What is not here changes nothing, and nothing is sent.
@@ -90,6 +94,7 @@ _CHANGES: dict[State, dict[Seen, Target]] = {
         Seen.REBOOT: (_F, _NOTHING),
         Seen.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
         Seen.REFUSED: (_F, _NOTHING),
+        Seen.FAILSAFE: (_V, _NOTHING),
         Seen.OTHER: (_X, _NOTHING),
         Seen.GRANTED: (_C, _NEUTRAL),
         Seen.PENDING: (_A, _NEUTRAL),
@@ -99,6 +104,7 @@ _CHANGES: dict[State, dict[Seen, Target]] = {
         Seen.LAND: (_L, _NOTHING),
         Seen.REFUSED: (_L, _NOTHING),
         Seen.DISARMED: (_F, _NOTHING),
+        Seen.FAILSAFE: (_V, _NOTHING),
         Seen.OTHER: (_X, _NOTHING),
         Seen.GRANTED: (_G, _NEUTRAL),
         Seen.PENDING: (_C, _NEUTRAL),
@@ -108,6 +114,7 @@ _CHANGES: dict[State, dict[Seen, Target]] = {
         Seen.LAND: (_L, _NOTHING),
         Seen.REFUSED: (_L, _NOTHING),
         Seen.DISARMED: (_F, _NOTHING),
+        Seen.FAILSAFE: (_V, _NOTHING),
         Seen.OTHER: (_X, _NOTHING),
         Seen.GRANTED: (_E, _FLY),
         Seen.PENDING: (_G, _NEUTRAL),
@@ -126,8 +133,18 @@ _CHANGES: dict[State, dict[Seen, Target]] = {
         Seen.LAND: (_L, _NOTHING),
         Seen.SILENCE: (_E, _FLY),  # the controller brakes and holds, for a while: the vehicle may hear us still
         Seen.DISARMED: (_D, _NOTHING),
+        Seen.FAILSAFE: (_V, _NOTHING),
         Seen.OTHER: (_X, _NOTHING),
         Seen.EXTERNAL: (_E, _FLY),
+    },
+    _V: {
+        Seen.REBOOT: (_F, _NOTHING),
+        Seen.LAND: (_L, _NOTHING),
+        Seen.GRANTED: (_C, _NEUTRAL),  # it has ended by itself, and the climb goes on
+        Seen.REFUSED: (_L, _NOTHING),
+        Seen.ENGAGE: (_G, _NEUTRAL),
+        Seen.DISARMED: (_D, _NOTHING),
+        Seen.OTHER: (_X, _NOTHING),
     },
     _X: {
         Seen.ENGAGE: (_B, _NEUTRAL),
@@ -142,6 +159,7 @@ _CHANGES: dict[State, dict[Seen, Target]] = {
     _S: {
         Seen.REFUSED: (_F, _NOTHING),
         Seen.DISARMED: (_D, _NOTHING),
+        Seen.FAILSAFE: (_L, _NOTHING),  # it only seemed to land for us: its climb goes on
         Seen.OTHER: (_X, _NOTHING),
     },
     _D: {},
@@ -176,12 +194,23 @@ in `RETURNING`.
   of its lock ([operation.md](operation.md#how-it-ends)).
 * `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
   (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
+* `failsafe`: the vehicle itself says that a failsafe acts (system status CRITICAL, or "failsafe" in a text), and is in
+  a mode that failsafes choose ({_listed()}).
+  Any other mode is the pilot's, and so are these without such a word. On a flight that began with `--arm` it is waited
+  for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
+  has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
+  `ctl engage` comes first. A flight that the pilot began is released.
 * PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
   (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
 * What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
   still says otherwise 0.3 s later is the pilot's word.
 * While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
 """
+
+
+def _listed() -> str:
+    """The modes that failsafes choose, by autopilot."""
+    return "; ".join(f"{name}: {', '.join(sorted(habits.failsafes))}" for name, habits in HABITS.items())
 
 
 def drawing() -> str:

@@ -58,6 +58,8 @@ class Habits:
         take_off: The mode that take-off begins in, asked for on the ground.
         climbing: Modes that it is in during its own climb and right after.
         landing: Modes in which it lands by itself.
+        failsafes: Modes that its own failsafes choose.
+        returns: A failsafe that ends gives back the mode of before; else its mode stays.
         climbs_on_arming: Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does,
             to a height above the place of arming.
         modes: DO_SET_MODE's parameters 2 and 3 of the modes that are asked for.
@@ -67,6 +69,8 @@ class Habits:
     take_off: str
     climbing: frozenset[str]
     landing: frozenset[str]
+    failsafes: frozenset[str]
+    returns: bool
     climbs_on_arming: bool
     modes: dict[str, tuple[int, int]]
 
@@ -78,6 +82,8 @@ HABITS = {
         take_off="AUTO.TAKEOFF",
         climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
         landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND"}),
+        failsafes=frozenset({"AUTO.LAND", "AUTO.LOITER", "AUTO.RTL"}),
+        returns=True,
         climbs_on_arming=True,
         modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
@@ -87,6 +93,8 @@ HABITS = {
         take_off="GUIDED",
         climbing=frozenset({"GUIDED"}),
         landing=frozenset({"LAND"}),
+        failsafes=frozenset({"LAND", "RTL", "SMART_RTL", "BRAKE"}),
+        returns=False,
         climbs_on_arming=False,
         modes={"GUIDED": (4, 0)},
     ),

@@ -108,7 +108,7 @@ class Request:
         out_of_tries = self._ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
-        return f"{self._what()}{self._why()}{self._words()} ({self._effort(at_ns)})"
+        return f"{self._what()}{self._why()}{self.words} ({self._effort(at_ns)})"
 
     def _what(self) -> str:
         return "" if self._ask is None else f"{self._ask.value}: "
@@ -126,7 +126,9 @@ class Request:
             return f"the vehicle answered {result}, but does not do it"
         return f"the vehicle answered {result}"
 
-    def _words(self) -> str:
+    @property
+    def words(self) -> str:
+        """What the vehicle has said meanwhile, to be added to a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
     def _effort(self, at_ns: int) -> str:

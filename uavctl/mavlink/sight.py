@@ -18,9 +18,10 @@ HEARTBEAT_TIMEOUT_NS = 3_000_000_000
 # A heartbeat may have been under way when arming or the external mode was granted: PX4 shows it up to a second later.
 GRACE_NS = 300_000_000
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
+SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
 LOW = 0.3  # share of the take-off height below which a climb that has ended was none
 LEAVING = frozenset({State.MODE, State.ARMING, State.CLIMBING, State.ENGAGING})
-_UNDER_WAY = LEAVING | {State.RETURNING}  # here the operator's end of the flight asks for landing, too
+_UNDER_WAY = LEAVING | {State.RETURNING, State.FAILSAFE}  # here the operator's end of the flight asks for landing, too
 ASKING = _UNDER_WAY | {State.LANDING}
 CLOCK_NS = 5_000_000_000  # in which a vehicle that is found armed tells how long ago it started
 # A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
@@ -77,7 +78,10 @@ class Progress:
         ordered_ns: When take-off was ordered [ns]; None if it was not.
         height_m: Height of the climb that was ordered [m].
         ground_up_m: Height of the estimate before it was armed [m].
-        left_mode: The mode that is to be left for the external one, after a release.
+        left_mode: The mode that is to be left for the external one, after a release; or that a failsafe chose.
+        climb_ns: When the climb began first [ns]; None before.
+        resumes: The failsafe that acts ended the climb, not the flight.
+        words: What the vehicle said before its failsafe acted.
         granted_ns: When arming or the external mode was granted, ahead of the heartbeat [ns].
         boots: Times that the vehicle had started anew by the last tick.
         stands_by: A vehicle that is found armed is left alone.
@@ -93,6 +97,9 @@ class Progress:
     height_m: float = 0.0
     ground_up_m: float | None = None
     left_mode: str = ""
+    climb_ns: int | None = None
+    resumes: bool = False
+    words: str = ""
     granted_ns: int | None = None
     boots: int = 0
     stands_by: bool = False
@@ -133,10 +140,15 @@ def ordered(view: View, order: Order) -> bool:
     return any(command.order is order for command in view.commands)
 
 
+def fails(vehicle: VehicleStatus) -> bool:
+    """Whether a failsafe of its own has chosen its mode: it says that one acts, in a mode that they choose."""
+    return vehicle.failsafe and vehicle.mode in habits_of(vehicle).failsafes
+
+
 def against_engaging(state: State, view: View) -> str:
     """Why the external mode must not be asked for again; empty if it may."""
     vehicle = view.vehicle
-    if state not in (State.READY, State.RELEASED):
+    if state not in (State.READY, State.RELEASED, State.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
     if vehicle is None or silent(view.at_ns, vehicle) or vehicle.autopilot not in HABITS:
         return "no vehicle is heard that could be flown"
@@ -152,6 +164,8 @@ def look(progress: Progress, view: View) -> Sight:
         return Sight(Seen.REBOOT, "the vehicle has started anew")
     if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
         return Sight(Seen.LAND)
+    if state is State.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
+        return Sight(Seen.LAND)  # the controller has ended without a landing, and nobody else has what we took off
     there = Sight(Seen.SILENCE)
     if vehicle is not None and not silent(view.at_ns, vehicle):
         there = _LOOKS.get(state, _around)(progress, view, vehicle)
@@ -167,8 +181,22 @@ def _given_up(progress: Progress, view: View) -> str:
         return _never_ready(progress, view)
     if state in (State.MODE, State.ARMING) and vehicle is not None and not vehicle.alone:
         return _ANOTHER
+    if state is State.FAILSAFE:
+        return _failsafe_stays(progress, view)
     waits = state in ASKING or state is State.SETTLING
     return progress.request.given_up(view.at_ns) if waits else ""
+
+
+def _failsafe_stays(progress: Progress, view: View) -> str:
+    """Why the vehicle's failsafe is not waited for any longer; empty while it is."""
+    vehicle, config = view.vehicle, progress.config
+    lands = vehicle is not None and vehicle.mode in habits_of(vehicle).landing
+    begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
+    if progress.resumes and not lands and progress.climb_ns is not None:
+        begun_ns = progress.climb_ns
+    if view.at_ns - begun_ns < round(limit_s * 1e9):
+        return ""
+    return f"the vehicle's own failsafe ({progress.left_mode}) has not ended in {limit_s:g} s{progress.words}"
 
 
 def _never_ready(progress: Progress, view: View) -> str:
@@ -203,7 +231,10 @@ def _around(progress: Progress, view: View, vehicle: VehicleStatus) -> Sight:
         heard_ns = view.at_ns if progress.heard_ns is None else progress.heard_ns
         tells_not_yet = view.up_s is None and view.at_ns - heard_ns < CLOCK_NS
         return Sight(Seen.SILENCE) if tells_not_yet else Sight(Seen.LEFT, _LEFT)
-    return Sight(Seen.EXTERNAL if vehicle.external else Seen.OTHER)
+    if vehicle.external:
+        return Sight(Seen.EXTERNAL)
+    ours = progress.state is State.ENGAGED and progress.ordered_ns is not None
+    return Sight(Seen.FAILSAFE if ours and fails(vehicle) else Seen.OTHER)
 
 
 def _has_started_since(progress: Progress, view: View) -> bool:
@@ -223,7 +254,7 @@ def _for_mode(_progress: Progress, _view: View, vehicle: VehicleStatus) -> Sight
 def _for_arming(progress: Progress, _view: View, vehicle: VehicleStatus) -> Sight:
     habits, granted_ns = habits_of(vehicle), progress.request.granted_ns
     if vehicle.mode not in habits.climbing:
-        return Sight(Seen.OTHER)
+        return Sight(Seen.FAILSAFE if vehicle.armed and fails(vehicle) else Seen.OTHER)
     if habits.climbs_on_arming and granted_ns is not None:  # it climbs already
         return Sight(Seen.GRANTED, granted_ns=granted_ns)
     return Sight(Seen.GRANTED if vehicle.armed else Seen.PENDING)
@@ -234,7 +265,7 @@ def _at_climb(progress: Progress, view: View, vehicle: VehicleStatus) -> Sight:
         return Sight(Seen.DISARMED, _DISARMED)
     habits = habits_of(vehicle)
     if vehicle.mode not in habits.climbing:
-        return Sight(Seen.OTHER)
+        return Sight(Seen.FAILSAFE if fails(vehicle) else Seen.OTHER)
     share = _climbed(progress, view, LOOK_AHEAD_S if habits.climbs_on_arming else 0.0)
     ended = habits.climbs_on_arming and vehicle.mode != habits.take_off  # below the height: as high as it goes
     return Sight(Seen.GRANTED if share >= (LOW if ended else progress.config.reached) else Seen.PENDING)
@@ -253,8 +284,24 @@ def _for_external(progress: Progress, _view: View, vehicle: VehicleStatus) -> Si
     granted_ns = progress.request.granted_ns
     if vehicle.external or granted_ns is not None:
         return Sight(Seen.GRANTED, granted_ns=granted_ns)
-    passing = habits_of(vehicle).climbing if progress.state is State.ENGAGING else {progress.left_mode}
-    return Sight(Seen.PENDING if vehicle.mode in passing else Seen.OTHER)
+    engaging = progress.state is State.ENGAGING
+    if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in habits_of(vehicle).climbing):
+        return Sight(Seen.PENDING)
+    return Sight(Seen.FAILSAFE if engaging and fails(vehicle) else Seen.OTHER)
+
+
+def _at_failsafe(progress: Progress, view: View, vehicle: VehicleStatus) -> Sight:
+    """On a flight that we began; that the pilot may take over is no different from any other time."""
+    if not vehicle.armed:
+        return Sight(Seen.DISARMED, f"the vehicle's own failsafe ({progress.left_mode}) has landed it{progress.words}")
+    if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
+        return Sight(Seen.ENGAGE)
+    habits = habits_of(vehicle)
+    if progress.resumes and vehicle.mode in habits.climbing:
+        return Sight(Seen.GRANTED)
+    stays = not habits.returns and vehicle.mode == progress.left_mode
+    # The external mode is not taken up again unasked: nobody knows whose doing it is.
+    return Sight(Seen.PENDING if vehicle.external or fails(vehicle) or stays else Seen.OTHER)
 
 
 def _at_landing(progress: Progress, _view: View, vehicle: VehicleStatus) -> Sight:
@@ -262,10 +309,15 @@ def _at_landing(progress: Progress, _view: View, vehicle: VehicleStatus) -> Sigh
     if not vehicle.armed:
         return Sight(Seen.DISARMED if news else Seen.PENDING)
     habits, asking = habits_of(vehicle), progress.state is State.LANDING
+    ours = progress.ordered_ns is not None
     if vehicle.mode in habits.landing:
-        return Sight(Seen.GRANTED if asking else Seen.PENDING)
+        # A failsafe lands only until it ends: what we took off is to land whatever comes.
+        for_us = not (ours and fails(vehicle)) or progress.request.granted_ns is not None
+        return Sight(Seen.GRANTED if asking and for_us else Seen.PENDING)
+    if ours and not asking and habits.climbs_on_arming and vehicle.mode == habits.take_off:
+        return Sight(Seen.FAILSAFE if vehicle.at_ns > progress.since_ns + SHOWN_NS else Seen.PENDING)
     # Asked for in the middle of a climb, any mode of the climb may still be shown.
-    passing = vehicle.external or vehicle.mode in habits.climbing
+    passing = vehicle.external or vehicle.mode in habits.climbing or (ours and fails(vehicle))
     return Sight(Seen.PENDING if passing or not news else Seen.OTHER)
 
 
@@ -275,6 +327,7 @@ _LOOKS: dict[State, Callable[[Progress, View, VehicleStatus], Sight]] = {
     State.CLIMBING: _at_climb,
     State.ENGAGING: _for_external,
     State.RETURNING: _for_external,
+    State.FAILSAFE: _at_failsafe,
     State.LANDING: _at_landing,
     State.SETTLING: _at_landing,
 }
