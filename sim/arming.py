@@ -45,6 +45,7 @@ def preflight(
 
 def _px4(parameters: Parameters, estimator: Estimator, battery: Supply) -> tuple[str, ...]:
     checks = (
+        (estimator.steady, "Arming denied: Resolve system health failures first"),
         (estimator.position_ok, "Preflight Fail: no valid local position estimate"),
         (estimator.has_height, "Preflight Fail: height estimate not stable"),
         (estimator.has_heading, "Preflight Fail: heading estimate not stable"),
@@ -56,6 +57,7 @@ def _px4(parameters: Parameters, estimator: Estimator, battery: Supply) -> tuple
 def _ardupilot(parameters: Parameters, estimator: Estimator, battery: Supply, boot_age_ns: int) -> tuple[str, ...]:
     external = estimator.uses_external
     checks = (
+        (estimator.steady, "PreArm: Internal errors"),
         (estimator.position_ok, "PreArm: VisOdom: not healthy" if external else "PreArm: Need Position Estimate"),
         (estimator.has_height, "PreArm: EKF3 waiting for height source"),
         (estimator.has_heading, "PreArm: EKF3 yaw source not available"),

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.checks import Checks
 from sim.commands import Commands, Request
 from sim.craft import Craft, SteeredPlant
 from sim.estimator import Estimator
@@ -93,7 +94,10 @@ class Autopilot:
         whole = Vehicle(kind, craft, *parts, origin, boot_ns, radio, config.sim.streams)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
-        self._failsafes = Failsafes(kind, self.pilot, self.parameters, self.estimator, craft.battery)
+        self._failsafes = Failsafes(
+            kind, self.pilot, self.parameters, self.estimator, craft.battery, clears=config.sim.checks.clears
+        )
+        self._checks = Checks(config.sim.checks, seed, start_ns)
         self._was_armed = airborne
         self.text = ""
         self.steered_by: tuple[int, int] | None = None
@@ -125,13 +129,15 @@ class Autopilot:
         """Time of the next thing to do of itself [ns]; None after a crash."""
         if self.pilot.crashed:
             return None
-        parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial
+        parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial, self._checks
         return earliest([part.next_ns for part in parts])
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
         """Do what is due at `at_ns`, the vehicle being there; returns the datagrams sent."""
         if self.pilot.crashed:
             return ()
+        self._checks.run(at_ns, armed=self.pilot.armed)
+        self.estimator.valid, self.estimator.steady = self._checks.valid, self._checks.passing
         self.estimator.run(at_ns)
         self.inertial.run(at_ns)
         self.pilot.run(at_ns)

@@ -46,6 +46,8 @@ class Estimator:
         age_ns: how old PX4 takes a stamp to be, by the clock of who sent it; of (stamp, time) [ns].
 
     Attributes:
+        valid: whether its position may count as valid, whatever is known of it.
+        steady: whether pre-flight checks that flicker pass.
         origin: whether the geographic origin is known; ArduPilot without GPS waits for SET_GPS_GLOBAL_ORIGIN.
     """
 
@@ -57,6 +59,7 @@ class Estimator:
         self._parameters = parameters
         self._craft = craft
         self.origin = False
+        self.valid = self.steady = True
         self._position_error: Vec3 = ZERO
         self._velocity_error: Vec3 = ZERO
         self._updated_ns = craft.now_ns
@@ -133,7 +136,7 @@ class Estimator:
     @property
     def position_ok(self) -> bool:
         """Whether the vehicle trusts its position."""
-        return self.uses_gps or (self._fusing and self._has_origin)
+        return self.valid and (self.uses_gps or (self._fusing and self._has_origin))
 
     @property
     def geographic(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sim.craft import Supply
 from sim.estimator import Estimator
 from sim.parameters import Parameters
-from sim.personality import Personality, Role
+from sim.personality import Mode, Personality, Role
 from sim.pilot import CRITICAL, WARNING, Phase, Pilot
 
 SECOND_NS = 1_000_000_000
@@ -18,7 +18,14 @@ class Failsafes:
     """Looks ten times a second while armed."""
 
     def __init__(
-        self, kind: Personality, pilot: Pilot, parameters: Parameters, estimator: Estimator, battery: Supply
+        self,
+        kind: Personality,
+        pilot: Pilot,
+        parameters: Parameters,
+        estimator: Estimator,
+        battery: Supply,
+        *,
+        clears: bool = False,
     ) -> None:
         self._px4 = kind.name == "px4"
         self._mode = kind.by_role
@@ -30,6 +37,8 @@ class Failsafes:
         self._lost_ns: int | None = None  # since when the position is lost
         self._low_ns: int | None = None  # since when the battery is low
         self._warned = False
+        self._clears = clears
+        self._meant: Mode | None = None  # what it flew before its position was lost
         self.station_ns: int | None = None  # last heartbeat of the ground station
 
     @property
@@ -40,12 +49,14 @@ class Failsafes:
     def run(self, at_ns: int) -> None:
         """Look, if it is time."""
         if not self._pilot.armed:
-            self._lost_ns = self._low_ns = None
+            self._lost_ns = self._low_ns = self._meant = None
             self._warned = False
             return
         if self._look_ns > at_ns:
             return
         self._look_ns = at_ns + LOOK_NS
+        if self._meant is not None:
+            self._look_at_its_end(at_ns)
         if self._pilot.phase is not Phase.GROUND:
             self._look_at_position(at_ns)
             self._look_at_battery(at_ns)
@@ -56,6 +67,14 @@ class Failsafes:
         if self._pilot.mode.role is not Role.LAND:
             self._pilot.fail(self._mode(Role.LAND), at_ns)
 
+    def _look_at_its_end(self, at_ns: int) -> None:
+        """As recorded: a failsafe for want of a position ends with its cause, if nobody has changed the mode since."""
+        if not self._pilot.failsafe:
+            self._meant = None
+        elif self._estimator.position_ok and self._meant is not None:
+            self._pilot.recover(self._meant, at_ns)
+            self._meant = None
+
     def _look_at_position(self, at_ns: int) -> None:
         if self._estimator.position_ok:
             self._lost_ns = None
@@ -65,6 +84,7 @@ class Failsafes:
         if not self._pilot.mode.needs_position:
             return
         if self._px4:
+            self._meant = self._pilot.mode if self._clears else None
             self._land(at_ns, "Failsafe activated: no valid position estimate, landing")
         elif at_ns - self._lost_ns >= EKF_CHECK_NS and self._parameters["FS_EKF_ACTION"] == 1:
             self._land(at_ns, "EKF variance", "EKF Failsafe: changed to LAND Mode")

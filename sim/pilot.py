@@ -219,6 +219,12 @@ class Pilot:
         self._enter(mode, at_ns)
         self.failsafe, self._returns = True, returns
 
+    def recover(self, mode: Mode, at_ns: int) -> None:
+        """A failsafe ends, and the mode of before is back; a take-off goes on."""
+        self._enter(mode, at_ns)
+        if mode.role is Role.TAKEOFF and self.phase is not Phase.CLIMB:
+            self._climb(at_ns)
+
     def _streaming(self, at_ns: int) -> bool:
         limit_ns = min(FRESH_NS, round(self._parameters[self._kind.timeout] * 1e9))
         return self.setpoint_ns is not None and at_ns - self.setpoint_ns < limit_ns

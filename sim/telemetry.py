@@ -189,14 +189,20 @@ class Telemetry:
     def _boot_us(self, at_ns: int) -> int:
         return (at_ns - self._v.boot_ns) // 1000
 
-    def _heartbeat(self, _at_ns: int) -> Message:
+    def _heartbeat(self, at_ns: int) -> Message:
         pilot = self._v.pilot
         status = mavlink.MAV_STATE_STANDBY
         if pilot.phase is not Phase.GROUND or (pilot.armed and self._v.kind.name == "px4"):
             status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
+        elif self._v.kind.name == "px4" and not self._may_arm(at_ns):
+            status = mavlink.MAV_STATE_UNINIT  # as recorded: it stands by only while it might be armed
         base = pilot.mode.base | (ARMED_FLAG if pilot.armed else 0)
         kind = mavlink.MAV_TYPE_QUADROTOR, self._v.kind.autopilot
         return mavlink.MAVLink_heartbeat_message(*kind, base, pilot.mode.custom, status, 3)
+
+    def _may_arm(self, at_ns: int) -> bool:
+        v = self._v
+        return not preflight(v.kind, v.parameters, v.estimator, v.craft.battery, at_ns - v.boot_ns)
 
     def _status(self, at_ns: int) -> Message:
         v, battery = self._v, self._v.craft.battery
@@ -207,7 +213,7 @@ class Telemetry:
         healthy = present & ~(AHRS | VISION | PREARM)
         if estimator.position_ok:
             healthy |= present & (AHRS | VISION)
-        if not preflight(v.kind, v.parameters, estimator, battery, at_ns - v.boot_ns):
+        if self._may_arm(at_ns):
             healthy |= PREARM
         power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
         return mavlink.MAVLink_sys_status_message(present, present, healthy, 250, *power, 0, 0, 0, 0, 0, 0)

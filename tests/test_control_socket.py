@@ -48,12 +48,16 @@ class Flight:
         self.orders: list[Command] = []
         self.taken: list[Command] = []
         self._room = room
+        self.idle: tuple[Order, ...] = ()
 
     def order(self, command: Command) -> bool:
         if len(self.orders) >= self._room:
             return False
         self.orders.append(command)
         return True
+
+    def against(self, order: Order) -> str:
+        return f"{order} is for nothing" if order in self.idle else ""
 
     def tick(self, at_ns: int) -> None:
         self.answers = tuple((one, self._decide(one, at_ns)) for one in reversed(self.orders))  # in any order
@@ -140,6 +144,15 @@ def test_every_order_reaches_the_flight(rig: Rig, order: Order) -> None:
     (client,) = rig.say(ask(ask=order))
     rig.ticks(2)
     assert rig.flight.taken == [Command(order=order)] and heard(client)["ok"]
+
+
+@pytest.mark.fault(62)
+def test_an_order_that_would_come_to_nothing_is_refused_with_the_reason_and_reaches_no_tick(rig: Rig) -> None:
+    rig.flight.idle = (Order.GOTO,)
+    moved, held = rig.say(ask(ask="goto", position_m=[1, 0.5, -1]), ask(ask="hold"))
+    rig.ticks(2)
+    assert heard(moved) == {"ok": False, "text": "goto is for nothing", "status": None}
+    assert heard(held)["ok"] and rig.flight.taken == [Command(order=Order.HOLD)]
 
 
 def test_status_is_answered_at_once(rig: Rig) -> None:

@@ -102,11 +102,11 @@ def test_px4_whose_setpoints_do_not_arrive_is_let_go_and_comes_back_by_order_onl
     flight = Flight("px4").take_off().run(6.0)
     setpoint = "SET_POSITION_TARGET_LOCAL_NED"
     flight.hears = lambda data: decode(data)[0].get_type() != setpoint
-    flight.run(4.0, until=State.RELEASED)
+    flight.run(4.0, until=State.FAILSAFE)
     released_ns = flight.now_ns
     flight.hears = lambda data: True
     flight.run(5.0)
-    assert flight.is_in(State.RELEASED) and not flight.setpoints_between(released_ns, flight.now_ns)
+    assert flight.is_in(State.FAILSAFE) and not flight.setpoints_between(released_ns, flight.now_ns)
     assert flight.commands().count(SET_MODE) == 2  # nothing is asked for
     flight.loop.order(Command(order=Order.ENGAGE))
     flight.run(3.0, until=State.ENGAGED)
@@ -136,9 +136,10 @@ def test_the_vehicle_s_own_failsafe_has_precedence(autopilot: str) -> None:
     pilot = flight.peers.autopilot.pilot
     pilot.fail(PERSONALITIES[autopilot].by_role(Role.LAND), flight.now_ns)
     before = flight.commands()
-    flight.run(2.0, until=State.RELEASED)
+    flight.run(2.0, until=State.FAILSAFE)
     flight.run(20.0, until=State.DONE)
     assert flight.commands() == before and not pilot.armed
+    assert "failsafe" in flight.loop.failure
 
 
 @pytest.mark.fault(34)

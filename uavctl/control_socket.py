@@ -41,6 +41,10 @@ class Orderly(Protocol):
         """Queue an order for the next tick; False if too many wait."""
         ...
 
+    def against(self, order: Order) -> str:
+        """Why an order would come to nothing now; empty if it may be given."""
+        ...
+
 
 @dataclass(eq=False)
 class _Client:
@@ -138,7 +142,7 @@ class ControlServer:
         if request.ask == "status":
             self._reply(client, Reply(ok=True, text="", status=self._look()))
             return
-        problem = request.problem() or self._misplaced(request)
+        problem = request.problem() or self._misplaced(request) or self._flight.against(Order(request.ask)) or None
         if problem is not None:
             self._reply(client, Reply(ok=False, text=problem))
             return

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 
+from msgspec.structs import replace
+
 from uavctl.config import Config
 from uavctl.data import (
     ORDER_ACCEPTED,
@@ -21,10 +23,12 @@ from uavctl.data import (
     Event,
     InertialSample,
     LinkEstimate,
+    Order,
     Outgoing,
     PositionSample,
     Record,
     Refused,
+    Severity,
     Sink,
     StepInput,
     Timing,
@@ -39,7 +43,7 @@ from uavctl.mavlink.link import OVERRUN, Link
 from uavctl.mavlink.messages import Ack, Message, Text
 from uavctl.mavlink.mode import LEAVES_NONE, Sending, State
 from uavctl.mavlink.relay import Relay
-from uavctl.mavlink.sight import View
+from uavctl.mavlink.sight import View, against_moving
 from uavctl.smpc.plant import Plant
 
 Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | Text
@@ -51,6 +55,7 @@ MAX_ORDERS = 16  # that wait for one tick
 MAX_NEWS = 64  # events that wait for a person
 FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
+MAX_NOTICES = 100  # that wait for the console
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
@@ -109,6 +114,9 @@ class ControlLoop:
         self.link: LinkEstimate | None = None
         self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; who tells them takes them
         self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
+        self.notices: deque[Event] = deque(
+            maxlen=MAX_NOTICES
+        )  # of the hand-over, for a person; whoever shows them takes
         self._orders: deque[Command] = deque()
 
     @property
@@ -204,6 +212,11 @@ class ControlLoop:
         self._orders.append(command)
         return True
 
+    def against(self, order: Order) -> str:
+        """Why an order of where to fly would come to nothing now; empty if it may be taken, or is another one."""
+        moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
+        return against_moving(self.who_flies, self.vehicle) if moves else ""
+
     def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
         """Record what the shell measured around the last tick."""
         estimate = self.estimate
@@ -294,9 +307,11 @@ class ControlLoop:
         """What the vehicle is told: a setpoint, a request, or nothing."""
         at_ns = inp.at_ns
         told = self._hand_over.update(self._view(inp, out))
-        self.answers = tuple(_answered(inp.commands, out.events, told.events)) if inp.commands else ()
+        self.answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
+            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # who orders is answered
+                self.notices.append(event)
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
         if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
@@ -307,6 +322,15 @@ class ControlLoop:
         if self._hand_over.ours and self._hand_over.state in (State.READY, State.MODE, State.ARMING):
             for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
                 yield self._send(VEHICLE, data, at_ns)
+
+    def _answers(
+        self, commands: tuple[Command, ...], core: tuple[Event, ...], hand_over: tuple[Event, ...]
+    ) -> Iterator[tuple[Command, Event]]:
+        """Each order with its answer; a landing that the core does not fly, and the hand-over asks for, is accepted."""
+        for command, event in _answered(commands, core, hand_over):
+            landing = command.order is Order.LAND and event.code == ORDER_REFUSED and self.who_flies is State.LANDING
+            text = "land: the vehicle is asked for it"
+            yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
     def _view(self, inp: StepInput, out: StepOutput) -> View:
         """What the hand-over may know."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Protocol
 
 from cyclopts import Parameter
+from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -34,7 +35,7 @@ from uavctl.cli.provenance import cpu, versions
 from uavctl.cli.said import Said, waits_for
 from uavctl.config import Config
 from uavctl.config.load import dump_config
-from uavctl.data import ControlMode, Header, PolicyLibrary, Record
+from uavctl.data import ControlMode, Header, PolicyLibrary, Record, Severity
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 
@@ -200,6 +201,7 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
             while not done.wait(REFRESH_S):
                 tell()
                 decision = loop.decision
+                tell_notices(loop, progress.console)
                 if loop.let_go and not told.is_set():
                     told.set()
                     progress.console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
@@ -215,7 +217,16 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
             done.set()
             thread.join()
             tell()
+            tell_notices(loop, progress.console)
             sys.setswitchinterval(before_s)
+
+
+def tell_notices(loop: ControlLoop, console: Console) -> None:
+    """Say what the hand-over has to tell a person, as far as it is not said yet: each transition that is a warning."""
+    while loop.notices:
+        event = loop.notices.popleft()
+        style = "bold red" if event.severity is Severity.ERROR else "bold yellow"
+        console.print(f"[{style}]{event.code}:[/] {escape(event.text)}", soft_wrap=True)
 
 
 def _line(loop: ControlLoop) -> str:

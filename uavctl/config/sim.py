@@ -118,6 +118,35 @@ class InertialConfig(Section, frozen=True, kw_only=True):
     ] = False
 
 
+class ChecksConfig(Section, frozen=True, kw_only=True):
+    """What the simulated autopilot doubts of itself though nothing is wrong (docs/autopilots.md)."""
+
+    flicker_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=LONGEST_S,
+            description="mean time after which its pre-flight checks change between passing and failing, drawn each "
+            "time; 0: they stay as they are [s]",
+        ),
+    ] = 0.0
+    invalid: Annotated[
+        Spans,
+        Meta(
+            max_length=MOST_SPANS,
+            description="spans [from_s, to_s] since arming in which its position does not count as valid: its failsafe "
+            "acts [s]",
+        ),
+    ] = ()
+    clears: Annotated[
+        bool,
+        Meta(
+            description="whether a failsafe for want of a position ends with its cause: PX4 is back in the mode of "
+            "before, and a take-off goes on"
+        ),
+    ] = False
+
+
 class FaultConfig(Section, frozen=True, kw_only=True):
     """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
@@ -173,6 +202,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
     wind: WindConfig = WindConfig()
     quadrotor: QuadrotorConfig = QuadrotorConfig()
     inertial: InertialConfig = InertialConfig()
+    checks: ChecksConfig = ChecksConfig()
     plant: Annotated[
         Literal["linear", "quadrotor"],
         Meta(

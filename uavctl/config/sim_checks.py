@@ -38,6 +38,13 @@ def sim(config: SimConfig) -> Iterator[Problem]:
     """All problems of `[sim]`."""
     for name in ("occluded", "swapped", "frozen"):
         yield from spans(f"sim.camera.{name}", getattr(config.camera, name))
+    yield from spans("sim.checks.invalid", config.checks.invalid)
+    if config.checks.clears and config.autopilot != "px4":
+        yield Problem(
+            "sim.checks.clears",
+            f'has no effect with autopilot "{config.autopilot}", which stays in the mode of its failsafe',
+            'remove it, or set sim.autopilot = "px4"',
+        )
     yield from faults("sim.fault", config.fault, config.plant)
     if config.plant == "linear":
         for key, same in (("wind", config.wind == WindConfig()), ("quadrotor", config.quadrotor == QuadrotorConfig())):

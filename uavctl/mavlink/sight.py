@@ -157,6 +157,23 @@ def against_engaging(state: State, view: View) -> str:
     return view.unfit
 
 
+def against_moving(state: State, vehicle: VehicleStatus | None) -> str:
+    """Why an order of where to fly would come to nothing; empty if it is we who fly."""
+    if state is State.ENGAGED:
+        return ""
+    if state is State.WAITING or vehicle is None:
+        return "no vehicle is heard"
+    mode = vehicle.mode
+    if state is State.READY:
+        return f"it is not we who fly: the vehicle is in mode {mode}, and the pilot has not switched"
+    if state in LEAVING:
+        return f"the vehicle is on its way up ({state}); order it once it is flown"
+    if state in (State.FAILSAFE, State.RELEASED, State.RETURNING):
+        whose = "a failsafe of its own" if state is State.FAILSAFE else "the pilot"
+        return f"{whose} has the vehicle, in mode {mode}; `uavctl ctl engage` asks for it back"
+    return f"the vehicle has been handed over ({state})"
+
+
 def look(progress: Progress, view: View) -> Sight:
     """What a tick sees; of several things the first in the order of `Seen`."""
     vehicle, state = view.vehicle, progress.state

@@ -1,0 +1,129 @@
+"""Take-offs by relayed positions, with checks that flicker and failsafes that end, judged on the true vehicle."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from loopback_rig import make_loop
+from take_off_rig import RELAYED, Flight
+
+from logs.replay import replay
+from uavctl.data import ControlMode, Order, Severity
+from uavctl.mavlink.mode import State
+
+BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+LIMIT_S, SEEDS = 60.0, 10
+SETTLED_S = 20.0  # engaged for so long, past all that was to come
+LOW_M = 0.3  # a vehicle that is engaged is higher
+
+
+def troubled(autopilot: str, seed: int) -> Flight:
+    """A take-off with checks that flicker, and a position that is not valid for a while after arming."""
+    rng = random.Random(seed)
+    begin_s, length_s = rng.uniform(0.0, 6.0), rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3)
+    return Flight(
+        autopilot,
+        *RELAYED,
+        f"sim.seed={seed}",
+        f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
+        f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
+        f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
+    ).relayed()
+
+
+def outcome(flight: Flight) -> str:
+    """What has become of the true vehicle; `hovers` is what must not be."""
+    up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
+    if not pilot.armed and flight.peers.autopilot.craft.landed:
+        return "landed" if "climbing" in flight.states else "refused"
+    return "engaged" if flight.is_in(State.ENGAGED) and up_m > LOW_M else "hovers"
+
+
+def flown(flight: Flight) -> str:
+    """The outcome by the limit; a flight that has ended is over."""
+    flight.take_off()
+    engaged_s = 0.0
+    for _ in range(round(LIMIT_S)):
+        if flight.loop.finished or engaged_s > SETTLED_S:
+            break
+        flight.run(1.0)
+        engaged_s = engaged_s + 1.0 if flight.is_in(State.ENGAGED) else 0.0
+    return outcome(flight)
+
+
+@pytest.mark.fault(60, 61)
+@BOTH
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilot: str, seed: int) -> None:
+    flight = troubled(autopilot, seed)
+    what = flown(flight)
+    assert what != "hovers", (flight.state, flight.texts)
+    assert what == "engaged" or flight.loop.failure, flight.texts
+    assert not any("started anew" in text for text in flight.texts)
+    assert "released" not in flight.states  # there is no pilot
+
+
+@pytest.mark.fault(61)
+def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
+    more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
+    flight = Flight("px4", *RELAYED, *more).relayed()
+    assert flown(flight) == "engaged" and not flight.loop.failure
+    assert "failsafe" in flight.states and flight.loop.decision is not None
+    assert flight.loop.decision.mode is ControlMode.TRACK
+    told = [event.text for event in flight.loop.notices]
+    assert len(told) == 2 and all("failsafe" in text for text in told)  # in, and out again: for the console
+    result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
+    assert result.identical, result.first_difference
+
+
+@pytest.mark.fault(63)
+@BOTH
+@pytest.mark.parametrize("after_s", [0.6, 1.6, 3.0, 12.0])
+def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_ground(
+    autopilot: str, after_s: float
+) -> None:
+    more = ["sim.checks.invalid=[[0.4, 2.0]]"] + (["sim.checks.clears=true"] if autopilot == "px4" else [])
+    flight = Flight(autopilot, *RELAYED, *more).relayed().take_off()
+    flight.run(30.0, until=State.CLIMBING)
+    flight.run(after_s)
+    for _ in range(70):
+        if flight.loop.finished:
+            break
+        flight.run(1.0, stop=True)
+    assert flight.loop.finished and outcome(flight) == "landed"
+    last_ns = max(at_ns for at_ns, _ in flight.sent("VISION_POSITION_ESTIMATE"))
+    assert flight.now_ns - last_ns < 2_000_000_000
+
+
+@pytest.mark.fault(25, 63)
+def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
+    flight = Flight("px4", *RELAYED).relayed().take_off()
+    flight.run(30.0, until=State.CLIMBING)
+    flight.run(3.0)
+    flight.stick("POSCTL")
+    flight.run(3.0, until=State.RELEASED)
+    assert [event.severity for event in flight.loop.notices] == [Severity.WARNING]
+    before = flight.commands()
+    flight.run(10.0, stop=True)
+    assert not flight.loop.finished and flight.commands() == before
+    flight.stick("AUTO.LAND")
+    flight.run(30.0, stop=True, until=State.DONE)
+    assert flight.loop.finished and flight.commands() == before
+
+
+@pytest.mark.fault(62)
+@BOTH
+def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot: str) -> None:
+    flight = Flight(autopilot)
+    moves = (Order.GOTO, Order.HOLD, Order.RESUME)
+    assert all(flight.loop.against(order) for order in moves)
+    flight.run(1.0).take_off()
+    flight.run(10.0, until=State.CLIMBING)
+    assert all("on its way up" in flight.loop.against(order) for order in moves)
+    flight.run(10.0, until=State.ENGAGED)
+    assert not any(flight.loop.against(order) for order in Order)
+    flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
+    flight.run(3.0, until=State.RELEASED)
+    assert all("uavctl ctl engage" in flight.loop.against(order) for order in moves)
+    assert not flight.loop.against(Order.ENGAGE) and not flight.loop.against(Order.LAND)
