@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import random
 
 import pytest
 from loopback_rig import make_loop
+from rich.console import Console
 from take_off_rig import RELAYED, Flight
 
 from logs.replay import replay
+from uavctl.cli.flying import tell_notices
 from uavctl.data import ControlMode, Order, Severity
 from uavctl.mavlink.mode import State
 
@@ -21,7 +24,10 @@ LOW_M = 0.3  # a vehicle that is engaged is higher
 def troubled(autopilot: str, seed: int) -> Flight:
     """A take-off with checks that flicker, and a position that is not valid for a while after arming."""
     rng = random.Random(seed)
-    begin_s, length_s = rng.uniform(0.0, 6.0), rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3)
+    begin_s, length_s = (
+        rng.uniform(0.0, rng.choice([1.5, 6.0])),
+        rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3),
+    )
     return Flight(
         autopilot,
         *RELAYED,
@@ -75,6 +81,24 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
     assert len(told) == 2 and all("failsafe" in text for text in told)  # in, and out again: for the console
     result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
     assert result.identical, result.first_difference
+
+
+@pytest.mark.fault(61)
+def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
+    flight = Flight("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
+    flight.run(30.0, until=State.FAILSAFE)
+    flight.run(3.0)
+    flight.stick("POSCTL")
+    flight.run(3.0, until=State.RELEASED)
+    said = io.StringIO()
+    tell_notices(flight.loop, Console(file=said, width=200))
+    lines = said.getvalue().splitlines()
+    assert [line.split(" (")[0] for line in lines] == [
+        "hand-over: climbing -> failsafe",
+        "hand-over: failsafe -> climbing",
+        "hand-over: engaged -> released",
+    ]
+    assert not flight.loop.notices
 
 
 @pytest.mark.fault(63)

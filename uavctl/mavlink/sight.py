@@ -213,7 +213,9 @@ def _failsafe_stays(progress: Progress, view: View) -> str:
         begun_ns = progress.climb_ns
     if view.at_ns - begun_ns < round(limit_s * 1e9):
         return ""
-    return f"the vehicle's own failsafe ({progress.left_mode}) has not ended in {limit_s:g} s{progress.words}"
+    acts = vehicle is None or fails(vehicle)
+    became = "has not ended" if acts else "has ended, and nobody has taken the flight up again,"
+    return f"the vehicle's own failsafe ({progress.left_mode}) {became} in {limit_s:g} s{progress.words}"
 
 
 def _never_ready(progress: Progress, view: View) -> str:
