@@ -100,6 +100,17 @@ def test_what_hovers_in_a_failsafe_is_landed_in_bounded_time(autopilot: str, mod
     assert rig.asked_last(Ask.LAND) and "has not ended" in rig.hand_over.failure
 
 
+@pytest.mark.fault(25, 61)
+def test_a_pilot_who_takes_over_in_the_very_tick_in_which_time_is_up_is_not_landed() -> None:
+    rig = engaged(config=HandOverConfig(climb_s=5.0))
+    rig.fail("AUTO.LOITER")
+    rig.run(4.95)
+    assert rig.is_in(State.FAILSAFE)
+    rig.be(mode="POSCTL", failsafe=False)
+    rig.run(1.0)
+    assert rig.is_in(State.RELEASED) and Ask.LAND not in [ask for _, ask in rig.asked]
+
+
 @pytest.mark.fault(8, 61)
 def test_an_engaged_flight_is_taken_up_again_by_order_only() -> None:
     rig = engaged()
