@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from sim.inertial import InertialMeasurement
 from sim.world import World
@@ -17,7 +19,6 @@ from uavctl.trial.metrics import beyond_m
 from uavctl.trial.room import room_of
 
 BLACKOUT_S = (5.0, 9.0)
-LANDS_S = 9.0  # from then on it may land: the floor is no wall
 GUSTS = ("sim.wind.velocity_mps=[0.6, -0.36, 0.0]", "sim.wind.gust_wind_mps=3.0")
 
 
@@ -34,36 +35,61 @@ class Told:
 
 
 @lru_cache
-def furthest_m(autopilot: str, lie: str, seed: int) -> tuple[float, frozenset[str]]:
+def furthest_m(
+    autopilot: str,
+    lie: str,
+    seed: int,
+    preset: str = "",
+    blackout_s: tuple[float, float] = BLACKOUT_S,
+    lies_s: float = BLACKOUT_S[0],
+    silent_s: float = math.inf,
+) -> tuple[float, frozenset[str]]:
     """How far the true vehicle came beyond a wall from the blackout on [m], and what was told.
 
     Args:
         autopilot: whose preset flies.
-        lie: what its inertial data do from the blackout's begin on; "none": they are not used.
+        lie: what its inertial data do; "none": they are not used.
         seed: of gusts, noise and losses.
+        preset: that flies; empty for the autopilot's own.
+        blackout_s: from when to when no position comes.
+        lies_s: from when on they lie.
+        silent_s: from when on the vehicle says nothing of its own velocity.
     """
-    design = ("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()
+    preset = preset or f"room-{autopilot}"
+    design = (f"sim.autopilot={autopilot}", *(("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()))
     flown = load_config(
-        f"room-{autopilot}",
-        [*design, *GUSTS, "duration_s=12.0", f"sim.seed={seed}", f"link.blackout=[[{BLACKOUT_S[0]}, {BLACKOUT_S[1]}]]"],
+        preset,
+        [
+            *design,
+            *GUSTS,
+            "sim.plant=quadrotor",
+            "duration_s=12.0",
+            f"sim.seed={seed}",
+            f"link.blackout=[[{blackout_s[0]}, {blackout_s[1]}]]",
+        ],
     )
     told = Told()
-    believed = load_config(f"room-{autopilot}", design)
+    believed = load_config(preset, design)
     watched = WatchedFlyer(ControlLoop(believed, controller_of(believed), told, lambda: 0))
     world = World(flown, watched)
     vehicle, sensors = world.peers.vehicle, world.peers.autopilot.inertial
+    streams, own = world.peers.autopilot.telemetry.streams, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+    says = streams[own]
+    streams[own] = lambda at_ns: says(at_ns) if at_ns < silent_s * 1e9 else None
+
     watched.where = lambda: vehicle.position_m
     measure, kept = sensors.measure, []
 
     def lying(unit: int) -> InertialMeasurement:
         true = measure(unit)
-        since_s = (watched.times_s[-1] if watched.times_s else 0.0) - BLACKOUT_S[0]
+        since_s = (watched.times_s[-1] if watched.times_s else 0.0) - lies_s
         if since_s < 0.0:
             return true
         kept.append(true)
         forces: dict[str, Vec3] = {
             "frozen": kept[0].force_mps2,
             "step": (true.force_mps2[0] - 1.5, *true.force_mps2[1:]),
+            "offset": (true.force_mps2[0] - 0.7, true.force_mps2[1] - 0.7, true.force_mps2[2]),
             "small": (true.force_mps2[0] - 0.3, *true.force_mps2[1:]),
             "ramp": (true.force_mps2[0] - min(2.0 * since_s, 2.0), *true.force_mps2[1:]),
         }
@@ -73,7 +99,7 @@ def furthest_m(autopilot: str, lie: str, seed: int) -> tuple[float, frozenset[st
     world.run(flown.duration_s)
     times, where = np.array(watched.times_s), np.array(watched.positions_m)
     beyond = beyond_m(where, *room_of(flown))
-    return float(beyond[(times >= BLACKOUT_S[0]) & (times <= LANDS_S)].max()), frozenset(told.codes)
+    return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(told.codes)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -86,6 +112,23 @@ def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(a
         without_m, _ = furthest_m(autopilot, "none", seed)
         assert lied_m < 0.0 and lied_m < without_m + 0.2
         assert told & {"inertial-doubted", "inertial-silent"}
+
+
+@pytest.mark.fault(59)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -> None:
+    """No position could yet speak for the vehicle's own velocity: what was sent since the flight began does."""
+    for seed in (3, 5):
+        lied_m, told = furthest_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
+        assert lied_m < 0.1 and "inertial-doubted" in told
+
+
+@pytest.mark.fault(59)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str) -> None:
+    for seed in (3, 5):
+        healthy_m, told = furthest_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
+        assert healthy_m < -0.4 and "inertial-doubted" not in told
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
