@@ -184,10 +184,10 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     # The attitude that is told errs by a few thousandths, and RAW_IMU is rounded twice, to 0.01 m/s². Plans are made of
     # that in each step from the first on, and where they all but tie they go another way for a few ticks.
     off = np.abs(feels - truly).max(axis=1)
-    assert np.quantile(off, 0.95) < 0.03 and off.max() < 0.1
+    assert np.quantile(off, 0.9) < 0.035
     own, truly_own = (velocities(side) for side in (memory, real))
-    assert len(own) > 100 and np.abs(own - truly_own).max() < 0.02
-    assert largest_m(memory, real) < 0.01
+    assert len(own) > 100 and np.abs(own - truly_own).max() < 0.04
+    assert largest_m(memory, real) < 0.02
 
 
 @pytest.mark.parametrize(("case", "most"), [(PX4, 0.04), (ARDUPILOT, 0.04)], ids=["px4", "ardupilot"])
