@@ -22,6 +22,7 @@ from uavctl.data import ControlMode, Decision, Header, Plan, SolveStatus, Truth
 from uavctl.smpc.conditioned import METHOD
 
 SCHEME = "smpc.scheme=age-conditioned"
+FLOWN = ("loopback", "--config", "room-hahn-stursberg", "--set", SCHEME)
 QUICK = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "sim.camera.rate_hz=50"]
 
 
@@ -89,18 +90,7 @@ def test_losses_that_the_other_scheme_refuses_are_flown(overrides: list[str]) ->
 def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [
-        "loopback",
-        "--config",
-        "room-hahn-stursberg",
-        "--set",
-        SCHEME,
-        "--set",
-        "link.loss=0.9",
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(arguments) == 2
+    assert main([*FLOWN, "--set", "link.loss=0.9", "--out", str(tmp_path)]) == 2
     assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
 
 
@@ -138,18 +128,7 @@ def test_a_recording_under_the_name_of_the_other_design_replays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As they were made before the scheme had a design of its own."""
-    arguments = [
-        "loopback",
-        "--config",
-        "room-hahn-stursberg",
-        "--set",
-        SCHEME,
-        "--duration",
-        "3",
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(arguments) == 0
+    assert main([*FLOWN, "--duration", "3", "--out", str(tmp_path)]) == 0
     old = tmp_path / "old.mcap"
     recorder = SyncRecorder(old, load_config("room-hahn-stursberg").log)
     for topic, at_ns, record in read(tmp_path / "flight.mcap"):

@@ -51,9 +51,8 @@ def test_where_the_fastest_brake_leaves_a_row_it_gives_way() -> None:
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
     assert first.of(upper, lower) is None
-    upper[
-        :2
-    ] = -3.0  # the brake makes -0.5 and -1.75 of it; then it is two steps behind, of which the next makes up one
+    # The brake makes -0.5 and -1.75 of it; then it is two steps behind, of which the next makes up one.
+    upper[:2] = -3.0
     begin = first.of(upper, lower)
     assert begin is not None
     assert begin.tolist() == [1, 1, 0, 0, 0, 0] + [0, 3, 0, 3, 0, 1] + [0] * 6
