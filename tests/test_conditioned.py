@@ -15,7 +15,7 @@ from scipy.stats import binomtest, norm
 
 from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc.age_risk import age_risk
+from uavctl.smpc.age_risk import SELDOM, age_risk, equal_risk
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, Path
 from uavctl.smpc.baselines import PacketisedPredictive, Problem
 from uavctl.smpc.batch_smpc import BatchSmpc
@@ -142,7 +142,9 @@ def test_no_short_cut_changes_the_answer(
         if answer.iterations > MOST_SHIFTING:
             continue  # it has ended its rounds early
         compared += 1
-        slow = plan_slowly(given, solver.risk.shares, x, answer.reference, outlook, SLEW_MPS3[name])
+        slow = plan_slowly(
+            given, solver.risk_towards(target, outlook).shares, x, answer.reference, outlook, SLEW_MPS3[name]
+        )
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
     assert compared > 8
@@ -170,7 +172,7 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
         assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
-            assert (spent(given, answer, cov) <= solver.risk.shares + 1e-9).all()
+            assert (spent(given, answer, cov) <= solver.risk_towards(target).shares + 1e-9).all()
             assert not answer.gave_way
         else:
             assert sum(way.amount for way in answer.gave_way) == pytest.approx(answer.slack, abs=1e-3)
@@ -222,6 +224,45 @@ def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
     solver = ConditionedSolver(given, rare, ALLOWED)
     reference = solver.solve(0, PAPER_START, np.array([80.0, 0.0, 40.0, 0.0])).reference
     assert given.state_set.margin(reference).min() < 2.0  # where each row had a half of one half it was 4 m
+
+
+def test_in_transit_the_ages_share_alike_but_for_those_that_hardly_come() -> None:
+    """Every age that keeps something back has the same risk, and all of what is allowed is used up."""
+    for loss in (0.1, 0.3, 0.8):
+        risk = equal_risk(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
+        counts = np.isfinite(risk.shares)
+        assert np.ptp(risk.budgets[counts]) == 0.0
+        assert (np.diff(counts.astype(int)) <= 0).all()
+        left = SELDOM * (ALLOWED - risk.beyond)
+        assert risk.weights[~counts].sum() <= left
+        assert risk.weights[~counts].sum() + risk.weights[counts][-1] > left  # one more would be too many
+
+
+@pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
+def test_which_spread_a_plan_has_goes_by_the_place_alone(name: str) -> None:
+    """Neither the state, its covariance, how late it was nor what was sent may choose: those go with the age."""
+    given, rng = problem(name), np.random.default_rng(14)
+    solver = ConditionedSolver(given, LINK, ALLOWED)
+    margin, told = given.state_set.margin(given.target), []
+    for share in np.linspace(0.0, 1.0, 21):
+        # From the configured target towards the nearest limit of a position.
+        row = min(
+            (i for i in range(len(margin)) if given.state_set.c[i, list(given.plant.position_index)].any()),
+            key=lambda i: margin[i],
+        )
+        target = given.target + share * margin[row] * given.state_set.c[row] / np.vdot(*[given.state_set.c[row]] * 2)
+        chosen = solver.risk_towards(target)
+        for kind in ("covariance", "sent"):  # the first is late, too
+            assert solver.risk_towards(target, outlook_of(kind, given, rng)) is chosen
+        told.append(chosen is solver.risk_in_transit)
+        assert told[-1] or chosen is solver.risk
+    assert told[0]
+    assert not told[-1]
+    assert (np.diff(np.array(told, dtype=int)) <= 0).all()
+    assert solver.risk_towards(given.target, outlook_of("path", given, rng)) is solver.risk
+    narrow = np.tile(given.state_set.b - margin, (given.horizon + 1, 1))  # a fence that has come to the target
+    assert solver.risk_towards(given.target, replace(NOMINAL, limits=narrow)) is solver.risk
 
 
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])

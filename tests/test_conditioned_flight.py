@@ -173,8 +173,9 @@ def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -
     assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["scheme"] == METHOD
-    weights, budgets = np.array(found["weights"]), np.array(found["budgets"])
-    assert weights @ budgets + found["beyond"] == pytest.approx(0.05)
+    weights = np.array(found["weights"])
+    for budgets in (found["budgets"], found["budgets_in_transit"]):
+        assert weights @ np.array(budgets) + found["beyond"] == pytest.approx(0.05)
     assert main(["design", "--config", "paper", "--set", SCHEME]) == 0
     assert "upper limit of east position" in capsys.readouterr().out
 

@@ -32,7 +32,8 @@ def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: py
             continue  # one of them may have ended its rounds early
         compared += 1
         assert one.inputs == pytest.approx(other.inputs, abs=1e-6)
-        assert one.slack == pytest.approx(other.slack, abs=1e-6)
+        # Slacks are as exact as their size: these are states that inputs cannot brake, metres past their limits.
+        assert one.slack == pytest.approx(other.slack, rel=1e-7, abs=1e-6)
     assert compared > 20
     assert sum(one.iterations for one in guessed) < 0.8 * sum(one.iterations for one in without)
 

@@ -74,17 +74,19 @@ def conditioned_document(made: ConditionedDesign, wall_s: float) -> dict[str, ob
 def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
     """Ages and their risk, and where a plan may rest, as tables."""
     ages = Table(title=f"Risk by the age of information, design {made.design_id} of {name}", title_justify="left")
-    for heading in ("age [steps]", "probability", "may be outside"):
+    for heading in ("age [steps]", "probability", "may be outside", "far from limits"):
         ages.add_column(heading, justify="right")
-    risk, problem = made.solver.risk, made.solver.problem
+    risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
     left = 1.0 - np.cumsum(risk.weights)
     told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
-    for age, (weight, budget) in enumerate(zip(risk.weights[:told], risk.budgets, strict=False), start=1):
-        ages.add_row(str(age), f"{weight:.3g}", f"{budget:.2%}")
+    for age in range(told):
+        both = (f"{spread.budgets[age]:.2%}" for spread in (risk, transit))
+        ages.add_row(str(age + 1), f"{risk.weights[age]:.3g}", *both)
     if told < problem.horizon:
         rest = f"{risk.weights[told:].sum():.3g}"
-        ages.add_row(f"{told + 1} to {problem.horizon}", rest, f"up to {risk.budgets[-1]:.2%}")
-    ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full")
+        both = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
+        ages.add_row(f"{told + 1} to {problem.horizon}", rest, *both)
+    ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
     names = build_names(made)
     limits = Table(title="Where a plan may rest", title_justify="left")
     for heading in ("limit", "at", "rests up to", "unit"):

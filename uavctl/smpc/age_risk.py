@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 PRICE = 1.0  # h of π_t^h, what an age's back-off costs: its share of time. More keeps plans back for ages seldom met
 LARGEST_RISK = 0.5  # of a row: a mean outside of its limit is no plan
 LEAST_RISK = 1e-9  # of an age's budget: what rounding may leave
+SELDOM = 0.05  # of the allowed risk: what the oldest ages may use up that keep nothing back in transit
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +58,7 @@ def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = P
         DesignError: Information is older than the horizon more often than is allowed.
     """
     steps = len(deviations)
-    older = np.array([link.outage(age) for age in range(steps + 1)])
-    weights, beyond = older[:-1] - older[1:], float(older[-1])
-    left = allowed - beyond
-    if left <= LEAST_RISK * allowed:
-        raise DesignError(
-            "smpc.horizon",
-            f"positions are {steps} steps old or more in {beyond:.3g} of all steps, and no more than {allowed:.3g} "
-            "may be outside of the limits",
-            "take a longer smpc.horizon or a lower smpc.delta_x",
-        )
+    weights, beyond, left = _ages(link, steps, allowed)
     most = min(1.0, corner * LARGEST_RISK)
     if not deviations.all():
         return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), most)))
@@ -83,3 +75,41 @@ def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = P
 
     low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
     return AgeRisk(weights, beyond, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
+
+
+def equal_risk(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
+    """Spread the allowed risk equally over the ages, but for the oldest that hardly come: those keep nothing back.
+
+    Where a target leaves room no plan rests near a limit, and limits are met only on the way, by plans that are young:
+    what an age costs there is not its share of time. Ages that keep nothing back use up SELDOM of the risk together.
+
+    Args:
+        link: Model of the link.
+        steps: H.
+        allowed: 1 - δ_x.
+        corner: n, rows that may bind at once.
+
+    Raises:
+        DesignError: Information is older than the horizon more often than is allowed.
+    """
+    weights, beyond, left = _ages(link, steps, allowed)
+    older = np.cumsum(weights[::-1])[::-1]
+    seldom = older <= SELDOM * left
+    most = min(1.0, corner * LARGEST_RISK)
+    equal = min(most, (left - float(weights[seldom].sum())) / float(weights[~seldom].sum()))
+    return AgeRisk(weights, beyond, np.where(seldom, 1.0, equal))
+
+
+def _ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
+    """π_t (H,), the probability of more than H, and what is left of the allowed risk."""
+    older = np.array([link.outage(age) for age in range(steps + 1)])
+    weights, beyond = older[:-1] - older[1:], float(older[-1])
+    left = allowed - beyond
+    if left <= LEAST_RISK * allowed:
+        raise DesignError(
+            "smpc.horizon",
+            f"positions are {steps} steps old or more in {beyond:.3g} of all steps, and no more than {allowed:.3g} "
+            "may be outside of the limits",
+            "take a longer smpc.horizon or a lower smpc.delta_x",
+        )
+    return weights, beyond, left

@@ -9,7 +9,8 @@ and disturbances are independent of losses. By total probability
 where row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i with
 the estimate's own covariance P. The budget ε̄_t of an age is fixed, because plans of different ages share it at one
 moment; how a plan spreads ε̄_t over its rows is free (iterative risk allocation). `docs/theory.md` has statement and
-proof.
+proof. Two spreads of ε̄_t are at hand: one for targets that leave room from all limits, one for the others and for
+motions, whose plans meet limits at any age.
 
 The cost is that of the regulator: with u_t = u_s + K(x_t - x_s) + c_t and its Riccati solution behind stage H it is
 |z|² in z = L'c, L L' = R + B'PB. Where z = 0 keeps all limits within the budgets it is the answer; elsewhere a
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from uavctl.data import GaveWay, SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc.age_risk import LARGEST_RISK, PRICE, age_risk
+from uavctl.smpc.age_risk import LARGEST_RISK, PRICE, AgeRisk, age_risk, equal_risk
 from uavctl.smpc.allocation import DISTANT, binding, quantile, shifted, spent
 from uavctl.smpc.answer import NOMINAL, Answer, Outlook, finite
 from uavctl.smpc.assemble import INPUT_TOLERANCE, KEPT, inside
@@ -71,6 +72,25 @@ class _Margins:
     budgets: Array
     backoff: Array
     distant: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """How the risk is spread over the ages, and what follows from it, by how late [steps] a position was.
+
+    Attributes:
+        risk: The spread.
+        budgets: ε̄ of the stages (H, H).
+        shared: Quantiles of rows that share them equally (H, H, 1).
+        distant: Quantiles of rows at first which the regulator's plan is not near (H, H, 1).
+        rest: What a plan that rests keeps from each row (n, m), by how many rows are in the way of a target.
+    """
+
+    risk: AgeRisk
+    budgets: Array
+    shared: Array
+    distant: Array
+    rest: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,32 +165,52 @@ class ConditionedSolver:
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
-        self.risk = age_risk(link, self._pacing(), allowed, price, len(self._parts))
-        # By how late the position was: budgets, and quantiles of rows that share them and of one that need not.
-        ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-        self._budgets = self.risk.shares[ages]
-        self._shared = quantile(self._budgets / max(1, width))[:, :, None]
-        self._distant = quantile(DISTANT * self._budgets / max(1, width))[:, :, None]
-        # By how many rows are in the way of a target: what a plan that rests keeps from each.
-        self._rest = np.zeros((len(self._parts), width))
-        self._rest[:, self._resting] = rest_backoffs(
-            problem, self.risk, allowed, self._slew, self._c[self._resting], cov, len(self._parts), self.seen
-        )
-        self._last: tuple[tuple[int, bytes], _Margins] | None = None
+        many = len(self._parts)
+
+        def spread(risk: AgeRisk) -> _Spread:
+            ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
+            budgets, rest = risk.shares[ages], np.zeros((many, width))
+            rest[:, self._resting] = rest_backoffs(
+                problem, risk, allowed, self._slew, self._c[self._resting], cov, many, self.seen
+            )
+            shares = budgets / max(1, width)
+            return _Spread(risk, budgets, quantile(shares)[:, :, None], quantile(DISTANT * shares)[:, :, None], rest)
+
+        self._near = spread(age_risk(link, self._pacing(), allowed, price, many))
+        self._transit = spread(equal_risk(link, steps, allowed, many))
+        # Who rests there is seldom outside even at the oldest age that keeps something back, so limits matter on the
+        # way alone.
+        counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
+        oldest = self._deviations.of(None)[max(0, counts - 1)]
+        self._far = np.maximum(self._transit.rest[-1], float(quantile(np.array(allowed / many))) * oldest)
+        self._last: tuple[tuple[bool, int, bytes], _Margins] | None = None
+
+    @property
+    def risk(self) -> AgeRisk:
+        """The risk by age beside limits and along motions."""
+        return self._near.risk
+
+    @property
+    def risk_in_transit(self) -> AgeRisk:
+        """The risk by age where the target leaves room."""
+        return self._transit.risk
+
+    def risk_towards(self, target: Array, outlook: Outlook = NOMINAL) -> AgeRisk:
+        """The spread of a plan towards `target` (n_x,): by the target, the limits and whether there is a motion."""
+        return self._towards(target, self._limits(outlook), outlook).risk
 
     def rests(self) -> Array:
         """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._rest[-1]
+        sides[self._rows] -= self._near.rest[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards `target` (n_x,), an equilibrium; see `Solver`."""
         if not finite(x, target, outlook):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        margins, limits = self._margins(outlook), self._b
-        if outlook.limits is not None:
-            limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
+        limits = self._limits(outlook)
+        margins = self._margins(self._towards(target, limits, outlook), outlook)
         reference = self._reference(target, limits)
         hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
         first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
@@ -219,23 +259,37 @@ class ConditionedSolver:
             gave_way=gave_way,
         )
 
-    def _margins(self, outlook: Outlook) -> _Margins:
+    def _limits(self, outlook: Outlook) -> Array:
+        """Right sides of the state rows, in each stage (H, m) or in all alike (m,)."""
+        limits: Array = self._b
+        if outlook.limits is not None:
+            limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
+        return limits
+
+    def _towards(self, target: Array, limits: Array, outlook: Outlook) -> _Spread:
+        """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides."""
+        if outlook.path is not None:
+            return self._near
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        kept = (sides - self._far)[self._resting]
+        return self._transit if (self._placed.dot(target[self._rests.held]) <= kept).all() else self._near
+
+    def _margins(self, spread: _Spread, outlook: Outlook) -> _Margins:
         """Those of an outlook; the last ones are kept, by the very bits that they are made of."""
-        key = outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
+        key = spread is self._transit, outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
-            shared = self._shared[late] * sigma
-            self._last = key, _Margins(sigma, self._budgets[late], shared, self._distant[late])
+            self._last = key, _Margins(sigma, spread.budgets[late], spread.shared[late] * sigma, spread.distant[late])
         return self._last[1]
 
     def _reference(self, target: Array, limits: Array) -> Array:
         """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
         sides = limits if limits.ndim == 1 else limits.min(axis=0)
-        short = self._placed.dot(target[self._rests.held]) > (sides - self._rest[0])[self._resting]
+        short = self._placed.dot(target[self._rests.held]) > (sides - self._near.rest[0])[self._resting]
         count = np.count_nonzero(short)
         if not count:
             return target
-        reference, rest = np.array(target), self._rest[min(int(count), len(self._rest)) - 1]
+        reference, rest = np.array(target), self._near.rest[min(int(count), len(self._parts)) - 1]
         for one, places in zip(self._parts, self._places, strict=True):
             places.nearest(reference, (sides - rest)[one.columns])
         return reference

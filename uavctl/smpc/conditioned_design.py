@@ -92,6 +92,7 @@ def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
         "target": design.target.tolist(),
         "weights": risk.weights.tolist(),
         "budgets": risk.budgets.tolist(),
+        "budgets_in_transit": design.solver.risk_in_transit.budgets.tolist(),
         "beyond": risk.beyond,
         "rests": design.rests.tolist(),
         "a": plant.a.tolist(),
