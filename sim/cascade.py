@@ -25,6 +25,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
 REFERENCE_GAIN_1PS = 2.0
 REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
+CRAWL_BELOW_M = 1.0  # PX4's MPC_LAND_ALT3
 CARRIED_S = 3.0  # ArduPilot moves a position on with its velocity for so long (GUID_TIMEOUT), then it stays
 
 
@@ -45,6 +46,11 @@ class Tuning:
         integral_1ps2: integral gain of the velocity loop, horizontal.
         integral_down_1ps2: the same, vertical.
         hover_error: relative error of the thrust that the autopilot takes for hovering.
+        thrust_gain: of a loop that holds the vertical acceleration by the thrust; 0 is none, and the thrust that is
+            reckoned for an acceleration is given at once.
+        thrust_integral_1ps: integral gain of that loop.
+        land_mps: with which it sinks to land.
+        crawl_mps: the same near the floor.
     """
 
     open_loop: bool
@@ -59,8 +65,15 @@ class Tuning:
     integral_1ps2: float
     integral_down_1ps2: float
     hover_error: float
+    thrust_gain: float = 0.0
+    thrust_integral_1ps: float = 0.0
+    land_mps: float = LAND_MPS
+    crawl_mps: float = LAND_MPS
 
 
+# ArduPilot gives throttle for the error of the vertical acceleration alone: PSC_ACCZ_P 0.5 and PSC_ACCZ_I 1, a
+# thousandth of it for 1 cm/s2, on a vehicle that hovers at a throttle of 0.39 (MOT_THST_HOVER as recorded).
+THROTTLE_MPS2 = GRAVITY_MPS2 / 0.39
 # Outer gains are the autopilots' defaults (PSC_POSXY_P, PSC_VELXY_P and so on; MPC_XY_P, MPC_XY_VEL_P_ACC and so on);
 # dead time, attitude gain and hover error are fitted to the recorded flights, see docs/vehicle.md.
 TUNINGS = {
@@ -75,8 +88,10 @@ TUNINGS = {
         velocity_1ps=2.0,
         velocity_down_1ps=5.0,
         integral_1ps2=1.0,
-        integral_down_1ps2=1.0,
+        integral_down_1ps2=0.0,
         hover_error=0.0,
+        thrust_gain=0.05 * THROTTLE_MPS2,
+        thrust_integral_1ps=0.1 * THROTTLE_MPS2,
     ),
     "px4": Tuning(
         open_loop=True,
@@ -91,6 +106,8 @@ TUNINGS = {
         integral_1ps2=0.4,
         integral_down_1ps2=2.0,
         hover_error=0.0153,
+        land_mps=0.7,  # MPC_LAND_SPEED and MPC_LAND_CRWL, as recorded
+        crawl_mps=0.3,
     ),
 }
 
@@ -102,6 +119,7 @@ class Demand(Enum):
     VELOCITY = auto()
     POSITION = auto()
     MOTION = auto()
+    LANDING = auto()
 
 
 class _Asked(NamedTuple):
@@ -135,12 +153,14 @@ class Cascade:
         self._velocity: Vec3 = ZERO
         self._accel: Vec3 = ZERO
         self._integral: Vec3 = ZERO
+        self._thrust_mps2 = 0.0  # integral of the loop on the vertical acceleration
 
     def begin(self, motion: Motion) -> None:
         """Begin anew from this motion, with zero acceleration."""
         self._coming.clear()
         self._demand, self._wanted = Demand.ACCELERATION, ZERO
         self._accel = self._integral = ZERO
+        self._thrust_mps2 = 0.0
         self._carry(motion)
 
     def accelerate(self, accel_mps2: Vec3) -> None:
@@ -176,7 +196,8 @@ class Cascade:
 
     def land(self) -> None:
         """Sink at the landing speed, over the present place."""
-        self.fly((0.0, 0.0, LAND_MPS))
+        self._coming.clear()
+        self._demand, self._wanted = Demand.LANDING, (0.0, 0.0, self.tuning.land_mps)
 
     def listen(self) -> None:
         """Begin a step: what has waited out the dead time is asked from now on."""
@@ -195,14 +216,16 @@ class Cascade:
     def stand(self, motion: Motion) -> None:
         """A step on the floor: the reference stays with the vehicle, and nothing is left of the flight before."""
         self._accel = self._integral = ZERO
+        self._thrust_mps2 = 0.0
         self._carry(motion)
 
-    def step(self, motion: Motion, *, thrust_limited: bool) -> Lean:
+    def step(self, motion: Motion, *, thrust_limited: bool, fall_mps2: float = 0.0) -> Lean:
         """A step in the air: the lean to take now.
 
         Args:
             motion: of the vehicle, as its loops see it.
             thrust_limited: whether the rotors could not give the thrust of the last step.
+            fall_mps2: downward acceleration in the last step, as accelerometers feel it.
         """
         if self._demand is Demand.ACCELERATION:
             self._follow_acceleration()
@@ -212,13 +235,16 @@ class Cascade:
                 return self._lean((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
         elif self._demand is Demand.VELOCITY:
             self._follow_velocity(self._wanted)
+        elif self._demand is Demand.LANDING:
+            near = -motion.position_m[2] < CRAWL_BELOW_M
+            self._follow_velocity((0.0, 0.0, self.tuning.crawl_mps if near else self.tuning.land_mps))
         elif self._demand is Demand.POSITION:
             self._follow_position()
         else:
             self._carry_on()
-            return self._track(motion, thrust_limited)
+            return self._track(motion, thrust_limited, fall_mps2)
         self._move_reference()
-        return self._track(motion, thrust_limited)
+        return self._track(motion, thrust_limited, fall_mps2)
 
     def _lean(self, accel: Vec3) -> Lean:
         return lean(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
@@ -280,7 +306,7 @@ class Cascade:
 
     # The loops on it
 
-    def _track(self, motion: Motion, thrust_limited: bool) -> Lean:
+    def _track(self, motion: Motion, thrust_limited: bool, fall_mps2: float) -> Lean:
         """Hold the vehicle on the reference, which must not run away from a vehicle that cannot follow."""
         t = self.tuning
         (pn, pe, pd), (vn, ve, vd) = motion.position_m, motion.velocity_mps
@@ -288,13 +314,11 @@ class Cascade:
         ee = self._velocity[1] - ve + t.position_1ps * (self._position[1] - pe)
         ed = self._velocity[2] - vd + t.position_down_1ps * (self._position[2] - pd)
         (an, ae, ad), (jn, je, jd) = self._accel, self._integral
-        result = self._lean(
-            (
-                an + t.velocity_1ps * en + jn,
-                ae + t.velocity_1ps * ee + je,
-                ad + t.velocity_down_1ps * ed + jd - t.hover_error * GRAVITY_MPS2,
-            )
-        )
+        down = ad + t.velocity_down_1ps * ed + jd - t.hover_error * GRAVITY_MPS2
+        lack = down - fall_mps2
+        if t.thrust_gain > 0.0:  # a loop on the acceleration gives the thrust for it
+            down = t.thrust_gain * lack + self._thrust_mps2
+        result = self._lean((an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down))
         if result.limited:
             self._position, self._velocity = (pn, pe, self._position[2]), (vn, ve, self._velocity[2])
         else:
@@ -304,6 +328,7 @@ class Cascade:
             self._position, self._velocity = (*self._position[:2], pd), (*self._velocity[:2], vd)
         else:
             jd += t.integral_down_1ps2 * self._step_s * ed
+            self._thrust_mps2 += t.thrust_integral_1ps * self._step_s * lack
         self._integral = (jn, je, jd)
         return result
 

@@ -104,8 +104,7 @@ class Commands:
         if v.kind.name == "px4":
             if request.frame not in RELATIVE_FRAMES:
                 up -= v.origin.altitude_m - v.pilot.home_m[2]
-            height = up if 0.0 < up <= TAKEOFF_MAX_M else v.parameters["MIS_TAKEOFF_ALT"]
-            return v.pilot.take_off(height, at_ns)
+            return v.pilot.take_off(up if 0.0 < up <= TAKEOFF_MAX_M else None, at_ns)
         return v.pilot.take_off(up, at_ns) if 0.0 < up <= TAKEOFF_MAX_M else FAILED
 
     def _set_interval(self, request: Request, at_ns: int) -> int:

@@ -87,7 +87,7 @@ PX4_PARAMETERS = {
     "MAV_SYS_ID": _told(1, Kind.INT32),
     "MIS_TAKEOFF_ALT": _real(2.5),
     "MPC_ACC_HOR": _told(REFERENCE_ACCEL_MPS2),
-    "MPC_LAND_SPEED": _told(LAND_MPS),
+    "MPC_LAND_SPEED": _told(TUNINGS["px4"].land_mps),
     "MPC_TILTMAX_AIR": _told(_degrees("px4")),
     "NAV_DLL_ACT": _int(0, 0, 1, 3),  # nothing, hold, land
     "SYS_HAS_GPS": _int(1, 0, 1),

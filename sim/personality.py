@@ -53,6 +53,12 @@ class Personality:
     disarmed_text: str
     preflight_text: str  # when it disarms itself before take-off
     landed_text: str  # empty: it says nothing
+    takeoff_text: str  # when it notices that it takes off; empty: it says nothing
+    touch_text: str  # its simulator's, on the floor's first touch; empty: it says nothing
+    lifts_s: float  # from arming to the thrust that lifts: rotors spin up, thrust ramps
+    ramps_s: float  # the same from the order, armed for long
+    settles_s: float  # from standing on the floor to knowing it
+    disarms_s: float  # from knowing it to disarming
     good_flags: int  # ESTIMATOR_STATUS_FLAGS of a good estimate, as recorded in flight
     vtol_state: int  # of EXTENDED_SYS_STATE
     version: int  # flight_sw_version of AUTOPILOT_VERSION
@@ -101,6 +107,12 @@ PX4 = Personality(
     disarmed_text="Disarmed by landing",
     preflight_text="Disarmed by auto preflight disarming",
     landed_text="Landing detected",
+    takeoff_text="Takeoff detected",
+    touch_text="",
+    lifts_s=3.8,
+    ramps_s=3.0,
+    settles_s=1.9,
+    disarms_s=2.0,
     good_flags=0x37F,
     vtol_state=0,
     version=0x01080000,
@@ -132,6 +144,12 @@ ARDUPILOT = Personality(
     disarmed_text="Disarming motors",
     preflight_text="Disarming motors",
     landed_text="",
+    takeoff_text="",
+    touch_text="SIM Hit ground at 0.500000 m/s",
+    lifts_s=3.4,
+    ramps_s=0.8,
+    settles_s=0.0,
+    disarms_s=1.65,
     good_flags=0x33F,
     vtol_state=3,
     version=0x040602FF,

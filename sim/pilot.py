@@ -23,9 +23,7 @@ WATCH_NS = 20_000_000  # how often height and floor are looked at
 # PX4 takes OFFBOARD while the newest setpoint is younger than COM_OF_LOSS_T; its documentation asks for 2 Hz, so here
 # never longer than that.
 FRESH_NS = SECOND_NS // 2
-DISARM_NS = 2 * SECOND_NS  # from touching the floor to disarming
 NO_DOWN_NS = 5 * SECOND_NS  # length of a take-off or landing of a plant that has no vertical axis
-TAKEOFF_HEIGHT_M = 2.5  # PX4's MIS_TAKEOFF_ALT
 TAKEOFF_DONE_M = 0.1
 LANDS = 4  # COM_OBL_RC_ACT; less leaves it to the stick
 CRASHED = "CRASHED"
@@ -78,7 +76,10 @@ class Pilot:
         self._watch_ns = craft.now_ns
         self._phase_end_ns: int | None = None  # end of a timed climb or descent, or of the wait for disarming
         self._disarm_text = kind.preflight_text
-        self._takeoff_m = TAKEOFF_HEIGHT_M
+        self._takeoff_m: float | None = None  # height that was asked for; without, PX4 has its own
+        self._armed_ns = craft.now_ns
+        self._lift_ns: int | None = None  # when it leaves the floor, while rotors spin up
+        self._stood_ns: int | None = None  # since when it stands on the floor without knowing it
         self.setpoint_ns: int | None = None
         self._returns = False  # whether setpoints that come again end the failsafe
         self.texts: list[tuple[int, str]] = []
@@ -116,7 +117,7 @@ class Pilot:
         """Time of the next thing to do of itself [ns]."""
         watch_ns = self._watch_ns if self._watches else None
         steered_ns = None if self._steered is None else self._steered.next_ns
-        return earliest((self._phase_end_ns, self._deadline_ns, watch_ns, steered_ns))
+        return earliest((self._phase_end_ns, self._deadline_ns, watch_ns, steered_ns, self._lift_ns))
 
     @property
     def _watches(self) -> bool:
@@ -128,6 +129,8 @@ class Pilot:
         """Do what is due at `at_ns`, the vehicle being there."""
         if self._deadline_ns is not None and self._deadline_ns <= at_ns:
             self._on_silence(at_ns)
+        if self._lift_ns is not None and self._lift_ns <= at_ns:
+            self._lift(at_ns)
         if self._phase_end_ns is not None and self._phase_end_ns <= at_ns:
             self._end_phase(at_ns)
         if self._watches and self._watch_ns <= at_ns:
@@ -165,7 +168,7 @@ class Pilot:
         if why and not forced:
             self.texts.extend((CRITICAL, text) for text in why)
             return self._kind.refused_arming
-        self.armed = True
+        self.armed, self._armed_ns = True, at_ns
         self.home_m = self._estimator.position_m
         self._phase_end_ns, self._disarm_text = self._self_disarm_ns(at_ns), self._kind.preflight_text
         self.texts.append((INFO, self._kind.armed_text))
@@ -187,12 +190,17 @@ class Pilot:
 
     def _disarm(self) -> None:
         self.armed = self.failsafe = self._returns = False
-        self._phase_end_ns = None
+        self._phase_end_ns = self._lift_ns = None
         self._craft.rest()
+
+    @property
+    def _height_m(self) -> float:
+        """Of a take-off, above the floor."""
+        return self._parameters["MIS_TAKEOFF_ALT"] if self._takeoff_m is None else self._takeoff_m
 
     def take_off(self, height_m: float | None, at_ns: int) -> int:
         """Climb to a height above the floor [m]; PX4 changes to its take-off mode, ArduPilot stays GUIDED."""
-        self._takeoff_m = TAKEOFF_HEIGHT_M if height_m is None else height_m
+        self._takeoff_m = height_m
         if self._kind.name == "px4":
             self._enter(self._kind.by_role(Role.TAKEOFF), at_ns)
         elif self.armed and self.phase is Phase.GROUND and self.mode.role is Role.EXTERNAL:
@@ -209,8 +217,10 @@ class Pilot:
             self.texts.append((WARNING, f"Mode change failed: {what}"))
             return TEMPORARILY_REJECTED if px4 else FAILED
         if mode.role is Role.EXTERNAL and self._kind.needs_stream and not self._streaming(at_ns):
-            self.texts.append((CRITICAL, "OFFBOARD refused: no fresh setpoint"))
+            self.texts.append((CRITICAL, "Switching to Offboard is currently not available"))
             return TEMPORARILY_REJECTED
+        if mode.role is Role.TAKEOFF:
+            self._takeoff_m = None
         self._enter(mode, at_ns)
         return ACCEPTED
 
@@ -232,21 +242,44 @@ class Pilot:
     # Modes and phases
 
     def _enter(self, mode: Mode, at_ns: int) -> None:
+        lifts = self._lift_ns is not None and (mode is self.mode or mode.role is Role.TAKEOFF)
         self.mode = mode
         self.failsafe = self._returns = False
+        if lifts:
+            return
         if self.phase is Phase.GROUND:
             if mode.role is Role.TAKEOFF and self.armed:
                 self._climb(at_ns)
             return
         lands = mode.role is Role.LAND
+        if self._lift_ns is not None:  # still on the floor: its rotors slow down again
+            self._lift_ns, self.phase = None, Phase.GROUND
+            self._phase_end_ns, self._disarm_text = self._self_disarm_ns(at_ns), self._kind.preflight_text
+            if lands:
+                self._know_the_floor(at_ns)
+            return
         self.phase = Phase.DESCENT if lands else Phase.AIR
         self._phase_end_ns = at_ns + NO_DOWN_NS if lands and not self._craft.has_down else None
         self._fly_itself(at_ns)
 
     def _climb(self, at_ns: int) -> None:
-        self._craft.grounded = False
+        """Take off: a quadrotor's rotors spin up first, the linear plant has none."""
         self.phase = Phase.CLIMB
+        if self._takeoff_m is None and self._steered is None:
+            self.texts.append((INFO, f"Using default takeoff altitude: {self._height_m:.1f} m"))
         self._phase_end_ns = None if self._craft.has_down else at_ns + NO_DOWN_NS
+        if self._steered is None and self._craft.grounded:
+            kind = self._kind
+            self._lift_ns = max(self._armed_ns + round(kind.lifts_s * 1e9), at_ns + round(kind.ramps_s * 1e9))
+        else:
+            self._lift(at_ns)
+
+    def _lift(self, at_ns: int) -> None:
+        self._lift_ns = None
+        if self._craft.grounded:
+            self._craft.grounded = False
+            if self._steered is None and self._kind.takeoff_text:
+                self.texts.append((INFO, self._kind.takeoff_text))
         self._fly_itself(at_ns)
 
     def _end_phase(self, at_ns: int) -> None:
@@ -262,24 +295,41 @@ class Pilot:
     def _watch(self, at_ns: int) -> None:
         self._watch_ns = at_ns + WATCH_NS
         if self.phase is Phase.CLIMB:
-            if self._estimator.position_m[2] <= TAKEOFF_DONE_M - self._takeoff_m:
+            if self._estimator.position_m[2] <= TAKEOFF_DONE_M - self._height_m:
                 self._climbed(at_ns)
         elif self._craft.landed:
-            self._touch(at_ns)
+            self._settle(at_ns)
+        else:
+            self._stood_ns = None
 
     def _climbed(self, at_ns: int) -> None:
         self._enter(self._kind.by_role(Role.HOLD) if self.mode.role is Role.TAKEOFF else self.mode, at_ns)
 
+    def _settle(self, at_ns: int) -> None:
+        """Know some time after that it has landed, as the autopilot of a quadrotor does."""
+        if self._stood_ns is None:
+            self._stood_ns = at_ns
+            if self._steered is None and self._kind.touch_text:
+                self.texts.append((INFO, self._kind.touch_text))
+        settles_ns = round(self._kind.settles_s * 1e9) if self._steered is None else 0
+        if at_ns - self._stood_ns >= settles_ns:
+            self._touch(at_ns)
+
     def _touch(self, at_ns: int) -> None:
+        self._stood_ns = None
         if self._steered is not None:  # its plant would fall through the floor
             self._craft.rest()
         else:  # whatever it was told to fly
             self._craft.land()
         self.phase = Phase.GROUND
         self.helm.obeyed = None
-        self._phase_end_ns, self._disarm_text = at_ns + DISARM_NS, self._kind.disarmed_text
+        self._know_the_floor(at_ns)
         if self._kind.landed_text:
             self.texts.append((INFO, self._kind.landed_text))
+
+    def _know_the_floor(self, at_ns: int) -> None:
+        disarms_ns = round(self._kind.disarms_s * 1e9)
+        self._phase_end_ns, self._disarm_text = at_ns + disarms_ns, self._kind.disarmed_text
 
     def _on_silence(self, at_ns: int) -> None:
         if self._kind.name == "px4":
@@ -294,7 +344,7 @@ class Pilot:
         """Fly what the phase asks for."""
         self.helm.obeyed = None
         if self.phase is Phase.CLIMB:
-            self._craft.take_off(self._takeoff_m)
+            self._craft.take_off(self._height_m)
         elif self.phase is Phase.DESCENT:
             self._craft.land()
         else:

@@ -71,6 +71,7 @@ class Quadrotor:
         self._grounded = False
         self._accel: Vec3 = ZERO
         self._errors: tuple[Vec3, Vec3] | None = None
+        self._fall_mps2 = 0.0  # downward acceleration in the last step
         self._turn: Vec3 | None = None  # of the attitude that the loops believe
         hover = airframe.hover_rps
         self._rotors.speeds_rps = self._rotors.commands_rps = (hover, hover, hover, hover)
@@ -269,6 +270,7 @@ class Quadrotor:
         wrenches = self._rotors.step()
         self._motion = step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
         self.battery.drain(wrenches[0].thrust_n, STEP_S)
+        self._fall_mps2 = (self._motion.velocity_mps[2] - motion.velocity_mps[2]) / STEP_S
         self._meet_the_floor(motion)
 
     def _control(self, motion: Motion) -> None:
@@ -277,12 +279,13 @@ class Quadrotor:
         idles = self._touched_ns is not None and not self.cascade.climbs
         if idles or self.battery.empty:
             self.cascade.stand(motion)
+            self._fall_mps2 = 0.0
             self._loop.reset(motion.rates_rps)
             self._rotors.command(0.0, ZERO, self.battery.largest_rps)
             if self.battery.empty:
                 self._rotors.stop()
             return
-        wanted = self.cascade.step(motion, thrust_limited=self._rotors.thrust_limited)
+        wanted = self.cascade.step(motion, thrust_limited=self._rotors.thrust_limited, fall_mps2=self._fall_mps2)
         w, x, y, z = motion.attitude
         fn, fe, fd = wanted.force_mps2
         along = fn * (x * z + w * y) * 2.0 + fe * (y * z - w * x) * 2.0 + fd * (1.0 - 2.0 * (x * x + y * y))

@@ -192,7 +192,7 @@ class Telemetry:
     def _heartbeat(self, at_ns: int) -> Message:
         pilot = self._v.pilot
         status = mavlink.MAV_STATE_STANDBY
-        if pilot.phase is not Phase.GROUND or (pilot.armed and self._v.kind.name == "px4"):
+        if not self._stands or (pilot.armed and self._v.kind.name == "px4"):
             status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
         elif self._v.kind.name == "px4" and not self._may_arm(at_ns):
             status = mavlink.MAV_STATE_UNINIT  # as recorded: it stands by only while it might be armed
@@ -368,8 +368,15 @@ class Telemetry:
             self._boot_us(at_ns), flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
         )
 
+    @property
+    def _stands(self) -> bool:
+        """Whether it is on the floor, its rotors perhaps spinning up."""
+        return self._v.pilot.phase is Phase.GROUND or (self._v.pilot.phase is Phase.CLIMB and self._v.craft.grounded)
+
     def _landed(self, _at_ns: int) -> Message:
-        return mavlink.MAVLink_extended_sys_state_message(self._v.kind.vtol_state, self._v.pilot.phase.value)
+        return mavlink.MAVLink_extended_sys_state_message(
+            self._v.kind.vtol_state, (Phase.GROUND if self._stands else self._v.pilot.phase).value
+        )
 
 
 def clipped_mm(metres: float) -> int:

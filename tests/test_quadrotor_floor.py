@@ -41,8 +41,11 @@ def test_it_takes_off_from_the_floor_and_lands_on_it(autopilot: Autopilot) -> No
         sinks.append(it.velocity_mps[2])
 
     run(one, 11.0, watch)
-    assert max(sinks) == pytest.approx(0.5, abs=0.15)
-    assert np.median(sinks) == pytest.approx(0.5, abs=0.01)  # recorded: ground hit at 0.4999 m/s (LAND_SPEED 50)
+    high, low = (0.5, 0.5) if autopilot == "ardupilot" else (0.7, 0.3)
+    assert max(sinks) == pytest.approx(high, abs=0.15)
+    falling = [speed for speed in sinks if speed > 0.0]
+    # Recorded: ground hit at 0.4999 m/s (LAND_SPEED 50); MPC_LAND_SPEED, and MPC_LAND_CRWL below a metre.
+    assert falling[-1] == pytest.approx(low, abs=0.02)
     assert one.landed
     assert one.position_m[2] == 0.0
     assert one.velocity_mps == (0.0, 0.0, 0.0)
@@ -179,7 +182,7 @@ def test_nothing_of_the_attitude_loop_of_the_flight_before_is_left_at_take_off(h
     one = quadrotor(at=(0.0, 0.0, -height_m))
     one.land()
     one.face(2.5)
-    run(one, 0.6)
+    run(one, 0.8)
     assert rests == (one.position_m[2] < 0.0)
     if rests:
         one.rest()

@@ -365,3 +365,41 @@ def test_a_px4_at_rest_tells_a_constant_position_and_none_in_the_air() -> None:
 
 def is_status(packet: TlogPacket) -> bool:
     return packet.data[5] == 1 and int.from_bytes(packet.data[7:10], "little") == 230
+
+
+@pytest.mark.parametrize(
+    ("name", "lift_s", "disarm_s"),
+    [("ardupilot", 3.8, 2.15), ("px4", 4.1, 4.4)],  # recorded: 3.7 to 3.9 and 4.1 to 4.3; 2.1 to 2.25 and 4.1 to 4.8
+)
+def test_rotors_spin_up_before_it_lifts_and_it_disarms_some_time_after_it_stands(
+    name: Name, lift_s: float, disarm_s: float
+) -> None:
+    one = Flight(name, airborne=False)
+    order = [(SET_MODE, *GUIDED)] if name == "ardupilot" else []
+    for command, *parameters in order:
+        assert one.ask(command, *parameters) == 0
+    assert one.ask(ARM, 1) == 0
+    begun_ns = one.now_ns
+    assert one.ask(TAKE_OFF, 0, 0, 0, 0, 0, 0, math.nan if name == "px4" else 1.2) == 0
+    while one.vehicle.position_m[2] > -0.03:
+        one.wait(0.05)
+        assert one.now_ns - begun_ns < 10e9
+    assert (one.now_ns - begun_ns) * 1e-9 == pytest.approx(lift_s, abs=0.4)
+    one.wait(6.0)
+    assert one.ask(LAND) == 0
+    while one.vehicle.position_m[2] < 0.0:
+        one.wait(0.05)
+    stood_ns = one.now_ns
+    while one.autopilot.pilot.armed:
+        one.wait(0.05)
+    assert (one.now_ns - stood_ns) * 1e-9 == pytest.approx(disarm_s, abs=0.4)
+
+
+def test_px4_s_take_off_mode_climbs_to_its_parameter() -> None:
+    one = Flight("px4", airborne=False)
+    one.set(MIS_TAKEOFF_ALT=1.2)
+    assert one.ask(SET_MODE, 1, 4, 2) == 0
+    assert one.ask(ARM, 1) == 0
+    one.wait(12.0)
+    assert one.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.15)
+    assert "Using default takeoff altitude: 1.2 m" in one.texts

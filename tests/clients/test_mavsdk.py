@@ -73,7 +73,7 @@ def test_mavsdk_flies_from_connecting_to_the_floor(autopilot: str) -> None:
         assert seen["home_deg"] == pytest.approx([47.397742, 8.545594], abs=1e-4)
     else:
         assert (seen["version"], seen["integers"]["GUID_OPTIONS"]) == (4, 0)
-        assert (armed, landed) == ("Arming motors", ["Arming motors", "Disarming motors"])
+        assert (armed, landed) == ("Arming motors", ["SIM Hit ground at 0.500000 m/s", "Disarming motors"])
         assert seen["home_deg"] == pytest.approx([-35.363262, 149.165237], abs=1e-4)
 
 

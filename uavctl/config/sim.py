@@ -206,8 +206,8 @@ class SimConfig(Section, frozen=True, kw_only=True):
     plant: Annotated[
         Literal["linear", "quadrotor"],
         Meta(
-            description="simulated vehicle: the plant of `[plant]`, or a quadrotor with rotors, battery, wind and the "
-            "loops of its autopilot"
+            description="simulated vehicle: the plant of `[plant]` without its dead time, or a quadrotor with rotors, "
+            "battery, wind and the loops of its autopilot"
         ),
     ] = "linear"
     autopilot: Annotated[
