@@ -61,7 +61,7 @@ def _load(path: Path, name: str) -> Loaded:
         command=flight.header.command,
         started_utc=flight.header.started_utc,
         seed=flight.header.seed,
-        ended=summary.ended.value,
+        ended=summary.ending.cause,
         finished=whole.finished,
         records_lost=whole.dropped + whole.refused + whole.missing,
     )

@@ -68,7 +68,8 @@ def found(*warnings: str) -> Identification:
         link={},
         warnings=warnings,
     )
-    return Identification(result, load_config("room-hahn-stursberg"), fit_link(seen(), np.ones(99, dtype=np.int64)), ())
+    link = fit_link(seen(), np.ones(99, dtype=np.int64))
+    return Identification(result, load_config("room-hahn-stursberg"), link, (), (), ())
 
 
 def sentences(page: str) -> list[str]:

@@ -13,6 +13,7 @@ from uavctl.config.mission_checks import position_index
 from uavctl.config.peers import CAMERAS
 from uavctl.config.types import Config
 from uavctl.data import Vec3
+from uavctl.loss_runs import loss_std
 
 _ENOUGH = 8  # samples without which nothing is said
 _AGE_TOLERANCE_S = 0.005
@@ -143,7 +144,10 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     if link.model != "bernoulli" or link.probability:
         return item(name, State.NOTE, value, f"as link.model {link.model!r} has it", "compare it with the model's")
     # Two standard deviations: fewer than one right set-up in forty is told that it loses more than it does.
-    surely = loss - 2.0 * math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
+    # Losses in bursts vary more than that.
+    alone = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
+    in_runs = loss_std(np.diff(np.unique(steps)) - 1)
+    surely = loss - 2.0 * max(alone, in_runs)
     hint = "design for the loss that is there (link.loss, link.model), or better the link"
     if surely <= expected < loss:
         value += ", which is within the chance of so few"

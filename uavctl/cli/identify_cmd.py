@@ -23,6 +23,7 @@ from uavctl.cli.common import DEFAULTS, Common, can_be_read, messages, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
+from uavctl.identify.link_fit import loss_words
 from uavctl.identify.page import write_page
 from uavctl.identify.recorded import History, from_records, from_tlog
 from uavctl.identify.result import Identification, fits_of, identify
@@ -45,9 +46,9 @@ def identify_command(
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
     spare_recording(target)
-    with _progress(fits_of(history, config)) as advance:
+    with fitting(fits_of(history, config)) as advance:
         found = identify(history, config, advance)
-    doubts = (*found.result.warnings, *_design_doubts(found.config))
+    doubts = (*found.result.warnings, *design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
     found = dataclasses.replace(found, result=result)
     page = target.with_suffix(".html")
@@ -76,7 +77,7 @@ def _history(flight: Path, common: Common) -> tuple[History, Config]:
     return from_records(read(flight)), config
 
 
-def _design_doubts(config: Config) -> tuple[str, ...]:
+def design_doubts(config: Config) -> tuple[str, ...]:
     """Why the identified configuration makes no design as it stands, if it does not."""
     try:
         design_of(config)
@@ -86,7 +87,8 @@ def _design_doubts(config: Config) -> tuple[str, ...]:
 
 
 @contextmanager
-def _progress(steps: int) -> Iterator[Callable[[], None]]:
+def fitting(steps: int) -> Iterator[Callable[[], None]]:
+    """Show a bar while plants are fitted."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=messages(), transient=True) as progress:
         task = progress.add_task("fitting", total=steps)
@@ -128,7 +130,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{found.link.rate_hz:.4g} Hz"),
-        ("lost", f"{found.link.loss:.1%}, {'in bursts' if found.link.bursts else 'each by itself'}"),
+        ("lost", loss_words(found.link)),
         ("delay", f"{1e3 * found.link.delay_s:.0f} ms, 99 % within {1e3 * found.link.jitter_s:.0f} ms more"),
     ):
         link.add_row(name, value)

@@ -11,6 +11,7 @@ from logs.page import Section, folded, grid, page, table
 from logs.svg import Drawing, canvas, colour, dots
 from uavctl.config.load import dump_config
 from uavctl.identify.history import Seen
+from uavctl.identify.link_fit import loss_words
 from uavctl.identify.prediction import LAGS, SHOWN_S, Prediction
 from uavctl.identify.result import Identification, Identified
 
@@ -30,7 +31,7 @@ def write_page(found: Identification, seen: Seen, source: str) -> str:
     result = found.result
     story = [
         f"{result.flown_s:.0f} s were flown under setpoints; {found.link.received} positions came, {found.link.lost} "
-        f"did not ({100 * found.link.loss:.1f} %), {'in bursts' if found.link.bursts else 'each by itself'}.",
+        f"did not: {loss_words(found.link)}.",
         *(
             f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {SHOWN_S:g} s is predicted."
             for one in result.response

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,8 +18,10 @@ from logs.tlog import TlogPacket
 from uavctl.config import Config
 from uavctl.data import Datagram, PositionSample, Record, Setpoint, StepInput
 from uavctl.errors import RecordingError
+from uavctl.identify.exchange import Exchange
 from uavctl.identify.history import LEAST_SAMPLES, Asked, Seen, seen_from
 from uavctl.loop import MOCAP, make_links
+from uavctl.mavlink.clocksync import ClockSource
 from uavctl.mavlink.framing import scan
 
 _NO_POSITION_NO_VELOCITY = 0x03F  # bits of type_mask: ignored
@@ -200,20 +202,39 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> History:
         else:
             senders.take(packet.data, packet.at_ns)
             told.take(packet.data)
-    samples = _samples(whole, config)
+    samples, answered = _samples(whole, config)
     latency_s = senders.shortest_delay_s(_source(samples)) if samples else None
     if latency_s is not None:
         clock = msgspec.structs.replace(config.clock, latency_s=round(latency_s, 4))
-        samples = _samples(whole, msgspec.structs.replace(config, clock=clock))
+        samples, _ = _samples(whole, msgspec.structs.replace(config, clock=clock))
+    elif answered:
+        latency_s = max(0.0, min(1e-9 * (one.received_ns - one.captured_ns) for one in answered))
+        # Those from before the clock was known count by what stamps alone tell: how late they are is not known.
+        samples = answered if len(answered) > len(samples) // 2 else samples
     return replace(_history(sent, samples, senders, told), latency_s=latency_s)
 
 
-def _samples(packets: Iterable[TlogPacket], config: Config) -> list[PositionSample]:
-    """Positions as the daemon would take them."""
+def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[PositionSample], list[PositionSample]]:
+    """Positions as the daemon would take them, and those of them whose clock the client's own exchange told.
+
+    A source that answers nothing may stamp by the vehicle's clock: its answers are tried for such stamps too.
+    """
     links = make_links(config)
     link = links.get(MOCAP) or next(iter(links.values()))
-    heard = (item for one in packets if not one.outgoing for item in link.receive(one.data, one.at_ns))
-    return [item for item in heard if isinstance(item, PositionSample)]
+    exchange, senders = Exchange(), {head.sender for one in packets if not one.outgoing for head in _heads(one.data)}
+    found, answered = [], []
+    for one in packets:
+        for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
+            for address in senders:
+                link.answered(address, trip.sent_ns, trip.remote_ns, one.at_ns)
+        if one.outgoing:
+            continue
+        for item in link.receive(one.data, one.at_ns):
+            if isinstance(item, PositionSample):
+                found.append(item)
+                if link.clock_source is ClockSource.TIMESYNC:
+                    answered.append(item)
+    return found, answered
 
 
 def _source(samples: Iterable[PositionSample]) -> Address:

@@ -78,17 +78,28 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Result, the configuration with it, and what the plots show."""
+    """Result, the configuration with it, and what it is from.
+
+    Attributes:
+        result: What is told.
+        config: The configuration with it.
+        link: What the link did.
+        predictions: What the plots show, each axis.
+        flown: The flight as it was fitted to: positions thinned, setpoints ramped as the autopilot does.
+        fits: The chosen plant of each axis.
+    """
 
     result: Identified
     config: Config
     link: LinkFit
     predictions: tuple[Prediction, ...]
+    flown: tuple[Stretch, ...]
+    fits: tuple[AxisFit, ...]
 
 
 def fits_of(history: History, config: Config) -> int:
     """How often `identify` advances."""
-    return TRIES * len(_kinds(history, config))
+    return TRIES * len(kinds_of(history, config))
 
 
 def identify(history: History, config: Config, advance: Callable[[], None]) -> Identification:
@@ -103,15 +114,11 @@ def identify(history: History, config: Config, advance: Callable[[], None]) -> I
         RecordingError: The flight does not show enough.
     """
     dt_s = config.plant.dt_s
-    limits_mps3 = _jerk_limits(history, config)
-    flown = tuple(
-        ramped(thinned(stretch, dt_s * (1.0 - 1e-6)), *limits_mps3)
-        for stretch in stretches(history.asked, history.seen)
-    )
+    flown = flown_stretches(history, config)
     axes = [AXES.index(name) for name in config.plant.axes]
     for axis in axes:
         _check_moved(flown, axis)
-    kinds = _kinds(history, config)
+    kinds = kinds_of(history, config)
     candidates = [choose_dead_time(flown, axes, kind, advance) for kind in kinds]
     chosen = candidates[0]
     predictions = [predict(flown, axis, fit) for axis, fit in zip(axes, chosen.fits, strict=True)]
@@ -120,7 +127,7 @@ def identify(history: History, config: Config, advance: Callable[[], None]) -> I
         for name, fit, prediction in zip(config.plant.axes, chosen.fits, predictions, strict=True)
     )
     link = fit_link(history.seen, history.gaps)
-    ramp_s = _mean_ramp_s(config, limits_mps3)
+    ramp_s = ramp_of(history, config)
     made = _config(config, chosen, ramp_s, responses, link)
     if history.latency_s is not None:
         made = msgspec.structs.replace(
@@ -138,10 +145,22 @@ def identify(history: History, config: Config, advance: Callable[[], None]) -> I
         link=_link_section(link),
         warnings=(*_doubts(responses), *_better(chosen, candidates[1:])),
     )
-    return Identification(result, made, link, tuple(predictions))
+    return Identification(result, made, link, tuple(predictions), flown, chosen.fits)
 
 
-def _kinds(history: History, config: Config) -> list[tuple[AxisModel, ...]]:
+def flown_stretches(history: History, config: Config) -> tuple[Stretch, ...]:
+    """The flight as a plant is fitted to it: one position a step at most, setpoints ramped as the autopilot does.
+
+    Raises:
+        RecordingError: No stretch is long enough.
+    """
+    spacing_s, limits_mps3 = config.plant.dt_s * (1.0 - 1e-6), _jerk_limits(history, config)
+    return tuple(
+        ramped(thinned(stretch, spacing_s), *limits_mps3) for stretch in stretches(history.asked, history.seen)
+    )
+
+
+def kinds_of(history: History, config: Config) -> list[tuple[AxisModel, ...]]:
     """The plants to fit, each axis; the configuration's own first."""
     plant = config.plant
     own = plant.model == VELOCITY_REFERENCE
@@ -177,12 +196,13 @@ def _jerk_limits(history: History, config: Config) -> tuple[float, float]:
     return level, down
 
 
-def _mean_ramp_s(config: Config, limits_mps3: tuple[float, float]) -> float:
+def ramp_of(history: History, config: Config) -> float:
     """How late the ramp to each of the configuration's own setpoints is on the whole, which its plant has not [s].
 
     That of a level setpoint that changes as much as it may; it ends with the next setpoint at the latest.
     """
-    return 0.5 * config.daemon.tick_s * min(config.limits.slew_mps3 / limits_mps3[0], 1.0)
+    level_mps3, _ = _jerk_limits(history, config)
+    return 0.5 * config.daemon.tick_s * min(config.limits.slew_mps3 / level_mps3, 1.0)
 
 
 def _candidate(one: ChosenPlant) -> Candidate:

@@ -166,6 +166,7 @@ class ClockSync:
         self._latency_ns = latency_ns
         self._future_tolerance_ns = future_tolerance_ns
         self._minimum = SlidingMinimum(window_ns)
+        self._shortest = SlidingMinimum(window_ns)  # delay by the offset from round trips
         self._newest_ns = 0
         self._count = 0
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
@@ -195,11 +196,21 @@ class ClockSync:
         self._newest_ns = stamp_ns if self._count == 1 else max(self._newest_ns, stamp_ns)
         self._stamps.append(stamp_ns)
         minimum_ns = self._minimum.push(received_ns, received_ns - stamp_ns)
-        if offset_ns is None or not -self._future_tolerance_ns <= minimum_ns - offset_ns <= LEAP_NS:
-            self.offset_ns, self.source = minimum_ns - self._latency_ns, ClockSource.MINIMUM
-        else:
+        if offset_ns is not None and self._is_plausible(offset_ns, minimum_ns, stamp_ns, received_ns):
             self.offset_ns, self.source = offset_ns, ClockSource.TIMESYNC
+        else:
+            self.offset_ns, self.source = minimum_ns - self._latency_ns, ClockSource.MINIMUM
         return min(stamp_ns + self.offset_ns, received_ns)
+
+    def _is_plausible(self, offset_ns: int, minimum_ns: int, stamp_ns: int, received_ns: int) -> bool:
+        """Whether an offset makes the smallest delay neither negative nor long.
+
+        The minimum of a clock that runs slow is that of a while ago, and too small for now: so each delay is also
+        judged by the offset of its own time.
+        """
+        shortest_ns = self._shortest.push(received_ns, received_ns - stamp_ns - offset_ns)
+        least_ns = -self._future_tolerance_ns
+        return any(least_ns <= delay_ns <= LEAP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
     def unwrap(self, stamp: int, modulus: int, unit_ns: int) -> int:
         """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
@@ -232,6 +243,7 @@ class ClockSync:
     def _restart(self) -> None:
         """Begin anew: the source has another clock now."""
         self._minimum.clear()
+        self._shortest.clear()
         self._stamps.clear()
         self._leaps.clear()
         self._count = 0

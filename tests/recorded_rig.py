@@ -1,0 +1,106 @@
+"""The nine recorded flights of real autopilot software, as the tests feed them: packets, truth, and what looked on."""
+
+from __future__ import annotations
+
+import lzma
+import tempfile
+from collections import deque
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from loopback_rig import Memory, header, shared
+from mavlink_rig import DATA
+from numpy.typing import NDArray
+
+from logs.flight_data import FlightData
+from logs.tlog import TlogPacket, read_tlog
+from uavctl.check.preflight import Preflight
+from uavctl.config import Config, load_config
+from uavctl.data import VehicleStatus
+from uavctl.loop import VEHICLE, ControlLoop, make_links
+
+FLIGHTS = DATA / "flights"
+TICK_NS, SECOND = 50_000_000, 1_000_000_000
+OF_OTHERS = ("arducopter-gps-guided-accel", "arducopter-vicon-guided-accel", "px4-sih-offboard-accel")
+RELAYED = (
+    "arducopter-relay-bursts-blackouts-wind",
+    "arducopter-relay-pilot-switches",
+    "px4-sih-relay-blown-away",
+    "px4-sih-relay-released-in-climb",
+    "px4-sih-relay-waypoints",
+)
+AT_REST = "px4-sih-false-reboot"
+EVERY = (*OF_OTHERS, *RELAYED, AT_REST)
+OWN_ESTIMATE = 'source.messages=["LOCAL_POSITION_NED"]'
+
+
+@cache
+def packets(name: str) -> tuple[TlogPacket, ...]:
+    """A recording, from its packed excerpt."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.tlog"
+        path.write_bytes(lzma.decompress((FLIGHTS / f"{name}.tlog.xz").read_bytes()))
+        return read_tlog(path).packets
+
+
+@cache
+def truth(name: str) -> NDArray[np.float64]:
+    """Rows of time [s] and position [m]."""
+    text = lzma.decompress((FLIGHTS / f"{name}-truth.csv.xz").read_bytes()).decode()
+    return np.array([[float(value) for value in line.split(",")[:4]] for line in text.splitlines()[1:]])
+
+
+def config_of(name: str, *overrides: str) -> Config:
+    """The preset of the autopilot that flew, on one link."""
+    preset = "room-px4" if name.startswith("px4") else "room-ardupilot"
+    own = () if name in RELAYED or name in (AT_REST, OF_OTHERS[1]) else (OWN_ESTIMATE,)
+    return load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog", *own, *overrides])
+
+
+def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[str, str]:
+    """State of each item of a check that listens to a part of a recording."""
+    whole = packets(name)
+    begin_ns = whole[0].at_ns + round(since_s * SECOND)
+    flight = Preflight(config_of(name, *overrides), make_links, begin_ns)
+    tick = 0
+    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while begin_ns + tick * TICK_NS <= one.at_ns:
+            deque(flight.tick(tick, begin_ns + tick * TICK_NS), maxlen=0)
+            tick += 1
+        flight.receive(VEHICLE, one.data, one.at_ns)
+    return {one.name: one.state.value for one in flight.items(begin_ns + tick * TICK_NS)}
+
+
+def watched(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> Memory:
+    """What the control loop records of a part of a recording that it only listens to."""
+    whole = packets(name)
+    begin_ns = whole[0].at_ns + round(since_s * SECOND)
+    config, memory = config_of(name, "solver.method=exact", *overrides), Memory()
+    design, controller = shared(config)
+    memory.put("/uavctl/header", begin_ns, header(config, design))
+    loop, tick = ControlLoop(config, controller, memory, lambda: 0), 0
+    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while begin_ns + tick * TICK_NS < one.at_ns:
+            deque(loop.tick(tick, begin_ns + tick * TICK_NS), maxlen=0)
+            tick += 1
+        loop.receive(VEHICLE, one.data, one.at_ns)
+    return memory
+
+
+def page_of(memory: Memory) -> FlightData:
+    """The flight as a page reads it."""
+    return FlightData.from_records(memory.entries)
+
+
+def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
+    """What a link makes of the vehicle's words, with times since the first packet [s]."""
+    whole = packets(name)
+    link = make_links(config_of(name))[VEHICLE]
+    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns))
+    return [((one.at_ns - whole[0].at_ns) * 1e-9, item) for one, item in heard if isinstance(item, VehicleStatus)]
+
+
+def _between(whole: Sequence[TlogPacket], since_ns: int, until_ns: int) -> Iterator[TlogPacket]:
+    return (one for one in whole if since_ns <= one.at_ns <= until_ns and not one.outgoing)
