@@ -1,0 +1,246 @@
+"""The parts of a tuning run: the excitation in its box, what a flight changes, what a folder remembers."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from loopback_rig import lockstep
+
+from logs.flight_data import FlightData
+from uavctl.build import design_of
+from uavctl.config import Config, load_config
+from uavctl.errors import UsageError
+from uavctl.identify.axis_model import DragLagAxis, places
+from uavctl.identify.recorded import from_records
+from uavctl.identify.result import Identification, identify
+from uavctl.tune.change import MOST_DEAD_RANGE_S, Change, TunedResult, check_tunable, tuned
+from uavctl.tune.comparison import figures_of, plan_errors_m
+from uavctl.tune.excitation import LEAST_WAY_M, SafeBox, check_start, excited, parse_box
+from uavctl.tune.response import PinnedAxis
+from uavctl.tune.run_folder import STATE, TuneAsked, TuneFolder
+
+BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
+ASKED = TuneAsked(box="b", flight="", simulated=True, take_off_m=None)
+
+
+def room(*overrides: str) -> Config:
+    return load_config("room", ("sim.plant=quadrotor", *overrides))
+
+
+def test_any_two_opposite_corners_make_the_box() -> None:
+    assert parse_box("1.5,-1.4,-0.4,-1.5,1.4,-2") == SafeBox((-1.5, -1.4, -2.0), (1.5, 1.4, -0.4)) == BOX
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", "1,2,3,4,5,nan", ""])
+def test_what_is_no_box_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--box"):
+        parse_box(text)
+
+
+@pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
+def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None:
+    config = load_config(preset, ("sim.plant=quadrotor",))
+    made = excited(config, design_of(config), BOX, lands=False)
+    points = np.array(made.mission.waypoints)
+    assert np.all(points > np.array(BOX.lower) + 0.1) and np.all(points < np.array(BOX.upper) - 0.1)
+    steps = np.abs(np.diff(points, axis=0))
+    for axis, least_m in enumerate(LEAST_WAY_M):
+        alone = (steps[:, axis] >= least_m) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
+        assert np.count_nonzero(alone) >= 3
+    assert tuple(points[-1]) == BOX.centre
+    assert {(one.state, one.side): one.values[0] for one in made.fence} == {
+        (name, side): values[axis]
+        for axis, name in enumerate(("north", "east", "down"))
+        for side, values in (("lower", BOX.lower), ("upper", BOX.upper))
+    }
+
+
+def test_a_box_outside_the_room_is_refused_by_its_axis() -> None:
+    config = room()
+    with pytest.raises(UsageError, match=r"east: .* -2\.5 to 2\.5 m") as refused:
+        excited(config, design_of(config), parse_box("-1,-3,-2,1,1,-0.4"), lands=False)
+    assert "north" not in str(refused.value)
+
+
+def test_a_fence_of_the_configuration_counts_as_a_wall() -> None:
+    config = room('fence=[{state="north",side="upper",times_s=[0.0,5.0],values=[2.0,1.0]}]')
+    with pytest.raises(UsageError, match=r"north: .* to 1 m"):
+        excited(config, design_of(config), BOX, lands=False)
+
+
+def test_a_box_that_is_too_small_says_how_large_it_must_be() -> None:
+    config = room()
+    design = design_of(config)
+    with pytest.raises(UsageError) as refused:
+        excited(config, design, parse_box("-0.2,-1,-2,0.2,1,-0.4"), lands=False)
+    found = re.search(r"north: .* at least ([\d.]+) m", str(refused.value))
+    assert found is not None
+    half = float(found[1]) / 2.0
+    excited(config, design, parse_box(f"{-half},-1,-2,{half},1,-0.4"), lands=False)
+    with pytest.raises(UsageError):
+        excited(config, design, parse_box(f"{-half + 0.02},-1,-2,{half - 0.02},1,-0.4"), lands=False)
+
+
+def test_a_start_outside_the_box_is_refused() -> None:
+    check_start(BOX, (0.0, 0.0, -1.0), "start")
+    check_start(BOX, (0.0, 0.0, 0.0), "start", (0, 1))  # on the floor, below the box
+    with pytest.raises(UsageError, match=r"north -2\.40 m"):
+        check_start(BOX, (-2.4, 0.0, -1.0), "start")
+
+
+def test_a_plant_without_a_lag_is_refused() -> None:
+    with pytest.raises(UsageError, match="matrices"):
+        check_tunable(load_config("paper"))
+
+
+def test_a_pinned_axis_moves_as_its_model_with_these_values() -> None:
+    model = DragLagAxis(drifts=True)
+    values = {
+        "lag_s": 0.2,
+        "drag_1ps": 0.3,
+        "gain": 0.9,
+        "wind_mps2_rts": 0.05,
+        "noise_m": 0.01,
+        "drift_mps2_rts": 0.02,
+    }
+    pinned = PinnedAxis(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
+    whole, fitted = places(model, values)[None], places(pinned, values)[None]
+    assert fitted.shape[1] == whole.shape[1] - 2
+    for one, other in zip(model.motion(whole), pinned.motion(fitted), strict=True):
+        assert one == pytest.approx(other)
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[Config, FlightData, Identification]:
+    """Half a minute of waypoints on the quadrotor."""
+    overrides = (
+        "sim.plant=quadrotor",
+        "sim.start_position_m=[0.0,0.0,-1.2]",
+        "mission.waypoints=[[1.0,0.8,-0.7],[-1.0,-0.8,-1.6],[1.0,-0.8,-0.8],[-1.0,0.8,-1.5],[0.0,0.0,-1.2]]",
+    )
+    memory = lockstep("room", 30.0, *overrides)
+    config = load_config("room", overrides)
+    found = identify(from_records(memory.entries), config, lambda: None)
+    return config, FlightData.from_records(memory.entries), found
+
+
+def rows(told: TunedResult, key: str) -> list[Change]:
+    return [one for one in told.changes if one.key == key]
+
+
+def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, found = flight
+    made = tuned(config, found)
+    told = made.result
+    assert told.new_errors.overall_m < 0.6 * told.old_errors.overall_m
+    for row in rows(told, "plant.lag_s")[:2] + rows(told, "plant.drag_1ps"):
+        assert row.changed and row.new == row.flight
+    assert made.config.plant.drag_1ps == tuple(one.new for one in rows(told, "plant.drag_1ps"))
+    assert made.config.plant.drag_1ps[0] == pytest.approx(0.25, abs=0.05)
+    # A calm half minute lowers no noise, and a link that was as believed stays so.
+    assert made.config.plant.wind_std_mps2 == config.plant.wind_std_mps2
+    assert made.config.link == config.link
+    assert msgspec.structs.replace(made.config, name="", plant=config.plant, cost=config.cost) == (
+        msgspec.structs.replace(config, name="")
+    )
+
+
+def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
+    flight: tuple[Config, FlightData, Identification],
+) -> None:
+    config, _, found = flight
+    north, *others = found.result.response
+    doubtful = (msgspec.structs.replace(north, r2=0.3), *others)
+    result = msgspec.structs.replace(found.result, response=doubtful)
+    made = tuned(config, dataclasses.replace(found, result=result))
+    for key in ("plant.lag_s", "plant.drag_1ps", "plant.gain"):
+        row = rows(made.result, key)[0]
+        assert not row.changed and "30 %" in row.reason
+        assert rows(made.result, key)[1].reason != row.reason
+
+
+def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, found = flight
+    flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MOST_DEAD_RANGE_S))
+    result = msgspec.structs.replace(found.result, candidates=(flat,))
+    made = tuned(config, dataclasses.replace(found, result=result))
+    assert made.config.plant.dead_time_s == config.plant.dead_time_s
+    assert made.config.plant.drag_1ps != config.plant.drag_1ps
+
+
+def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, found = flight
+    replace = msgspec.structs.replace
+    hopeful = replace(
+        config,
+        plant=replace(config.plant, wind_std_mps2=(1e-4,) * 3),
+        link=replace(config.link, loss=0.1, jitter_s=0.0),
+        estimator=replace(config.estimator, position_std_m=1e-4),
+    )
+    made = tuned(hopeful, found).config
+    assert made.plant.wind_std_mps2 == found.config.plant.wind_std_mps2
+    assert made.estimator.position_std_m == found.config.estimator.position_std_m
+    assert made.link.loss == pytest.approx(0.3, abs=0.08)
+    assert made.link.jitter_s == pytest.approx(0.04, abs=0.005)
+
+
+def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, found = flight
+    stalled = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=3.0))
+    late = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=0.1))
+    assert tuned(config, stalled).config.link.jitter_s == config.link.jitter_s
+    assert "stood still" in rows(tuned(config, stalled).result, "link.jitter_s")[0].reason
+    assert tuned(config, late).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
+
+
+def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, found = flight
+    fitted = msgspec.structs.replace(config, plant=found.config.plant)
+    told = tuned(fitted, found).result
+    assert told.new_errors.overall_m <= told.old_errors.overall_m
+    assert told.new_errors.overall_m == pytest.approx(told.old_errors.overall_m, rel=0.05)
+
+
+def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, FlightData, Identification]) -> None:
+    _, flown, _ = flight
+    figures = figures_of(flown, "flight", 0, BOX)
+    assert figures.judged_by == "truth"
+    assert figures.hold_s > 2.0
+    assert figures.hold_rms_m is not None and 0.0 < figures.hold_rms_m < 0.1
+    truth = np.array([one.state for one in flown.truths])[:, list(flown.design.position_index)]
+    inside = np.minimum(truth - np.array(BOX.lower), np.array(BOX.upper) - truth).min()
+    assert figures.beyond_box_m == pytest.approx(-inside, abs=0.03)
+    wrong = plan_errors_m(flown)
+    assert len(wrong) > 300 and 0.001 < float(np.median(wrong)) < 0.1
+
+
+def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
+    folder = TuneFolder.opened(tmp_path / "run", room(), ASKED)
+    folder.note(before="before/flight.mcap")
+    again = TuneFolder.opened(tmp_path / "run", room(), ASKED)
+    assert again.progress.before == "before/flight.mcap"
+    with pytest.raises(UsageError, match=r"link\.loss = 0\.3 there, 0\.4 here"):
+        TuneFolder.opened(tmp_path / "run", room("link.loss=0.4"), ASKED)
+    with pytest.raises(UsageError, match="--box=b"):
+        TuneFolder.opened(tmp_path / "run", room(), msgspec.structs.replace(ASKED, box="other"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="no run"):
+        TuneFolder.opened(tmp_path / "other", room(), ASKED)
+    (tmp_path / "run" / STATE).write_text("{")
+    with pytest.raises(UsageError, match="cannot be read"):
+        TuneFolder.opened(tmp_path / "run", room(), ASKED)
+
+
+def test_attempts_have_folders_of_their_own(tmp_path: Path) -> None:
+    folder = TuneFolder.opened(tmp_path, room(), ASKED)
+    folder.free("before").mkdir()
+    assert folder.free("before").name == "before-2"
+    assert folder.relative(tmp_path / "before" / "flight.mcap") == "before/flight.mcap"
+    assert folder.recording("before/flight.mcap") == tmp_path / "before" / "flight.mcap"
+    assert folder.recording("/else/flight.mcap") == Path("/else/flight.mcap")
