@@ -58,7 +58,8 @@ def innovations(flight: FlightData, config: Config) -> Innovations:
     Raises:
         DesignError: The configuration has no plant.
     """
-    track = Track(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
+    kalman = make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns)
+    track = Track(flight, kalman, round(config.plant.dead_time_s * 1e9))
     near = list(track.one_ahead())
     far = list(track.many_ahead([belief for belief, _, _ in near], flight.design.horizon))
     axes = len(flight.design.axes)
@@ -72,9 +73,15 @@ def innovations(flight: FlightData, config: Config) -> Innovations:
 
 
 class Track:
-    """Positions and inputs of a flight along the time of capture."""
+    """Positions and inputs of a flight along the time of capture.
 
-    def __init__(self, flight: FlightData, kalman: Kalman) -> None:
+    Args:
+        flight: The flight.
+        kalman: Its filter.
+        dead_ns: From sending an input until it begins to act, as the flight's filter believed [ns].
+    """
+
+    def __init__(self, flight: FlightData, kalman: Kalman, dead_ns: int = 0) -> None:
         self.kalman = kalman
         self.origin_ns = flight.origin_ns - flight.decisions[0].tick * flight.tick_ns
         self.samples = sorted({captured_ns(one): one for one in flight.samples}.items())[:MOST]
@@ -87,7 +94,7 @@ class Track:
             before = self.inputs[-1] if self.inputs else None
             if u is before or (u is not None and before is not None and np.array_equal(u, before)):
                 continue
-            self.input_ns.append(decision.at_ns)
+            self.input_ns.append(decision.at_ns + dead_ns)
             self.inputs.append(u)
         self.spans_ns = _flown_ns(flight)
 

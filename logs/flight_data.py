@@ -20,6 +20,7 @@ from uavctl.data import (
     Checked,
     ControlMode,
     Decision,
+    Ending,
     Estimate,
     Event,
     Header,
@@ -73,6 +74,7 @@ class FlightData:
     link_estimates: tuple[LinkEstimate, ...] = ()
     checks: tuple[Checked, ...] = ()  # before arming
     notes: tuple[RecorderNote, ...] = ()  # the recorder's own account
+    endings: tuple[Ending, ...] = ()  # the daemon's last word; none in older recordings, and in torn ones
 
     @classmethod
     def from_records(cls, records: Iterable[tuple[str, int, Record]], path: Path | None = None) -> Self:
@@ -116,6 +118,7 @@ class FlightData:
             link_estimates=take(LinkEstimate),
             checks=take(Checked),
             notes=take(RecorderNote),
+            endings=take(Ending),
         )
 
     @property

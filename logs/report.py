@@ -32,6 +32,9 @@ _NO_PLAN = "No plan was flown, so there is nothing to compare."
 _LATENESS = "lateness is from a tick's deadline to its start"
 _NO_TIMING = "No times were measured in this flight."
 
+# Of these every other text is another matter: what the vehicle says, who flies.
+_WORD_BY_WORD = frozenset({"vehicle-text", "command-ack", "hand-over"})
+
 
 def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged: Judged | None = None) -> None:
     """Write the page; `judged` are the flight's verdicts, if they are there already.
@@ -212,12 +215,13 @@ def _timing_section(flight: FlightData) -> Section:
 
 
 def _events_section(flight: FlightData) -> Section:
-    kinds: dict[tuple[str, str], list[Event]] = {}
+    kinds: dict[tuple[str, str, str], list[Event]] = {}
     for event in flight.events:
-        kinds.setdefault((event.severity.value, event.code), []).append(event)
+        text = event.text if event.code in _WORD_BY_WORD else ""
+        kinds.setdefault((event.severity.value, event.code, text), []).append(event)
     found = [
         (f"{flight.seconds([some[0].at_ns])[0]:.2f}", severity, code, str(sum(e.count for e in some)), some[0].text)
-        for (severity, code), some in kinds.items()
+        for (severity, code, _), some in kinds.items()
     ]
     columns = ("first at [s]", "severity", "event", "times", "as first told")
     body = page.table(columns, found, frozenset({0, 3})) if found else page.paragraph("There were none.")

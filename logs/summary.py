@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from enum import StrEnum
 from itertools import pairwise
 
 import msgspec
@@ -14,9 +13,11 @@ from rich.text import Text
 
 from logs.design_view import Floats
 from logs.digits import duration, number, percent_above
+from logs.ended import ending_of
 from logs.flight_data import FLOWN, FlightData
 from logs.moving_limits import limits_at
-from uavctl.data import ControlMode, Matrix, SolveStatus, Vector
+from uavctl.data import Ending, Matrix, SolveStatus, Vector
+from uavctl.ending import lacking
 
 RELATIVE_TOLERANCE = 1e-9
 # MAVLink carries setpoints as 32-bit floats: an input at its limit may come out one rounding beyond.
@@ -32,18 +33,6 @@ class Spread(msgspec.Struct, frozen=True, kw_only=True):
     p50: float | None = None
     p99: float | None = None
     max: float | None = None
-
-
-class Ending(StrEnum):
-    """What became of the vehicle, as far as the controller was concerned."""
-
-    FLYING = "flying"  # the recording ends in flight
-    LANDED = "landed by the fallback"
-    LET_GO = "let go by the envelope"
-    ORDERED = "landed as ordered"
-    MISSION_OVER = "landed at the end of the mission"
-    HANDED_OVER = "handed over by the operator"
-    WAITING = "waiting"  # for positions, or for a vehicle that takes setpoints
 
 
 class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,7 +74,8 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     final_age_s: float | None  # age of the newest position there
     final_std_m: float | None  # largest standard deviation of the estimated position there, in any direction
     recorder_dropped: int  # records that the disk was too slow for
-    ended: Ending
+    ended: str  # the cause of its end, in a phrase
+    ending: Ending  # the whole of it: cause, whether as ordered, in one sentence, and the exit code
     let_go: str | None  # why the envelope let the vehicle go
     breaks_off: bool = False  # the recording was not closed in order
 
@@ -97,11 +87,15 @@ def summarise(
     recording: str | None = None,
     report: str | None = None,
     recorder_dropped: int = 0,
+    ending: Ending | None = None,
 ) -> FlightSummary:
     """Figures of a flight.
 
-    `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day.
+    `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day, and so
+    is `ending`, which the recording tells then.
     """
+    if ending is None:
+        ending = lacking(ending_of(flight), recorder_dropped, "")
     steps = flight.steps
     flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}
@@ -145,7 +139,8 @@ def summarise(
         final_age_s=None if flight.last_flown is None else flight.last_flown.age_s,
         final_std_m=_position_std_m(flight),
         recorder_dropped=recorder_dropped,
-        ended=_ending(flight),
+        ended=ending.cause,
+        ending=ending,
         let_go=None if flight.breach is None else flight.breach.text,
         breaks_off=flight.breaks_off,
     )
@@ -241,7 +236,8 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
     seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
     found = [
         ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
-        ("Ended", f"{s.ended.value}; the recording breaks off" if s.breaks_off else s.ended.value),
+        ("Ended", f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
+        *((("Relay", s.ending.relay),) if s.ending.relay else ()),
         *(() if s.let_go is None else (("Let go", s.let_go),)),
         ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
         ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
@@ -296,19 +292,6 @@ def _times(times: Spread) -> str:
 def count(amount: int, noun: str) -> str:
     """An amount with its noun, e.g. "1 step"."""
     return f"{amount} {noun}{'' if amount == 1 else 's'}"
-
-
-def _ending(flight: FlightData) -> Ending:
-    modes = [decision.mode for decision in flight.flown]
-    if flight.breach is not None:
-        return Ending.LET_GO
-    if ControlMode.LAND in modes:  # for one tick; nobody flies after it
-        if flight.landing is None:
-            return Ending.LANDED
-        return Ending.ORDERED if flight.landing.ordered else Ending.MISSION_OVER
-    if not modes or modes[-1] is ControlMode.WAIT:
-        return Ending.WAITING
-    return Ending.FLYING if flight.stopped_ns is None else Ending.HANDED_OVER
 
 
 def _fallback_entries(flight: FlightData) -> int:

@@ -19,6 +19,7 @@ from uavctl.data import (
     Checked,
     Datagram,
     Decision,
+    Ending,
     Estimate,
     Event,
     Header,
@@ -28,6 +29,7 @@ from uavctl.data import (
     PolicyLibrary,
     Record,
     Refused,
+    RelayStats,
     Setpoint,
     StepInput,
     Timing,
@@ -37,6 +39,7 @@ from uavctl.data import (
 
 HEADER = "/uavctl/header"
 LIBRARY = "/uavctl/library"
+ENDED = "/uavctl/end"
 RECORDER = "/uavctl/recorder"
 # How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
 # process was killed, the power failed, the disk took no more, or the file was cut.
@@ -109,7 +112,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
     Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
+    Topic("/uavctl/relay", RelayStats, "positions that were passed on to the vehicle, once a second, if any are"),
     Topic("/uavctl/link_estimate", LinkEstimate, "what is believed of the link that carries the positions"),
+    Topic(ENDED, Ending, "how the flight ended, once, before the recording is closed"),
     Topic("/sim/truth", Truth, "the simulator's own state, in simulated flights"),
     Topic(RECORDER, RecorderNote, "the recorder's own account: segments, drops, failed writes"),
 )

@@ -10,7 +10,6 @@ from logs.digits import duration, number
 from logs.flight_data import FLOWN, FlightData
 from logs.moving_limits import box_at
 from logs.summary import (
-    Ending,
     FlightSummary,
     count,
     input_outside,
@@ -19,18 +18,7 @@ from logs.summary import (
     state_outside,
 )
 from logs.topics import GOES_ON, RECOVERED
-from uavctl.data import ControlMode
 from uavctl.naming import severity, tell, worst
-
-_IN_FLIGHT = {
-    ControlMode.BRAKE: "The recording ends while the fallback was braking.",
-    ControlMode.HOLD: "The recording ends while the fallback held zero acceleration.",
-}
-_LANDED = {
-    Ending.LANDED: "The fallback had the vehicle land after",
-    Ending.ORDERED: "The operator ordered the landing; the vehicle was handed over to it after",
-    Ending.MISSION_OVER: "The mission was over; the vehicle was handed over to its own landing after",
-}
 
 # A target that moves by less than this share of its longest step only settles.
 _STILL = 0.05
@@ -40,9 +28,11 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Sentences that say what happened; each is true of this flight's data."""
     if summary.final_error_m is None or summary.settled_error_m is None:
         last = (flight.flown or flight.decisions)[-1]
-        return [*_part(flight), f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}.", *_cut(flight)]
+        nothing = f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}."
+        return [*_part(flight), summary.ending.sentence, nothing, *_cut(flight)]
     return [
         *_part(flight),
+        summary.ending.sentence,
         _engaged(flight, summary, summary.final_error_m, summary.settled_error_m),
         _silence(flight, summary),
         _fallback(flight, summary),
@@ -51,7 +41,6 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
         _plans(flight, summary),
         *_amiss(summary),
         *(_trajectory(flight) if summary.trajectory else _waypoints(flight)),
-        _ending(flight, summary),
         *_cut(flight),
     ]
 
@@ -250,32 +239,6 @@ def _trajectory(flight: FlightData) -> list[str]:
         f"It was to follow a trajectory, {number(float(moves.sum()))} m from {number(begun_s)} s to "
         f"{number(ended_s)} s{near}."
     ]
-
-
-def _ending(flight: FlightData, s: FlightSummary) -> str:
-    last = flight.flown[-1]
-    if flight.breach is not None:
-        return f"The vehicle was let go after {_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}."
-    if s.ended in _LANDED:
-        landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
-        return f"{_LANDED[s.ended]} {_seconds(flight, landed_ns)}."
-    if s.ended is Ending.WAITING:
-        return f"At the end the controller was waiting: {last.reason}."
-    if flight.stopped_ns is not None:
-        return f"The operator ended the flight after {_seconds(flight, flight.stopped_ns)}; {_hand_over(flight)}."
-    if flight.landing is not None and last.mode in _IN_FLIGHT:
-        return "The recording ends while the vehicle was brought to rest, to land."
-    return _IN_FLIGHT.get(last.mode, "At the end a plan was being flown.")
-
-
-def _hand_over(flight: FlightData) -> str:
-    """What the controller did after the operator's stop."""
-    modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
-    if ControlMode.LAND in modes:
-        return "the vehicle was handed over to its own landing"
-    if ControlMode.STOPPED in modes:
-        return "the vehicle was handed over"
-    return "the recording ends before the vehicle was handed over"
 
 
 def _seconds(flight: FlightData, at_ns: int) -> str:

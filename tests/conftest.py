@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from uavctl.loop import ControlLoop
+
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
 # Most of a run's time. They begin, so that no worker is left alone with one of them in the end.
@@ -41,6 +43,22 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails in the controller fails the test too, though in flight the positions for the vehicle go on."""
+
+    def fail(loop: ControlLoop, error: Exception, at_ns: int) -> None:
+        raise error
+
+    if "control_may_fail" not in request.fixturenames:
+        monkeypatch.setattr(ControlLoop, "_die", fail)
+
+
+@pytest.fixture
+def control_may_fail() -> None:
+    """For tests of what happens when the controller fails."""
 
 
 @pytest.fixture

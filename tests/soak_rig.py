@@ -55,6 +55,7 @@ class Watch:
     modes: dict[str, int] = field(default_factory=dict)
     plan: Plan | None = None
     _setpoint: Setpoint | None = None
+    _failed: bool = False
     _before: Vec3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -85,6 +86,9 @@ class Watch:
         if decision is not None:
             self.modes[decision.mode.value] = self.modes.get(decision.mode.value, 0) + 1
             self._judge(decision)
+        if self.loop.course.died and not self._failed:
+            self.wrong.append(f"at {at_ns * 1e-9:.2f} s: the controller has failed: {self.loop.course.died}")
+        self._failed = bool(self.loop.course.died)
         self.after_tick(at_ns)
 
     def _judge(self, decision: Decision) -> None:

@@ -176,7 +176,7 @@ def test_a_recording_that_is_not_all_of_the_flight_says_so(
     cut = dataclasses.replace(flight, notes=(note("begin"), note(last)))
     text = " ".join(words_of(cut).text)
     assert told in text
-    assert ("; the recording breaks off" in text) is breaks_off
+    assert ("The recording breaks off." in text) is breaks_off
     assert ("breaks off" in text) is breaks_off
 
 

@@ -13,6 +13,7 @@ import pytest
 from soak_faults import FLIGHT_S, drawn, fly_faults
 from soak_mission import AUTOPILOTS, MISSION, fly_mission, summary
 from soak_rig import prepared_for
+from soak_take_off import fly_take_off, tally_take_offs
 
 from logs.reader import read
 from uavctl.cli.prepare import Prepared
@@ -36,6 +37,15 @@ def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> 
         assert max(leg.plan_rms_m for leg in flight.legs) < 0.2
     found = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
     assert (found["touched"], found["landed"], found["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
+
+
+def test_a_take_off_of_each_autopilot_and_a_judge_that_finds_what_hovers() -> None:
+    flights = [fly_take_off(autopilot, 1) for autopilot in AUTOPILOTS]
+    assert all(flight.reached and not flight.wrong for flight in flights), flights
+    hovering = replace(flights[0], what="hovers", seed=2, wrong=("nobody has it in the air",))
+    found = tally_take_offs([*flights, hovering])
+    assert (found["take_offs"], found["engaged"], found["hovers"]) == (3, 3, 1)
+    assert list(found["wrong"]) == ["2"]  # type: ignore[call-overload]
 
 
 def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
-import random
 
 import pytest
 from loopback_rig import make_loop
 from rich.console import Console
+from sim_rig import decode
+from soak_take_off import flown, outcome, troubled
 from take_off_rig import RELAYED, Flight
 
 from logs.replay import replay
@@ -16,46 +17,7 @@ from uavctl.data import ControlMode, Order, Severity
 from uavctl.mavlink.mode import State
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-LIMIT_S, SEEDS = 60.0, 10
-SETTLED_S = 20.0  # engaged for so long, past all that was to come
-LOW_M = 0.3  # a vehicle that is engaged is higher
-
-
-def troubled(autopilot: str, seed: int) -> Flight:
-    """A take-off with checks that flicker, and a position that is not valid for a while after arming."""
-    rng = random.Random(seed)
-    begin_s, length_s = (
-        rng.uniform(0.0, rng.choice([1.5, 6.0])),
-        rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3),
-    )
-    return Flight(
-        autopilot,
-        *RELAYED,
-        f"sim.seed={seed}",
-        f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
-        f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
-        f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
-    ).relayed()
-
-
-def outcome(flight: Flight) -> str:
-    """What has become of the true vehicle; `hovers` is what must not be."""
-    up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
-    if not pilot.armed and flight.peers.autopilot.craft.landed:
-        return "landed" if "climbing" in flight.states else "refused"
-    return "engaged" if flight.is_in(State.ENGAGED) and up_m > LOW_M else "hovers"
-
-
-def flown(flight: Flight) -> str:
-    """The outcome by the limit; a flight that has ended is over."""
-    flight.take_off()
-    engaged_s = 0.0
-    for _ in range(round(LIMIT_S)):
-        if flight.loop.finished or engaged_s > SETTLED_S:
-            break
-        flight.run(1.0)
-        engaged_s = engaged_s + 1.0 if flight.is_in(State.ENGAGED) else 0.0
-    return outcome(flight)
+SEEDS = 10
 
 
 @pytest.mark.fault(60, 61)
@@ -87,7 +49,7 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
 def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
     flight = Flight("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
     flight.run(30.0, until=State.FAILSAFE)
-    flight.run(3.0)
+    flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=State.RELEASED)
     said = io.StringIO()
@@ -124,7 +86,7 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
 def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
     flight = Flight("px4", *RELAYED).relayed().take_off()
     flight.run(30.0, until=State.CLIMBING)
-    flight.run(3.0)
+    flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=State.RELEASED)
     assert [event.severity for event in flight.loop.notices] == [Severity.WARNING]
@@ -151,3 +113,29 @@ def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot
     flight.run(3.0, until=State.RELEASED)
     assert all("uavctl ctl engage" in flight.loop.against(order) for order in moves)
     assert not flight.loop.against(Order.ENGAGE) and not flight.loop.against(Order.LAND)
+
+
+SET_MODE = 176
+
+
+@pytest.mark.fault(25, 65)
+@pytest.mark.parametrize("after", range(1, 26))
+def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switch(after: int) -> None:
+    """Heartbeats show a mode up to a second late: a repetition meanwhile would take it from the pilot."""
+    flight = Flight("px4").take_off().run(10.0, until=State.CLIMBING)
+    lost: list[bytes] = []
+
+    def hears(data: bytes) -> bool:
+        asked = not lost and any(getattr(m, "command", 0) == SET_MODE for m in decode(data))
+        lost.extend([data] if asked else [])
+        return not asked
+
+    flight.hears = hears
+    while not lost:
+        flight.run(0.05)
+    flight.run(0.05 * (after - 1))
+    before = flight.commands()
+    flight.stick("POSCTL")
+    flight.run(4.0)
+    assert flight.is_in(State.RELEASED) and flight.commands() == before
+    assert flight.peers.autopilot.mode_name == "POSCTL"

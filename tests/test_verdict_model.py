@@ -142,6 +142,14 @@ def test_the_filter_is_the_flights_own() -> None:
     assert compared > 60
 
 
+def test_what_is_sent_acts_after_the_dead_time() -> None:
+    config = load_config("room-hahn-stursberg", ("solver.method=exact", "plant.dead_time_s=0.2"))
+    right = judge(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
+    wrong = judge(as_modelled(config, 800, seed=1)).verdicts.model
+    assert right is not None and not right.refuted
+    assert wrong is not None and all(one.larger for one in wrong.axes)
+
+
 def test_positions_while_others_fly_do_not_count() -> None:
     config = room()
     whole = as_modelled(config, 200, seed=5)

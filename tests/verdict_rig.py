@@ -31,11 +31,19 @@ def plain(_step: int, w: Array) -> Array:
 
 
 def as_modelled(
-    config: Config, steps: int, *, seed: int, noise: Noise = plain, loss: float = 0.3, late_ns: int = 0
+    config: Config,
+    steps: int,
+    *,
+    seed: int,
+    noise: Noise = plain,
+    loss: float = 0.3,
+    late_ns: int = 0,
+    dead_steps: int = 0,
 ) -> FlightData:
     """A flight of the filter's own model, open loop: random inputs, disturbances as `noise` makes of the model's.
 
-    `late_ns`: by so much the stamps are later than the captures.
+    `late_ns`: by so much the stamps are later than the captures. `dead_steps`: so many steps after it was sent an input
+    begins to act.
     """
     rng = np.random.default_rng(seed)
     plant, believed = build_plant(config), build_estimator(config)
@@ -47,6 +55,7 @@ def as_modelled(
     items: list[tuple[str, int, Record]] = [("/uavctl/header", 0, header(config, build_design(config)))]
     per_step, age = dt_ns // tick_ns, 0
     waiting: list[PositionSample] = []
+    coming = [np.zeros(plant.n_u)] * dead_steps
     for step in range(steps):
         begun_ns = step * dt_ns
         u = rng.normal(0.0, 0.5, plant.n_u)
@@ -59,13 +68,15 @@ def as_modelled(
             tick = step * per_step + part
             items.append(("", at_ns, StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=VEHICLE)))
             items.append(("", at_ns, decision(tick, at_ns, step, u, age, boundary=part == 0)))
+        coming.append(u)
+        acting = coming.pop(0)
         f, g = kalman.propagation.over(CAPTURED_NS)
-        seen = (f @ z + g @ u)[kalman.shown[: len(kalman.axes)]] + rng.normal(0.0, believed.position_std_m, 3)
+        seen = (f @ z + g @ acting)[kalman.shown[: len(kalman.axes)]] + rng.normal(0.0, believed.position_std_m, 3)
         if step == 0 or rng.random() >= loss:
             stamp_ns = begun_ns + CAPTURED_NS + late_ns
             waiting = [sample(seen, stamp_ns, stamp_ns + ARRIVED_NS, step, believed.position_std_m)]
         f, g = kalman.propagation.over(dt_ns)
-        state = (f @ z + g @ u)[: kalman.n_x]
+        state = (f @ z + g @ acting)[: kalman.n_x]
     return FlightData.from_records(items)
 
 

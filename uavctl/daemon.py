@@ -9,7 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from uavctl.clock import Due, Ticker, monotonic_ns
-from uavctl.errors import UavctlError
+from uavctl.ending import Cause
+from uavctl.errors import ConnectionClosedError
 from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
 from uavctl.mavlink.link import OVERRUN
 from uavctl.transport import Connection, wait
@@ -41,7 +42,8 @@ def fly(
         ticker: the grid of ticks.
         stop_requested: asked once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
-        stop_limit_s: the hand-over is cut off after this time [s]; 0 ends without one.
+        stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
+            that are relayed to it; 0 ends without one.
         after_tick: called with each tick and its lateness [ns] once its setpoint is out; none may wait or raise.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
@@ -50,7 +52,7 @@ def fly(
         Whether the end was asked for, by `stop_requested` or `duration_s`.
 
     Raises:
-        UavctlError: the vehicle's connection was closed by the other side.
+        ConnectionClosedError: the vehicle's connection was closed by the other side.
     """
     first_ns: int | None = None
     stop_ns: int | None = None
@@ -66,7 +68,8 @@ def fly(
                 if not heard:  # a flood: take what comes by the handful, not each by itself
                     wait_for({}, min(due.at_ns, now() + PAUSE_NS))
             if connections[VEHICLE].closed:
-                raise UavctlError(
+                loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
+                raise ConnectionClosedError(
                     f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
                     "the vehicle's own failsafe has it. See to the link and start again"
                 )
@@ -77,7 +80,9 @@ def fly(
             over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
             if stop_ns is None and (over or stop_requested()):
                 stop_ns = due.at_ns
-            if stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9:
+                loop.course.stop(Cause.TIME if over else Cause.OPERATOR)
+            late = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
+            if late and not (stop_limit_s and loop.carries):
                 break
             withheld = 0
             for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):

@@ -285,6 +285,26 @@ class Checked(Record, frozen=True, kw_only=True):
     hint: str
 
 
+class Ending(Record, frozen=True, kw_only=True):
+    """How the flight ended: the last word of the daemon, before its recording is closed."""
+
+    cause: str  # one of a few phrases (`uavctl.ending.Cause`)
+    as_ordered: bool  # by the operator, the mission or the pilot
+    sentence: str  # for a person, with where the vehicle was then
+    exit_code: int  # of the program
+    relay: str = ""  # what became of the positions that were passed on to the vehicle; empty where none were
+
+
+class RelayStats(Record, frozen=True, kw_only=True):
+    """Counters, since the start, of the positions that are passed on to the vehicle's own estimator."""
+
+    at_ns: int
+    sent: int
+    kept: dict[str, int]  # that were not passed on, by reason
+    last_ns: int | None  # when the last one went
+    alone: bool  # nothing else is sent: control has ended, or failed
+
+
 class LinkStats(Record, frozen=True, kw_only=True):
     """Counters of one connection since the start."""
 

@@ -41,6 +41,10 @@ class ConnectionSpecError(UsageError):
     """A connection URL cannot be understood or opened."""
 
 
+class ConnectionClosedError(UavctlError):
+    """The other side has closed the vehicle's connection while it was flown."""
+
+
 class NotReadyError(UavctlError):
     """The vehicle must not be armed as things are; names every item that speaks against it."""
 

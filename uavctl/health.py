@@ -10,7 +10,9 @@ import msgspec
 from uavctl.clock import Due
 from uavctl.config import Config
 from uavctl.config.mission_checks import position_index
-from uavctl.data import ControlMode, Decision, Estimate, LinkEstimate, Vector, VehicleStatus
+from uavctl.data import ControlMode, Decision, Estimate, LinkEstimate, RelayStats, Vector, VehicleStatus
+from uavctl.ending import FlightCourse
+from uavctl.mavlink.mode import State
 
 PERIOD_NS = 1_000_000_000
 
@@ -37,6 +39,16 @@ class VehicleHealth(msgspec.Struct, frozen=True, kw_only=True):
     heard_s: float  # ago
 
 
+class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The positions that are passed on to the vehicle: a part of its own, which may go on when control has ended."""
+
+    sent: int  # since the start
+    sent_hz: float  # in the last second
+    kept: dict[str, int]  # that were not passed on, by reason
+    last_s: float | None  # since the last one; None before the first
+    alone: bool  # nothing else is sent any more: control has ended, or failed
+
+
 class Health(msgspec.Struct, frozen=True, kw_only=True):
     """The flight at one moment; SI units, local NED, axes that the plant has not are left out."""
 
@@ -57,6 +69,9 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     missed_ticks: int  # since the start
     vehicle: VehicleHealth | None
     recorder: RecorderHealth
+    who_flies: str = ""  # where the hand-over stands
+    ending: str = ""  # how the flight ends or has ended, in the words of its end; empty while nothing ends it
+    relay: RelayHealth | None = None  # None where no positions are passed on
 
 
 class Flight(Protocol):
@@ -66,6 +81,18 @@ class Flight(Protocol):
     estimate: Estimate | None
     link: LinkEstimate | None
     vehicle: VehicleStatus | None
+
+    course: FlightCourse
+
+    @property
+    def who_flies(self) -> State:
+        """Where the hand-over stands."""
+        ...
+
+    @property
+    def relay(self) -> RelayStats | None:
+        """What has become of the positions for the vehicle; None where none are passed on."""
+        ...
 
     @property
     def let_go(self) -> str:
@@ -104,6 +131,7 @@ class HealthWatch:
         self._worst_before_ns = 0  # of the last one
         self._recording = "well"  # as last told
         self._let_go = ""  # the same
+        self._relayed = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
 
     def after_tick(self, due: Due, lateness_ns: int) -> None:
         """The control loop has run a tick."""
@@ -118,6 +146,9 @@ class HealthWatch:
         if due.at_ns - self._told_ns >= PERIOD_NS:
             self._told_ns = due.at_ns
             self._worst_before_ns, self._worst_ns = self._worst_ns, 0
+            relay = self._flight.relay
+            if relay is not None:
+                self._relayed = relay.sent, float(relay.sent - self._relayed[0])
             health = self.look()
             self._alarm(health.recorder)
             self._tell(line(health))
@@ -155,12 +186,22 @@ class HealthWatch:
             missed_ticks=self._missed,
             vehicle=None if vehicle is None else _vehicle(vehicle, self._now_ns),
             recorder=recorder,
+            who_flies=flight.who_flies.value,
+            ending=flight.course.told,
+            relay=self._relay(),
         )
+
+    def _relay(self) -> RelayHealth | None:
+        stats = self._flight.relay
+        if stats is None:
+            return None
+        last_s = None if stats.last_ns is None else max(0.0, (self._now_ns - stats.last_ns) * 1e-9)
+        return RelayHealth(sent=stats.sent, sent_hz=self._relayed[1], kept=stats.kept, last_s=last_s, alone=stats.alone)
 
 
 def line(health: Health) -> str:
     """One line for a log: the same fields in the same order, `-` for what is not known."""
-    vehicle = health.vehicle
+    vehicle, relay = health.vehicle, health.relay
     battery = None if vehicle is None else vehicle.battery_v
     mode = "-" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     fields = (
@@ -171,6 +212,7 @@ def line(health: Health) -> str:
         f"missed {health.missed_ticks}",
         f"vehicle {mode}",
         f"battery {_number(battery, '.1f')} V",
+        *(() if relay is None else (f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}",)),
         f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
     )
     return "  ".join(fields)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
+from traceback import extract_tb
 
 from msgspec.structs import replace
 
@@ -19,6 +20,7 @@ from uavctl.data import (
     ControlMode,
     Datagram,
     Decision,
+    Ending,
     Estimate,
     Event,
     InertialSample,
@@ -28,6 +30,7 @@ from uavctl.data import (
     PositionSample,
     Record,
     Refused,
+    RelayStats,
     Severity,
     Sink,
     StepInput,
@@ -36,6 +39,7 @@ from uavctl.data import (
     VehicleStatus,
     raw_topic,
 )
+from uavctl.ending import Cause, FlightCourse
 from uavctl.flight.bias_bound import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.step import Controller, StepOutput, initial_state, step
 from uavctl.mavlink.hand_over import HAND_OVER_ORDERS, HandOver
@@ -51,6 +55,7 @@ Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
+FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 MAX_NEWS = 64  # events that wait for a person
 FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
@@ -118,12 +123,49 @@ class ControlLoop:
             maxlen=MAX_NOTICES
         )  # of the hand-over, for a person; whoever shows them takes
         self._orders: deque[Command] = deque()
+        self._adrift = False  # not even the hand-over works any more: positions are all that is sent
+        self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
+        self._lands = config.fallback.land or config.relay.enabled
+        self.course = FlightCourse()  # what happened on the way, as far as it bears upon the end
+
+    @property
+    def ending(self) -> Ending:
+        """How the flight ended, or would if it ended now."""
+        return replace(self.course.ending(over=self.finished), relay=self._relayed())
+
+    def _relayed(self) -> str:
+        """What became of the positions for the vehicle, for a person."""
+        stats = self.relay
+        if stats is None or stats.last_ns is None:
+            return "" if stats is None else "no position was passed on to the vehicle"
+        before_s = (stats.at_ns - stats.last_ns) * 1e-9
+        kept = sum(stats.kept.values())
+        text = f"passed on {stats.sent} positions and kept {kept} back, the last one {before_s:.1f} s before the end"
+        longer_s = 0.0 if self._controlled_ns is None else (stats.last_ns - self._controlled_ns) * 1e-9
+        return f"{text}, {longer_s:.1f} s after the last setpoint" if longer_s > 0.0 else text
 
     @property
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
+        if self._adrift:
+            return not self._hand_over.carries
         over = self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
         return self._hand_over.finished or (over and not self._hand_over.busy)
+
+    @property
+    def carries(self) -> bool:
+        """Whether a vehicle is in the air by the positions that are relayed to it."""
+        return self._hand_over.carries
+
+    @property
+    def relay(self) -> RelayStats | None:
+        """What has become of the positions for the vehicle; None where none are passed on."""
+        if not self._relay.enabled:
+            return None
+        kept = {reason: count for reason, count in self._relay.kept.items() if count}
+        at_ns = 0 if self.decision is None else self.decision.at_ns
+        alone = bool(self.course.died) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
+        return RelayStats(at_ns=at_ns, sent=self._relay.sent, kept=kept, last_ns=self._relay.last_ns, alone=alone)
 
     @property
     def plant(self) -> Plant:
@@ -188,28 +230,84 @@ class ControlLoop:
         Heartbeats and TIMESYNC come before the decision, so that a solve does not delay a round trip.
         """
         inp = self._gather(tick, at_ns, missed_ticks, stop)
+        if stop:
+            self.course.stop(Cause.OPERATOR)  # unless who asks has said why
         for name, link in self._links.items():
             for data in link.due(at_ns):
                 yield self._send(name, data, at_ns)
         begun = self._stopwatch()
-        self._state, out = step(self._state, inp, self._controller)
+        out = self._decide(inp)
         self._last_step_ns = self._stopwatch() - begun
         self.decision, self.estimate = out.decision, out.estimate
         self.link = out.link or self.link
         self._record(out, at_ns)
+        self.course.let_go = self.let_go
+        self.course.see(at_ns, self.vehicle)
+        self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
         autopilot = "" if self.vehicle is None else self.vehicle.autopilot
         # A vehicle that lands must not do so by positions that have just been found to be wrong.
         if not self._state.disbelieves:
             for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
                 yield self._send(VEHICLE, data, at_ns)
-        yield from self._command(inp, out)
+        if self._adrift:
+            self._hand_over.look_up(at_ns, self.vehicle)
+        else:
+            try:
+                yield from self._command(inp, out)
+            except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
+                self._adrift = True
+                self._die(error, at_ns)
+        self.course.over = self.finished
         self._record_stats(at_ns)
+
+    def _decide(self, inp: StepInput) -> StepOutput:
+        """What the core makes of a tick; one that has failed is not asked again, and what it flew has to land."""
+        if not self.course.died:
+            try:
+                self._state, out = step(self._state, inp, self._controller)
+            except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
+                self._die(error, inp.at_ns)
+                return self._without_core(inp, land=self._lands or self._hand_over.ours)
+            return out
+        return self._without_core(inp, land=False)
+
+    def _without_core(self, inp: StepInput, *, land: bool) -> StepOutput:
+        """A tick of a controller that has failed: nothing is decided; once, the vehicle's own landing is asked for."""
+        decision = Decision(
+            tick=inp.tick,
+            at_ns=inp.at_ns,
+            step=0 if self.decision is None else self.decision.step,
+            boundary=False,
+            mode=ControlMode.STOPPED,
+            age_steps=None,
+            news=False,
+            plan_seq=None,
+            plan_index=None,
+            solve=None,
+            input=None,
+            fresh=0,
+            missed_ticks=inp.missed_ticks,
+            accepted=0,
+            rejected=0,
+            reason=f"{FAILED} {self.course.died}",
+        )
+        return StepOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
+
+    def _die(self, error: Exception, at_ns: int) -> None:
+        """The controller has failed: no setpoint is sent any more, and the positions for the vehicle go on."""
+        last = next(reversed(extract_tb(error.__traceback__)), None)
+        where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
+        self.course.died = self.course.died or f"{type(error).__name__}: {error}{where}"
+        event = Event(at_ns=at_ns, severity=Severity.ERROR, code="control", text=f"{FAILED} {self.course.died}")
+        self._put("/uavctl/event", at_ns, event)
+        self.notices.append(event)
 
     def order(self, command: Command) -> bool:
         """Queue an order of the operator for the next tick; False if too many wait already."""
         if len(self._orders) >= MAX_ORDERS:
             return False
         self._orders.append(command)
+        self.course.takes_off = self.course.takes_off or command.order is Order.TAKE_OFF
         return True
 
     def against(self, order: Order) -> str:
@@ -307,6 +405,8 @@ class ControlLoop:
         """What the vehicle is told: a setpoint, a request, or nothing."""
         at_ns = inp.at_ns
         told = self._hand_over.update(self._view(inp, out))
+        if told.passage is not None:
+            self.course.turn(told.passage, self.vehicle)
         self.answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
@@ -316,6 +416,8 @@ class ControlLoop:
         sure = self._unsure_since_ns is None
         if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
+            if told.sending is Sending.SETPOINTS:
+                self._controlled_ns = at_ns
             yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
         if sure and told.ask is not None:
             yield self._send(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns)
@@ -369,6 +471,9 @@ class ControlLoop:
             self._next_stats_ns = at_ns + SECOND_NS
             for link in self._links.values():
                 self._put("/uavctl/link", at_ns, link.stats(at_ns))
+            relay = self.relay
+            if relay is not None:
+                self._put("/uavctl/relay", at_ns, relay)
 
 
 def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:

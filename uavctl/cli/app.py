@@ -12,7 +12,7 @@ from uavctl.cli.common import messages
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
 _EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
-130 interrupted.
+4 `tune`: the pilot has taken over; 130 interrupted.
 
 With --json, standard output holds one JSON document and nothing else; messages go to standard error.
 Every configuration key is described in docs/configuration.md."""
@@ -38,6 +38,7 @@ _COMMANDS = {
     "design": ("design_cmd:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
     "solve": ("solve_cmd:solve", "Solve one decision problem, towards the configured target."),
     "identify": ("identify_cmd:identify_command", "Identify plant, lag, disturbance and link from a recording."),
+    "tune": ("tune_cmd:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
     "bench": ("bench_cmd:bench", "Measure the speed of a decision, beside the problem as printed."),
     "paper": ("paper_cmd:paper", "Reproduce Section 5 of the paper, every claim beside what was measured."),
     "campaign": ("campaign_cmd:campaign", "Fly many runs of many controllers on the same noise and the same losses."),

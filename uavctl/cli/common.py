@@ -22,6 +22,17 @@ from uavctl.errors import ConfigError, DesignError
 
 _FILE_WIDTH = 120
 
+Overrides = Annotated[
+    tuple[str, ...],
+    Parameter(
+        name="--set",
+        negative=(),
+        show_default=False,
+        metavar="KEY=VALUE",
+        help="override one key, as in link.loss=0.3; may be repeated",
+    ),
+]
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -31,16 +42,7 @@ class Common:
     config: Annotated[
         str, Parameter(help="preset (paper, room, room-px4, room-ardupilot, room-hahn-stursberg) or TOML file")
     ] = "room"
-    overrides: Annotated[
-        tuple[str, ...],
-        Parameter(
-            name="--set",
-            negative=(),
-            show_default=False,
-            metavar="KEY=VALUE",
-            help="override one key, as in link.loss=0.3; may be repeated",
-        ),
-    ] = ()
+    overrides: Overrides = ()
     json: Annotated[
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
     ] = False

@@ -15,7 +15,7 @@ from uavctl.cli.common import Common, messages
 from uavctl.control_messages import SUFFIX, Reply, Request, control_folder
 from uavctl.data import Vec3
 from uavctl.errors import NotReachedError, UsageError
-from uavctl.health import Health, RecorderHealth
+from uavctl.health import Health, RecorderHealth, RelayHealth
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
 _BLOCK = 65_536
@@ -181,6 +181,9 @@ def _table(health: Health) -> Table:
     vehicle, recorder = health.vehicle, health.recorder
     rows = {
         "mode": "waiting" if health.mode is None else f"{health.mode.value}: {health.reason}",
+        "who flies": health.who_flies or "-",
+        **({"ending": health.ending} if health.ending else {}),
+        **({} if health.relay is None else {"relay": _relay(health.relay)}),
         "age": "-" if health.age_s is None else f"{health.age_s:.2f} s ({health.age_steps} steps)",
         "position": _point(health.position_m),
         "target": _point(health.target_m),
@@ -193,6 +196,14 @@ def _table(health: Health) -> Table:
     for name, text in rows.items():
         table.add_row(name, text)
     return table
+
+
+def _relay(relay: RelayHealth) -> str:
+    """How the vehicle gets its positions; control may have ended before."""
+    if relay.last_s is None:
+        return "no position has been passed on yet"
+    alone = "; control has ended, positions go on" if relay.alone else ""
+    return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{alone}"
 
 
 def _trouble(recorder: RecorderHealth) -> str:

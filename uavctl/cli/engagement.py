@@ -10,7 +10,7 @@ from uavctl.build import resting
 from uavctl.build_mission import build_mission
 from uavctl.cli.common import messages
 from uavctl.config import Config
-from uavctl.data import Command, ControlMode, Order, Vec3
+from uavctl.data import Command, ControlMode, Ending, Order, Vec3
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.mode import State
@@ -64,10 +64,16 @@ class Engagement:
         """Whether the vehicle is to be armed."""
         return self._take_off_m is not None
 
+    def begin(self, loop: ControlLoop) -> None:
+        """Say before the first tick what the flight is to do."""
+        loop.course.takes_off = self.takes_off
+        loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
+
     def follow(self, loop: ControlLoop) -> None:
         """Look at the tick that has just run; the first one gives the order to take off."""
         self.engaged = self.engaged or loop.who_flies is State.ENGAGED
         self._look_for_arrival(loop)
+        loop.course.arrived = self.arrived
         if self._take_off_m is not None and not self._ordered:
             self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
 
@@ -79,21 +85,6 @@ class Engagement:
         where = [estimate.mean[index] for index in plant.position_index]
         goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
         self.arrived = self.arrived or math.dist(where, goal) <= self._config.mission.accept_m
-
-    def verdict(self, loop: ControlLoop) -> str:
-        """What the flight was to do and did not; empty if it did all.
-
-        The pilot, not we, sees to the end of a flight that the pilot began.
-        """
-        if loop.let_go:
-            return f"the vehicle was let go: {loop.let_go}"
-        if self.takes_off and loop.failure:
-            return loop.failure
-        if self.takes_off and not self.engaged:
-            return "the flight ended before the controller was in charge"
-        if self.goal is not None and not self.arrived:
-            return f"--goto {','.join(f'{x:g}' for x in self.goal)} was not reached"
-        return ""
 
 
 def stand_by(loop: ControlLoop, flown_ns: int) -> None:
@@ -148,7 +139,9 @@ def checked_take_off(arm: bool, takeoff: float | None) -> float | None:
     return takeoff
 
 
-def tell_verdict(verdict: str) -> None:
-    """Say what the flight did not do, if there is anything."""
-    if verdict:
-        messages().print(f"[bold red]error:[/] {escape(verdict)}", soft_wrap=True)
+def tell_ending(ending: Ending) -> None:
+    """Say on the console how the flight ended."""
+    style = "[bold]ended:[/]" if ending.as_ordered else "[bold red]ended:[/]"
+    messages().print(f"{style} {escape(ending.sentence)}", soft_wrap=True)
+    if ending.relay:
+        messages().print(f"[bold]relay:[/] {escape(ending.relay)}", soft_wrap=True)

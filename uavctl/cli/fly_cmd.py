@@ -10,7 +10,8 @@ from cyclopts import Parameter
 from rich.markup import escape
 
 from logs.recorder import Recorder
-from logs.summary import render
+from logs.summary import FlightSummary, render
+from logs.topics import ENDED
 from uavctl.build import design_of
 from uavctl.cli.before_arming import checked_before_arming, record_items
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
@@ -20,12 +21,14 @@ from uavctl.cli.engagement import (
     checked_take_off,
     goto_overrides,
     stand_by,
-    tell_verdict,
+    tell_ending,
 )
 from uavctl.cli.flying import (
     Live,
     LivePort,
     conclude,
+    ending_noted,
+    final,
     live_line,
     live_view_port,
     new_recording,
@@ -37,6 +40,7 @@ from uavctl.cli.flying import (
 from uavctl.cli.operation import as_realtime, operation
 from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns
+from uavctl.config import Loaded
 from uavctl.config.security import warnings
 from uavctl.control_messages import control_folder, daemon_name
 from uavctl.control_socket import listening
@@ -85,9 +89,48 @@ def fly(
     take_off_m = checked_take_off(arm, takeoff)
     view_port = live_view_port(live=live, port=live_port)
     overrides = [*(f'{key}="{value}"' for key, value in given.items() if value is not None), *goto_overrides(goto)]
-    loaded = common.with_overrides(overrides).load()
+    summary = fly_daemon(
+        common.with_overrides(overrides).load(),
+        take_off_m=take_off_m,
+        goto=goto is not None,
+        duration_s=duration,
+        out=out,
+        control=control,
+        as_realtime_process=realtime,
+        view_port=view_port,
+    )
+    common.show(summary, lambda: render(summary))
+    return summary.ending.exit_code
+
+
+def fly_daemon(
+    loaded: Loaded,
+    *,
+    take_off_m: float | None = None,
+    goto: bool = False,
+    duration_s: float | None = None,
+    out: Path | None = None,
+    control: Path | None = None,
+    as_realtime_process: bool = False,
+    view_port: int | None = None,
+) -> FlightSummary:
+    """Fly a vehicle until the end, record it, and say on the console how it ended.
+
+    Args:
+        loaded: the configuration, with where it is from.
+        take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
+        goto: whether the mission is the place of `--goto`.
+        duration_s: hand over after this time [s]; None flies on.
+        out: folder of the recording; None makes a new one below `flights/`.
+        control: folder of the socket for orders; None is the user's own.
+        as_realtime_process: SCHED_FIFO and locked memory, as far as permitted.
+        view_port: TCP port of a live view; None is none.
+
+    Raises:
+        UavctlError: nothing was flown, and why.
+    """
     config = loaded.config
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # First of all, so that a second daemon is refused at once.
     with (
@@ -102,31 +145,34 @@ def fly(
             prepared = prepare(config, design)
         begun = time.perf_counter()
         with (
-            as_realtime(realtime) as collect,
+            as_realtime(as_realtime_process) as collect,
             stop_on_signals() as stopped,
             connected(config) as connections,
         ):
             checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
             recorder = Recorder(path, config.log, onlookers=looking)
+            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+            engagement.begin(loop)
+            asked_for = False
             try:
                 put_header(recorder, prepared, monotonic_ns())
                 record_items(recorder, checked, monotonic_ns())
-                loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
                 for warning in warnings(config.security, config.daemon):
                     messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
                 if tenure.left_ns is not None:
                     stand_by(loop, tenure.left_ns)
                 messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
                 with (
-                    live_line(loop, recorder, duration, config.daemon.tick_s),
+                    live_line(loop, recorder, duration_s, config.daemon.tick_s),
                     operation(loop, config, path, recorder.status, listener) as beside,
+                    ending_noted(loop),
                 ):
                     asked_for = run_daemon(
                         loop,
                         connections,
                         Ticker(tick_ns, dt_ns),
                         stopped,
-                        duration_s=duration,
+                        duration_s=duration_s,
                         stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
                             lambda *_: tenure.note(loop.leaves_vehicle),
@@ -139,8 +185,8 @@ def fly(
                 if asked_for:
                     tenure.note(False)
             finally:
+                ending = loop.ending
+                recorder.put(ENDED, monotonic_ns(), ending)
                 status = recorder.close()
-    summary = conclude(path, time.perf_counter() - begun, status)
-    common.show(summary, lambda: render(summary))
-    tell_verdict(engagement.verdict(loop))
-    return 0 if summary.steps and status.ok and not engagement.verdict(loop) else 1
+                tell_ending(final(ending, status))
+    return conclude(path, time.perf_counter() - begun, status, ending)

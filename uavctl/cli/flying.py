@@ -35,12 +35,14 @@ from uavctl.cli.provenance import cpu, versions
 from uavctl.cli.said import Said, waits_for
 from uavctl.config import Config
 from uavctl.config.load import dump_config
-from uavctl.data import ControlMode, Header, PolicyLibrary, Record, Severity
-from uavctl.errors import RecordingError, UsageError
+from uavctl.data import ControlMode, Ending, Header, PolicyLibrary, Record, Severity
+from uavctl.ending import lacking
+from uavctl.errors import ConnectionClosedError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
 
 LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
+SIGNALLED = 128  # exit codes of a process that a signal has ended are this much higher than its number
 LIVE_PORT = 8765  # where Foxglove looks first
 Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer on this machine; needs uavctl[live]")]
 LivePort = Annotated[
@@ -139,8 +141,14 @@ def stop_limit_s(config: Config, *, takes_off: bool) -> float:
     return config.fallback.brake_s + LANDING_S + (config.hand_over.land_s if lands else 0.0)
 
 
-def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary:
+def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
     """Read the recording back, sum it up and write the page beside it.
+
+    Args:
+        path: of the recording, which is closed.
+        wall_s: how long the flight took [s].
+        status: how the recorder fared.
+        ending: how the flight ended, in the words of those who flew; None where nobody did.
 
     Raises:
         RecordingError: the recording cannot be read, or nothing was flown.
@@ -156,9 +164,31 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus) -> FlightSummary
         recording=str(path),
         report=str(page),
         recorder_dropped=0 if status.ok else _lacking(status),
+        ending=None if ending is None else final(ending, status),
     )
     write_report(flight, summary, page)
     return summary
+
+
+@contextmanager
+def ending_noted(loop: ControlLoop) -> Iterator[None]:
+    """Note what ends a flight otherwise than in order; the link's end is told with the flight's, and raises no more."""
+    try:
+        yield
+    except ConnectionClosedError:
+        pass
+    except SystemExit as ended:
+        loop.course.kill(int(ended.code or 0) - SIGNALLED)
+        raise
+    except Exception as error:
+        loop.course.died = f"{type(error).__name__}: {error}"
+        raise
+
+
+def final(ending: Ending, status: RecorderStatus) -> Ending:
+    """How a flight ended, with how its recording did."""
+    why = status.reason or status.refusal or "the disk was too slow"
+    return ending if status.ok else lacking(ending, max(_lacking(status), 1), why)
 
 
 @contextmanager
@@ -169,7 +199,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
     def ask(number: int, frame: object) -> None:
         del frame
         if asked.is_set():
-            raise SystemExit(128 + number)
+            raise SystemExit(SIGNALLED + number)
         asked.set()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}

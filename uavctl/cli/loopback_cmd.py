@@ -19,17 +19,20 @@ from rich.progress import Progress
 from logs.onlookers import Onlookers
 from logs.recorder import Recorder, SyncRecorder
 from logs.summary import FlightSummary, render
+from logs.topics import ENDED
 from logs.views import Views
 from sim.script import Script
 from sim.server import Ready, serve_in_child
 from sim.world import World
 from uavctl.build import design_of
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
-from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_verdict
+from uavctl.cli.engagement import Engagement, check_places, checked_take_off, goto_overrides, tell_ending
 from uavctl.cli.flying import (
     Live,
     LivePort,
     conclude,
+    ending_noted,
+    final,
     live_line,
     live_view_port,
     new_recording,
@@ -41,9 +44,10 @@ from uavctl.cli.flying import (
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.cli.sim_door import make_door
 from uavctl.clock import Ticker, monotonic_ns
-from uavctl.config import Config
+from uavctl.config import Config, Loaded
 from uavctl.daemon import fly
 from uavctl.data import Outgoing, Sink, Truth
+from uavctl.ending import Cause
 from uavctl.errors import UavctlError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.realtime import collected_between_ticks
@@ -84,24 +88,51 @@ def loopback(
         raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
     given = {"duration_s": duration, "sim.seed": seed}
     overrides = [*(f"{key}={value}" for key, value in given.items() if value is not None), *goto_overrides(goto)]
-    loaded = common.with_overrides(overrides).load()
+    summary = fly_simulated(
+        common.with_overrides(overrides).load(),
+        udp=udp,
+        take_off_m=take_off_m,
+        goto=goto is not None,
+        out=out,
+        view_port=view_port,
+    )
+    common.show(summary, lambda: render(summary))
+    return summary.ending.exit_code
+
+
+def fly_simulated(
+    loaded: Loaded,
+    *,
+    udp: bool = False,
+    take_off_m: float | None = None,
+    goto: bool = False,
+    out: Path | None = None,
+    view_port: int | None = None,
+) -> FlightSummary:
+    """Fly the simulated vehicle for the configured time, record it, and say on the console how it ended.
+
+    Args:
+        loaded: the configuration, with where it is from.
+        udp: over real sockets and in real time, else in lockstep and virtual time.
+        take_off_m: height of the climb above the ground [m]; None begins and ends in the air.
+        goto: whether the mission is the place of `--goto`.
+        out: folder of the recording; None makes a new one below `flights/`.
+        view_port: TCP port of a live view; None is none.
+
+    Raises:
+        UavctlError: nothing was flown, and why.
+    """
     config = _on_loopback(loaded.config) if udp else loaded.config
     if config.duration_s < config.daemon.tick_s:
         raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
     with located(loaded):
         design = design_of(config)
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto is not None)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
     with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
         with located(loaded):
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        if udp:
-            summary, verdict = _real_time(prepared, path, engagement, looking)
-        else:
-            summary, verdict = lockstep(prepared, path, engagement)
-    common.show(summary, lambda: render(summary))
-    tell_verdict(verdict)
-    return 0 if summary.steps and not summary.recorder_dropped and not verdict else 1
+        return _real_time(prepared, path, engagement, looking) if udp else lockstep(prepared, path, engagement)
 
 
 class _Timed:
@@ -125,23 +156,20 @@ class _InterruptedError(Exception):
     """The operator asked for the end of a flight in virtual time."""
 
 
-def lockstep(
-    prepared: Prepared, path: Path, engagement: Engagement, script: Script | None = None
-) -> tuple[FlightSummary, str]:
-    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn.
-
-    Returns:
-        Its figures, and what it was to do and did not.
-    """
+def lockstep(prepared: Prepared, path: Path, engagement: Engagement, script: Script | None = None) -> FlightSummary:
+    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn."""
     config, takes_off = prepared.config, engagement.takes_off
     recorder = SyncRecorder(path, config.log, onlookers=Onlookers(Views()))
     begun = time.perf_counter()
+    loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+    engagement.begin(loop)
+    loop.course.in_flight = not takes_off
     try:
         put_header(recorder, prepared, started_ns=0)
-        loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         timed = _Timed(loop, engagement)
         with (
-            suppress(_InterruptedError),
+            ending_noted(loop),
+            suppress(_InterruptedError),  # inside: an end that the operator asked for is no failure
             stop_on_signals() as stopped,
             Progress(console=messages(), transient=True) as progress,
         ):
@@ -150,6 +178,7 @@ def lockstep(
             def show(flown_s: float) -> None:
                 progress.update(task, completed=flown_s)
                 if stopped():
+                    loop.course.stop(Cause.OPERATOR)
                     raise _InterruptedError
 
             def record(truth: Truth) -> None:
@@ -160,42 +189,55 @@ def lockstep(
             world.run(config.duration_s, lambda: takes_off and loop.finished)
             if takes_off:
                 timed.stop = True
+                loop.course.stop(Cause.TIME)
                 world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: loop.finished)
     finally:
         wall_s = time.perf_counter() - begun
+        recorder.put(ENDED, loop.decision.at_ns if loop.decision is not None else 0, loop.ending)
         status = recorder.close()
-    return conclude(path, wall_s, status), engagement.verdict(loop)
+        tell_ending(final(loop.ending, status))
+    return conclude(path, wall_s, status, loop.ending)
 
 
-def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: Onlookers) -> tuple[FlightSummary, str]:
+def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: Onlookers) -> FlightSummary:
     config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(connected(config))
         recorder = Recorder(path, config.log, onlookers=looking)
+        loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+        engagement.begin(loop)
+        loop.course.in_flight = not takes_off
+        wall_s = 0.0
         try:
             put_header(recorder, prepared, monotonic_ns())
-            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
             collector = simulator.enter_context(collected_between_ticks())
             begun = time.perf_counter()
-            fly(
-                loop,
-                connections,
-                Ticker(tick_ns, dt_ns),
-                stopped,
-                duration_s=config.duration_s,
-                stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
-                after_tick=(lambda *_: recorder.catch_up(), lambda *_: engagement.follow(loop), collector.after_tick),
-            )
+            with ending_noted(loop):
+                fly(
+                    loop,
+                    connections,
+                    Ticker(tick_ns, dt_ns),
+                    stopped,
+                    duration_s=config.duration_s,
+                    stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                    after_tick=(
+                        lambda *_: recorder.catch_up(),
+                        lambda *_: engagement.follow(loop),
+                        collector.after_tick,
+                    ),
+                )
             wall_s = time.perf_counter() - begun
             simulator.close()  # its last words go into the recording
         finally:
+            recorder.put(ENDED, monotonic_ns(), loop.ending)
             status = recorder.close()
-    return conclude(path, wall_s, status), engagement.verdict(loop)
+            tell_ending(final(loop.ending, status))
+    return conclude(path, wall_s, status, loop.ending)
 
 
 def _on_loopback(config: Config) -> Config:

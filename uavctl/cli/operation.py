@@ -52,6 +52,7 @@ def operation(
             # The sign of life comes last: it stands for all that a tick has to do.
             yield watch.after_tick, server.after_tick, notifier.after_tick
         finally:
+            notifier.status(f"ended: {loop.ending.sentence}")
             server.close()
             notifier.close()
 

@@ -60,7 +60,7 @@ def fly_again(flight: Reflight, out: Path | None) -> Reflown:
     config = flight.config
     as_flown = Engagement(config, take_off_m=None, goto=False)
     with new_recording(out, "refly", config.log.free_bytes) as path:
-        summary, _ = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
+        summary = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
         return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
 
 

@@ -11,6 +11,8 @@ from uavctl.mavlink.request import Ask, Patience, Request
 from uavctl.mavlink.sight import ASKING, LEAVING, Progress, Sight, View, against_engaging, habits_of, look, silent
 
 LAND_TRIES = 5
+NEWS_NS = 100_000_000  # a heartbeat is news for so long: two ticks
+MISSED_NS = 1_500_000_000  # one that was due is missing
 FOREVER_NS = 2**62
 _OVER = frozenset({State.DONE, State.FAILED})
 _ON_THE_GROUND = frozenset({State.MODE, State.ARMING})
@@ -23,6 +25,26 @@ _PROMISES = {
 HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
 
 
+class Passage(msgspec.Struct, frozen=True):
+    """A way in the table that was gone.
+
+    Attributes:
+        before: The state that was left.
+        seen: Why.
+        after: The state that was entered.
+        why: More about it, where something failed.
+        ask: What the vehicle had been asked for.
+        granted: It had said yes to that.
+    """
+
+    before: State
+    seen: Seen
+    after: State
+    why: str = ""
+    ask: Ask | None = None
+    granted: bool = False
+
+
 class Told(msgspec.Struct, frozen=True):
     """What a tick makes of it.
 
@@ -30,11 +52,13 @@ class Told(msgspec.Struct, frozen=True):
         sending: What may be streamed.
         ask: What to ask the vehicle for now, if anything.
         events: What there is to tell.
+        passage: The way in the table that was gone, if one was.
     """
 
     sending: Sending
     ask: Ask | None = None
     events: tuple[Event, ...] = ()
+    passage: Passage | None = None
 
 
 class HandOver:
@@ -56,7 +80,7 @@ class HandOver:
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
         self._disarms = False
         self._silent = False
-        self._aloft_ns: int | None = None  # the last tick, if the vehicle was heard to be in the air
+        self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
         self.failure = ""
 
     @property
@@ -76,19 +100,22 @@ class HandOver:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing more will be sent, whatever comes.
+        """Whether nothing more will be sent, whatever comes."""
+        return self.state in _OVER and not self.carries
 
-        A vehicle in the air that lands by the positions it gets from here gets them for the time of a landing.
+    @property
+    def carries(self) -> bool:
+        """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
+
+        One that is not heard any more gets them for the time of a landing.
         """
-        if self.state not in _OVER or self._aloft_ns is None or not self._sees_it_down:
-            return self.state in _OVER
-        return self._aloft_ns - self._now.since_ns >= _ns(self._config.land_s)
+        return self._sees_it_down and self._aloft_ns is not None
 
     @property
     def busy(self) -> bool:
         """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
-        if self.state is State.RELEASED:
-            return self._sees_it_down and self._aloft_ns is not None
+        if self.carries:
+            return True
         return self.state in ASKING or (self.state is State.SETTLING and (self.ours or self._sees_it_down))
 
     def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
@@ -114,20 +141,30 @@ class HandOver:
         events = self._take_orders(view)
         if now.heard_ns is None and view.vehicle is not None:
             now.heard_ns = view.at_ns
-        aloft = view.vehicle is not None and view.vehicle.armed and not view.vehicle.landed
-        self._aloft_ns = view.at_ns if aloft and not silent(view.at_ns, view.vehicle) else None
+        self.look_up(view.at_ns, view.vehicle)
         sight = look(now, view)
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
         now.state, sending = TRANSITIONS[before, sight.seen]
+        passage = None
         if now.state is not before:
+            was = now.request
+            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None)
             self._enter(before, sight, view)
         if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
             sending = Sending.NOTHING
         self._see_to_disarming(view)
-        ask = now.request.due(view.at_ns, view.unfit if now.state in _ON_THE_GROUND else "")
+        held = view.unfit if now.state in _ON_THE_GROUND else ""
+        ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
         if now.state is State.FAILED and before is State.ARMING:
             ask = Ask.DISARM  # arming may have been granted after all
-        return Told(sending, ask, (*events, *self._tell(view, before, sight)))
+        return Told(sending, ask, (*events, *self._tell(view, before, sight)), passage)
+
+    def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
+        """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
+        if vehicle is not None and not silent(at_ns, vehicle):
+            self._aloft_ns = at_ns if vehicle.armed and not vehicle.landed else None
+        elif self._aloft_ns is not None and at_ns - self._aloft_ns >= _ns(self._config.land_s):
+            self._aloft_ns = None
 
     def _take_orders(self, view: View) -> list[Event]:
         events = []
@@ -154,6 +191,18 @@ class HandOver:
             return f"a climb to {command.height_m} m is none"
         early = self.state in (State.WAITING, State.READY) and not self.ours
         return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
+
+    def _may_be_the_pilot_s(self, view: View) -> bool:
+        """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
+
+        Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
+        it is made again right after a heartbeat; landing also where none has come.
+        """
+        vehicle, ask = view.vehicle, self._now.request.ask
+        if ask not in (Ask.EXTERNAL_MODE, Ask.LAND) or vehicle is None:
+            return False
+        age_ns = view.at_ns - vehicle.at_ns
+        return age_ns > NEWS_NS and not (ask is Ask.LAND and age_ns > MISSED_NS)
 
     def _may_warm_up(self, view: View) -> bool:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""

@@ -22,7 +22,7 @@ from uavctl.data import (
     VehicleStatus,
 )
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import RoundTrips
+from uavctl.mavlink.clocksync import ClockSource, RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import BadBytes
@@ -120,6 +120,11 @@ class Link:
         return self._intake.attitude
 
     @property
+    def clock_source(self) -> ClockSource:
+        """Where the time of the newest sample's capture comes from."""
+        return self._intake.clock_source
+
+    @property
     def settled(self) -> bool:
         """Whether the newest sample is of a source that has spoken for a while."""
         return self._intake.settled
@@ -127,6 +132,17 @@ class Link:
     def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
         """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
         return self._intake.trips(address)
+
+    def answered(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
+
+        Args:
+            address: system and component whose stamps it tells of.
+            sent_ns: when the request went.
+            remote_ns: the time in the answer.
+            received_ns: when the answer came.
+        """
+        self._intake.answer(address, sent_ns, remote_ns, received_ns)
 
     @property
     def vehicle_asks_time(self) -> bool:

@@ -204,6 +204,9 @@ in `RETURNING`.
   (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
 * What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
   still says otherwise 0.3 s later is the pilot's word.
+* A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
+  have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
+  external mode, at the end of a climb, waits for none: a pilot who switches in that second has to switch again.
 * While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
 """
 

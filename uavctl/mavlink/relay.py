@@ -48,6 +48,7 @@ class Relay:
 
     Attributes:
         sent: poses passed on.
+        last_ns: time of the tick that passed the last one on; None before.
         kept: poses that were not, by reason.
     """
 
@@ -59,6 +60,7 @@ class Relay:
         self._last: tuple[Vec3, Quaternion] | None = None
         self._same = 0
         self.sent = 0
+        self.last_ns: int | None = None
         self.kept = dict.fromkeys(("no attitude", "refused", "stale", "stuck", "late", "rate", "no clock"), 0)
 
     @property
@@ -105,6 +107,7 @@ class Relay:
             self._newest_ns = sample.captured_ns
             out.append(self._pose(sample, attitude, offset_ns))
         self.sent += len(out)
+        self.last_ns = at_ns if out else self.last_ns
         return tuple(out)
 
     def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:

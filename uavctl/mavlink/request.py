@@ -72,7 +72,13 @@ class Request:
         self._texts: list[str] = []
         self._held = ""
         self._waits = False  # for the time after a refusal
+        self.asked_ns: int | None = None  # when it was made last
         self.granted_ns: int | None = None  # when it was accepted last
+
+    @property
+    def ask(self) -> Ask | None:
+        """What is asked for; None for a wait in which nothing is said."""
+        return self._ask
 
     def hear(self, message: Ack | Text, at_ns: int) -> None:
         """Take what the vehicle says."""
@@ -90,15 +96,20 @@ class Request:
                 self._waits = True
                 self._next_ns = at_ns + self._patience.retry_ns
 
-    def due(self, at_ns: int, held: str = "") -> Ask | None:
-        """What to send now, if anything; `held` says why it must not be sent yet."""
+    def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> Ask | None:
+        """What to send now, if anything; `held` says why it must not be sent yet.
+
+        `blind`: nothing is made again now, as it is not known what the vehicle does meanwhile.
+        """
         self._held = held
+        if blind and self._tries:
+            return None
         if self._ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
             return None
         if self._ask is Ask.TAKE_OFF and self.granted_ns is not None:  # it would begin again
             return None
         self._tries += 1
-        self._waits = False
+        self._waits, self.asked_ns = False, at_ns
         self._next_ns = at_ns + self._patience.answer_ns
         return self._ask
 

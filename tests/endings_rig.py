@@ -1,0 +1,267 @@
+"""`uavctl fly` itself in virtual time against the simulated peers, and every place that tells how it ended."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import signal
+import socket
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recording_fakes import Disk
+from sim_rig import decode
+
+from logs import report
+from logs.flight_data import FlightData
+from logs.reader import read
+from logs.recorder import SyncRecorder
+from logs.summary import summarise
+from sim.peers import Peers
+from sim.personality import PERSONALITIES
+from uavctl.cli import fly_cmd
+from uavctl.cli.app import run
+from uavctl.clock import Ticker
+from uavctl.config import load_config
+from uavctl.daemon import fly
+from uavctl.data import Ending
+from uavctl.health import HealthWatch
+from uavctl.lock import lock_paths
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.mode import State
+from uavctl.notify import Notifier
+from uavctl.transport import Connection
+
+SECOND = 1_000_000_000
+BEGUN_NS = 1  # a tick before the grid
+LONGEST_S = 400.0  # of a flight that should have ended long ago
+PRESET = ["--config", "room-hahn-stursberg", "--set", "solver.method=exact"]
+ON_THE_FLOOR = ("sim.start_position_m=[0.0,0.0,-0.7]",)
+TAKE_OFF = ("--arm", "--takeoff", "1.2")
+Step = tuple[Callable[["Endings"], bool], Callable[["Endings"], None]]
+
+
+class Line:
+    """A connection to the simulated peers."""
+
+    known, unread, send_errors, receive_errors = True, False, 0, 0
+
+    def __init__(self, rig: Endings, name: str) -> None:
+        self.url, self.closed = f"test://{name}", False
+        self._rig, self._name = rig, name
+        self.arrived: list[tuple[bytes, int]] = []
+        self.refused: Counter[str] = Counter()
+
+    def fileno(self) -> int:
+        return -1
+
+    def filenos(self) -> tuple[int, ...]:
+        return ()
+
+    def lost(self) -> int:
+        return 0
+
+    def trust(self, index: int) -> None:
+        pass
+
+    def answer(self, index: int) -> None:
+        pass
+
+    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+        taken, self.arrived = self.arrived, []
+        return taken
+
+    def send(self, data: bytes) -> None:
+        if self._rig.hears(data):
+            self._rig.peers.receive(self._name, data, self._rig.now_ns)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Sync(SyncRecorder):
+    """A recorder without a thread, on a disk that may take no more.
+
+    Attributes:
+        full: Whether the disk is.
+    """
+
+    full = False
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, open_file=Disk(lambda _: Sync.full).open, **more)
+
+    def catch_up(self) -> None:
+        pass
+
+
+class Endings:
+    """One flight of the command, with what the test does on the way: each step once its time has come.
+
+    Attributes:
+        hears: Whether the vehicle hears a datagram of ours.
+        told: Whether we hear one of the vehicle's.
+        steps: (when, what) in their order.
+    """
+
+    def __init__(self, folder: Path, *overrides: str, airborne: bool = False, peers: tuple[str, ...] = ()) -> None:
+        self.overrides = (*(() if airborne else ON_THE_FLOOR), *overrides)
+        settings = [*self.overrides, 'solver.method="exact"', *peers]
+        self.config = load_config("room-hahn-stursberg", settings)
+        self.folder, self.now_ns = folder, BEGUN_NS
+        self.peers = Peers(self.config, BEGUN_NS, airborne=airborne)
+        self.lines = {"vehicle": Line(self, "vehicle"), "mocap": Line(self, "mocap")}
+        self.hears: Callable[[bytes], bool] = lambda data: True
+        self.told: Callable[[bytes], bool] = lambda data: True
+        self.steps: list[Step] = []
+        self.loop: ControlLoop | None = None
+        self.watch: HealthWatch | None = None
+        self.notified: list[str] = []
+
+    # What a step may look at, and do
+
+    def is_in(self, state: State) -> bool:
+        return self.loop is not None and self.loop.who_flies is state
+
+    @property
+    def flying(self) -> ControlLoop:
+        assert self.loop is not None
+        return self.loop
+
+    def stick(self, mode: str) -> None:
+        kind = PERSONALITIES[self.config.sim.autopilot]
+        self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
+
+    def at(self, state: State, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:
+        """A step once the hand-over has been in a state for a while."""
+        since: list[int] = []
+
+        def due(rig: Endings) -> bool:
+            if rig.is_in(state) and not since:
+                since.append(rig.now_ns)
+            return bool(since) and rig.now_ns - since[0] >= after_s * SECOND
+
+        self.steps.append((due, do))
+        return self
+
+    def after(self, seconds: float, do: Callable[[Endings], None]) -> Endings:
+        """A step so long after the start."""
+        self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND, do))
+        return self
+
+    # Time
+
+    def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
+        assert self.now_ns < LONGEST_S * SECOND, "the flight does not end"
+        self.now_ns = max(self.now_ns, deadline_ns)
+        while self.steps and self.steps[0][0](self):
+            self.steps.pop(0)[1](self)
+        if self.now_ns > self.peers.now_ns:
+            for at_ns, link, data in self.peers.advance(self.now_ns):
+                if link == "mocap" or self.told(data):
+                    self.lines[link].arrived.append((data, at_ns))
+        return [name for name, line in self.lines.items() if line.arrived]
+
+    def fly(self, loop: ControlLoop, *given: Any, **more: Any) -> bool:
+        """The daemon's cycle on our clock."""
+        self.loop = loop
+        return fly(loop, *given, **more, wait_for=self.wait, now=lambda: self.now_ns)
+
+
+def interrupt(rig: Endings) -> None:
+    """Ctrl-C."""
+    signal.raise_signal(signal.SIGINT)
+
+
+class Told:
+    """How a flight ended, as every place tells it."""
+
+    def __init__(self, rig: Endings, code: int, out: str, err: str) -> None:
+        self.code = code
+        self.summary: dict[str, Any] = json.loads(out) if out else {}
+        self.console = " ".join(err.split())
+        self.path = rig.folder / "flight.mcap"
+        self.records = [record for _, _, record in read(self.path)]
+        self.recorded = [one for one in self.records if isinstance(one, Ending)]
+        page = self.path.with_suffix(".html")
+        self.page = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.read_text())).split()) if page.exists() else ""
+        self.status = "" if rig.watch is None else rig.watch.look().ending
+        self.notified = rig.notified
+
+    @property
+    def ending(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.summary["ending"]
+        return found
+
+    def agrees(self) -> None:
+        """All places have the one sentence, and the exit code goes with it."""
+        sentence = self.ending["sentence"]
+        assert f"ended: {sentence}" in self.console
+        assert self.status == sentence
+        assert self.notified[-1] == f"ended: {sentence}"
+        assert self.page.count(sentence) == 2  # first of what happened, and in the table
+        assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
+        assert self.ending["cause"] == self.summary["ended"]
+        assert [one.sentence for one in self.recorded] == [sentence]
+        again = summarise(FlightData.from_records(read(self.path)), wall_s=None)
+        assert (again.ending.sentence, again.ending.exit_code) == (sentence, self.code)
+
+
+@contextmanager
+def in_virtual_time(rig: Endings) -> Iterator[None]:
+    """The command's clock, connections and threads in our hands."""
+
+    @contextmanager
+    def connected(config: object) -> Iterator[dict[str, Line]]:
+        yield rig.lines
+
+    class Watched(HealthWatch):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            rig.watch = self
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fly_cmd, "connected", connected)
+        patch.setattr(fly_cmd, "run_daemon", rig.fly)
+        patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
+        patch.setattr(fly_cmd, "monotonic_ns", lambda: rig.now_ns)
+        patch.setattr(fly_cmd, "Recorder", Sync)
+        patch.setattr(fly_cmd, "checked_before_arming", lambda *_: ())
+        patch.setattr("uavctl.cli.operation.HealthWatch", Watched)
+        patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
+        sections = report._sections
+        patch.setattr(report, "_sections", lambda *given: [next(iter(sections(*given)))])  # its words, no drawings
+        patch.setattr(Sync, "full", False)
+        yield
+
+
+def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told:
+    """Type `uavctl fly` and look at what has become of it."""
+    with socket.socket(type=socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
+    sets = [word for setting in rig.overrides for word in ("--set", setting)]
+    places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
+    try:
+        # A folder with a short name: a socket's path has 107 bytes.
+        with in_virtual_time(rig), tempfile.TemporaryDirectory(prefix="uavctl-") as control:
+            code = run(["fly", *PRESET, *sets, *places, "--control", control, *words])
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    finally:
+        for path in lock_paths(url):
+            path.unlink(missing_ok=True)
+    out, err = capsys.readouterr()
+    assert (rig.folder / "flight.mcap").exists(), err
+    return Told(rig, code, out, err)
+
+
+def is_a(kind: str) -> Callable[[bytes], bool]:
+    """Whether a datagram is of a kind of message."""
+    return lambda data: any(message.get_type() == kind for message in decode(data))

@@ -1,0 +1,123 @@
+"""Take-offs by relayed positions over a bursty link, with checks that flicker and failsafes, judged on the truth."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from take_off_rig import RELAYED, Flight
+
+from uavctl.mavlink.mode import State
+
+AUTOPILOTS = ("px4", "ardupilot")
+LIMIT_S = 60.0  # in which a vehicle is flown, or on the ground again with a reason told
+SETTLED_S = 20.0  # engaged for so long, past all that was to come
+LANDING_S = 90.0  # more for one that lands at the limit
+LOW_M = 0.3  # a vehicle that is engaged is higher
+# Where a vehicle in the air is somebody's: ours, the pilot's, or on its way down by what was asked for.
+ATTENDED = frozenset(State) - {State.WAITING, State.READY, State.MODE, State.DONE, State.FAILED}
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """One take-off, as the truth has it.
+
+    Attributes:
+        autopilot: Whose behaviour the simulated vehicle shows.
+        seed: Of the flight.
+        what: What had become of the true vehicle: engaged, refused, landed; or what must not be.
+        reached: Whether it had been engaged at any time.
+        seconds: When that was so.
+        told: What the console had said of it.
+        sentence: How it ended.
+        wrong: What it did and should not have.
+    """
+
+    autopilot: str
+    seed: int
+    what: str
+    reached: bool
+    seconds: float
+    told: tuple[str, ...]
+    sentence: str
+    wrong: tuple[str, ...]
+
+
+def troubled(autopilot: str, seed: int) -> Flight:
+    """A take-off with checks that flicker, and a position that is not valid for a while after arming."""
+    rng = random.Random(seed)
+    begin_s, length_s = (
+        rng.uniform(0.0, rng.choice([1.5, 6.0])),
+        rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3),
+    )
+    return Flight(
+        autopilot,
+        *RELAYED,
+        f"sim.seed={seed}",
+        f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
+        f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
+        f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
+    ).relayed()
+
+
+def outcome(flight: Flight) -> str:
+    """What has become of the true vehicle; `hovers` is what must not be."""
+    up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
+    if not pilot.armed and flight.peers.autopilot.craft.landed:
+        return "landed" if "climbing" in flight.states else "refused"
+    return "engaged" if flight.is_in(State.ENGAGED) and up_m > LOW_M else "hovers"
+
+
+def flown(flight: Flight) -> str:
+    """The outcome by the limit; a flight that has ended is over."""
+    flight.take_off()
+    engaged_s = 0.0
+    for _ in range(round(LIMIT_S)):
+        if flight.loop.finished or engaged_s > SETTLED_S:
+            break
+        flight.run(1.0)
+        engaged_s = engaged_s + 1.0 if flight.is_in(State.ENGAGED) else 0.0
+    return outcome(flight)
+
+
+def fly_take_off(autopilot: str, seed: int) -> TakeOff:
+    """Fly one and judge it; what is still on its way down at the limit is looked at until it is there."""
+    flight = troubled(autopilot, seed)
+    what = flown(flight)
+    seconds, wrong = flight.now_ns * 1e-9, []
+    told = tuple(event.text for event in flight.loop.notices)
+    if what == "hovers":
+        while not flight.loop.finished and flight.now_ns * 1e-9 < seconds + LANDING_S and what == "hovers":
+            flight.run(1.0)
+            what = outcome(flight)
+        wrong.append(f"it was in the air and not flown at {seconds:.0f} s; then: {what}")
+    if what == "hovers":
+        wrong.append(f"nobody has it in the air ({flight.state})")
+    if what != "engaged" and not (told and flight.loop.course.told):
+        wrong.append("nobody was told why")
+    if flight.state not in ATTENDED and flight.peers.autopilot.pilot.armed:
+        wrong.append(f"it was left armed ({flight.state})")
+    reached = flight.loop.course.engaged
+    return TakeOff(autopilot, seed, what, reached, round(seconds, 1), told, flight.loop.ending.sentence, tuple(wrong))
+
+
+def tally_take_offs(flights: Sequence[TakeOff]) -> dict[str, object]:
+    """The figures of one autopilot's take-offs."""
+    found = Counter(flight.what for flight in flights)
+    late = max(flights, key=lambda flight: flight.seconds)
+    over = [flight.sentence for flight in flights if flight.what != "engaged"]
+    causes = Counter(sentence.partition(":")[0].partition(";")[0] for sentence in over)
+    return {
+        "take_offs": len(flights),
+        "engaged": sum(flight.reached for flight in flights),
+        "landed_again": sum(flight.reached and flight.what == "landed" for flight in flights),
+        "landed": sum(not flight.reached and flight.what == "landed" for flight in flights),
+        "refused": found["refused"],
+        "hovers": found["hovers"],
+        "latest_s": late.seconds,
+        "latest_seed": late.seed,
+        "ended": dict(causes.most_common()),
+        "wrong": {str(flight.seed): [*flight.wrong, flight.sentence] for flight in flights if flight.wrong},
+    }

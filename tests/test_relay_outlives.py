@@ -1,0 +1,147 @@
+"""The relay is a part of its own: control that fails or ends leaves positions to a vehicle until it is down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from take_off_rig import RELAYED, Flight
+
+from uavctl import loop as control
+from uavctl.data import Event, RelayStats, StepInput
+from uavctl.ending import Cause
+from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.step import StepOutput, step
+from uavctl.mavlink.hand_over import HandOver, Told
+from uavctl.mavlink.mode import State
+from uavctl.mavlink.sight import View
+
+BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+POSE, LAND = "VISION_POSITION_ESTIMATE", 21
+SECOND = 1_000_000_000
+
+
+def airborne(autopilot: str, *overrides: str, until: State = State.ENGAGED) -> Flight:
+    flight = Flight(autopilot, *RELAYED, *overrides).relayed().take_off()
+    flight.run(40.0, until=until)
+    return flight.run(5.0)  # the rotors spin up first, for as long as 4.2 s
+
+
+def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """What makes the core fail from then on."""
+    broken: list[bool] = []
+
+    def faulty(state: ControlState, inp: StepInput, controller: Controller) -> tuple[ControlState, StepOutput]:
+        if broken:
+            raise ArithmeticError("the core is broken")
+        return step(state, inp, controller)
+
+    monkeypatch.setattr(control, "step", faulty)
+    return lambda: broken.append(True)
+
+
+def poses_after(flight: Flight, at_ns: int) -> list[int]:
+    return [sent_ns for sent_ns, _ in flight.sent(POSE) if sent_ns > at_ns]
+
+
+def is_down(flight: Flight) -> bool:
+    return flight.peers.autopilot.craft.landed and not flight.peers.autopilot.pilot.armed
+
+
+@pytest.mark.fault(64)
+@pytest.mark.usefixtures("control_may_fail")
+@BOTH
+@pytest.mark.parametrize("until", [State.CLIMBING, State.ENGAGED])
+def test_a_core_that_fails_lands_the_vehicle_and_leaves_it_its_positions_until_then(
+    monkeypatch: pytest.MonkeyPatch, autopilot: str, until: State
+) -> None:
+    fail = failing(monkeypatch)
+    flight = airborne(autopilot, until=until)
+    fail()
+    failed_ns = flight.now_ns
+    for _ in range(60):
+        if flight.loop.finished:
+            break
+        flight.run(1.0)
+    assert flight.loop.finished and is_down(flight)
+    assert not flight.setpoints_between(failed_ns, flight.now_ns)
+    assert LAND in flight.commands()
+    poses = poses_after(flight, failed_ns)
+    assert len(poses) > 50 and flight.now_ns - poses[-1] < 3 * SECOND
+    told = [event.text for event in flight.loop.notices if event.code == "control"]
+    assert len(told) == 1 and "the core is broken" in told[0]
+    ending = flight.loop.ending
+    assert ending.cause == Cause.CONTROL and ending.exit_code == 1 and "the core is broken" in ending.sentence
+    assert "landed and disarmed" in ending.sentence
+    stats = flight.memory.of(RelayStats)[-1]
+    assert stats.alone and stats.sent > 50
+
+
+@pytest.mark.fault(64)
+@pytest.mark.usefixtures("control_may_fail")
+def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    fail = failing(monkeypatch)
+    flight = airborne("px4")
+    flight.stick("POSCTL")
+    flight.run(3.0, until=State.RELEASED)
+    before, failed_ns = flight.commands(), flight.now_ns
+    fail()
+    flight.run(20.0)
+    assert not flight.loop.finished and flight.commands() == before
+    assert len(poses_after(flight, failed_ns)) > 50
+    flight.stick("AUTO.LAND")
+    flight.run(30.0, until=State.DONE)
+    assert flight.loop.finished and flight.commands() == before
+
+
+@pytest.mark.fault(64)
+@pytest.mark.usefixtures("control_may_fail")
+def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = airborne("px4")
+
+    def faulty(hand_over: HandOver, view: View) -> Told:
+        raise LookupError("no such state")
+
+    monkeypatch.setattr(HandOver, "update", faulty)
+    failed_ns = flight.now_ns
+    flight.run(10.0)
+    assert not flight.loop.finished and poses_after(flight, flight.now_ns - SECOND)
+    assert not flight.setpoints_between(failed_ns, flight.now_ns)
+    flight.stick("AUTO.LAND")
+    for _ in range(40):
+        if flight.loop.finished:
+            break
+        flight.run(1.0)
+    assert flight.loop.finished and flight.peers.autopilot.craft.landed
+    assert [event.code for event in flight.memory.of(Event)].count("control") == 1
+
+
+@pytest.mark.fault(63)
+@BOTH
+def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopilot: str) -> None:
+    flight = airborne(autopilot, "hand_over.land_s=5.0")
+    flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
+    flight.run(3.0, until=State.RELEASED)
+    flight.run(40.0, stop=True)
+    assert flight.loop.carries and not flight.loop.finished
+    assert poses_after(flight, flight.now_ns - SECOND)
+
+
+@pytest.mark.fault(63)
+def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
+    flight = airborne("px4", "hand_over.land_s=5.0")
+    flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
+    flight.run(40.0, stop=True)
+    assert flight.is_in(State.FAILED) and flight.loop.carries and not flight.loop.finished
+    assert poses_after(flight, flight.now_ns - SECOND)
+    assert flight.loop.ending.cause == Cause.LANDING_FAILED
+
+
+def test_a_vehicle_that_is_not_heard_any_more_gets_them_for_the_time_of_a_landing() -> None:
+    flight = airborne("px4", "hand_over.land_s=5.0")
+    flight.told = lambda data: False
+    lost_ns = flight.now_ns
+    flight.run(90.0, stop=True)
+    assert flight.loop.finished
+    last_ns = poses_after(flight, lost_ns)[-1]
+    assert last_ns - lost_ns > 7 * SECOND
