@@ -51,6 +51,8 @@ class Tuning:
         thrust_integral_1ps: integral gain of that loop.
         land_mps: with which it sinks to land.
         crawl_mps: the same near the floor.
+        climb_mps: with which it takes off, at most.
+        climb_1ps: speed of a take-off per metre that is left; more than half a metre a second overshoots.
     """
 
     open_loop: bool
@@ -69,6 +71,8 @@ class Tuning:
     thrust_integral_1ps: float = 0.0
     land_mps: float = LAND_MPS
     crawl_mps: float = LAND_MPS
+    climb_mps: float = CLIMB_MPS
+    climb_1ps: float = REFERENCE_POSITION_1PS
 
 
 # ArduPilot gives throttle for the error of the vertical acceleration alone: PSC_ACCZ_P 0.5 and PSC_ACCZ_I 1, a
@@ -92,6 +96,8 @@ TUNINGS = {
         hover_error=0.0,
         thrust_gain=0.05 * THROTTLE_MPS2,
         thrust_integral_1ps=0.1 * THROTTLE_MPS2,
+        climb_mps=1.7,  # as recorded, to 1.2, 2 and 5 m; overshoots by a tenth of a metre
+        climb_1ps=1.0,
     ),
     "px4": Tuning(
         open_loop=True,
@@ -108,6 +114,8 @@ TUNINGS = {
         hover_error=0.0153,
         land_mps=0.7,  # MPC_LAND_SPEED and MPC_LAND_CRWL, as recorded
         crawl_mps=0.3,
+        climb_mps=1.1,  # as recorded, to 1.2 and 5 m
+        climb_1ps=0.53,
     ),
 }
 
@@ -119,6 +127,7 @@ class Demand(Enum):
     VELOCITY = auto()
     POSITION = auto()
     MOTION = auto()
+    CLIMB = auto()
     LANDING = auto()
 
 
@@ -192,7 +201,8 @@ class Cascade:
 
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the origin, over the present place."""
-        self.go_to((self._position[0], self._position[1], -height_m))
+        self._coming.clear()
+        self._demand, self._wanted = Demand.CLIMB, (self._position[0], self._position[1], -height_m)
 
     def land(self) -> None:
         """Sink at the landing speed, over the present place."""
@@ -239,7 +249,9 @@ class Cascade:
             near = -motion.position_m[2] < CRAWL_BELOW_M
             self._follow_velocity((0.0, 0.0, self.tuning.crawl_mps if near else self.tuning.land_mps))
         elif self._demand is Demand.POSITION:
-            self._follow_position()
+            self._follow_position(REFERENCE_POSITION_1PS, CLIMB_MPS)
+        elif self._demand is Demand.CLIMB:
+            self._follow_position(self.tuning.climb_1ps, self.tuning.climb_mps)
         else:
             self._carry_on()
             return self._track(motion, thrust_limited, fall_mps2)
@@ -277,12 +289,12 @@ class Cascade:
             north, east = north * REFERENCE_ACCEL_MPS2 / level, east * REFERENCE_ACCEL_MPS2 / level
         self._accel = (north, east, min(max(down, -REFERENCE_ACCEL_MPS2), REFERENCE_ACCEL_MPS2))
 
-    def _follow_position(self) -> None:
+    def _follow_position(self, down_1ps: float, climb_mps: float) -> None:
         dn, de = self._wanted[0] - self._position[0], self._wanted[1] - self._position[1]
         dd = self._wanted[2] - self._position[2]
         far = math.sqrt(dn * dn + de * de)
-        speed = _approach(far, CRUISE_MPS) / far if far > 0.0 else 0.0
-        down = math.copysign(_approach(abs(dd), CLIMB_MPS), dd)
+        speed = _approach(far, CRUISE_MPS, REFERENCE_POSITION_1PS) / far if far > 0.0 else 0.0
+        down = math.copysign(_approach(abs(dd), climb_mps, down_1ps), dd)
         self._follow_velocity((speed * dn, speed * de, down))
 
     def _carry_on(self) -> None:
@@ -333,10 +345,10 @@ class Cascade:
         return result
 
 
-def _approach(distance_m: float, limit_mps: float) -> float:
+def _approach(distance_m: float, limit_mps: float, gain_1ps: float) -> float:
     """Speed at a distance from which a stop takes half of the limit: proportional when near, a parabola when far."""
-    near = REFERENCE_ACCEL_MPS2 / (2.0 * REFERENCE_POSITION_1PS**2)
+    near = REFERENCE_ACCEL_MPS2 / (2.0 * gain_1ps**2)
     if distance_m <= near:
-        return min(REFERENCE_POSITION_1PS * distance_m, limit_mps)
+        return min(gain_1ps * distance_m, limit_mps)
     braking = math.sqrt(REFERENCE_ACCEL_MPS2 * (distance_m - 0.5 * near))
     return min(braking, limit_mps)

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.arming import preflight
 from sim.personality import ACCEPTED, DENIED, FAILED, UNSUPPORTED, Mode, Role, px4_custom
-from sim.pilot import CRITICAL, FORCED
+from sim.pilot import CRITICAL, FORCED, INFO
 from sim.telemetry import AUTOPILOT_VERSION, HOME_POSITION, MESSAGE_INTERVAL, Message, Telemetry, Vehicle
 
 TAKEOFF_MAX_M = 100.0
@@ -95,6 +95,8 @@ class Commands:
         return self.change(base, px4_custom(main, int(three[2])) if px4 else main, at_ns)
 
     def _land(self, _request: Request, at_ns: int) -> int:
+        if self._v.kind.name == "px4":
+            self._v.pilot.texts.append((INFO, "Landing at current position"))
         return self._v.pilot.change(self._v.kind.by_role(Role.LAND), at_ns)
 
     def _take_off(self, request: Request, at_ns: int) -> int:

@@ -85,7 +85,7 @@ class Failsafes:
             return
         if self._px4:
             self._meant = self._pilot.mode if self._clears else None
-            self._land(at_ns, "Failsafe activated: no valid position estimate, landing")
+            self._land(at_ns, "Failsafe activated")
         elif at_ns - self._lost_ns >= EKF_CHECK_NS and self._parameters["FS_EKF_ACTION"] == 1:
             self._land(at_ns, "EKF variance", "EKF Failsafe: changed to LAND Mode")
         elif first and self._parameters["FS_EKF_ACTION"] == 0:

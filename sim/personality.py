@@ -59,6 +59,7 @@ class Personality:
     ramps_s: float  # the same from the order, armed for long
     settles_s: float  # from standing on the floor to knowing it
     disarms_s: float  # from knowing it to disarming
+    resumes_mode: bool  # a landing or a failsafe that ended with disarming leaves the mode of before
     good_flags: int  # ESTIMATOR_STATUS_FLAGS of a good estimate, as recorded in flight
     vtol_state: int  # of EXTENDED_SYS_STATE
     version: int  # flight_sw_version of AUTOPILOT_VERSION
@@ -113,6 +114,7 @@ PX4 = Personality(
     ramps_s=3.0,
     settles_s=1.9,
     disarms_s=2.0,
+    resumes_mode=True,
     good_flags=0x37F,
     vtol_state=0,
     version=0x01080000,
@@ -150,6 +152,7 @@ ARDUPILOT = Personality(
     ramps_s=0.8,
     settles_s=0.0,
     disarms_s=1.65,
+    resumes_mode=False,
     good_flags=0x33F,
     vtol_state=3,
     version=0x040602FF,

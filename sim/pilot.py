@@ -25,6 +25,7 @@ WATCH_NS = 20_000_000  # how often height and floor are looked at
 FRESH_NS = SECOND_NS // 2
 NO_DOWN_NS = 5 * SECOND_NS  # length of a take-off or landing of a plant that has no vertical axis
 TAKEOFF_DONE_M = 0.1
+PASSING = frozenset({Role.TAKEOFF, Role.LAND})  # modes that end by themselves
 LANDS = 4  # COM_OBL_RC_ACT; less leaves it to the stick
 CRASHED = "CRASHED"
 CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
@@ -88,6 +89,7 @@ class Pilot:
         self.armed = airborne
         self.phase = Phase.AIR if airborne else Phase.GROUND
         self.mode: Mode = kind.by_role(Role.EXTERNAL) if airborne else kind.mode(kind.ground)
+        self._meant: Mode = self.mode  # the last one that somebody chose which is neither a take-off nor a landing
         flown = Setpoint(Ask.ACCELERATION) if airborne else None
         self.helm = Helm(kind, craft, parameters, estimator, flown)
         self.home_m: Vec3 = (0.0, 0.0, 0.0)
@@ -165,8 +167,10 @@ class Pilot:
         why = reasons(
             self._kind, self.mode, self._parameters, self._estimator, self._craft.battery, at_ns - self._boot_ns
         )
+        if self.lacks_stream(at_ns):
+            why = (*why, "Arming denied: Resolve system health failures first")
         if why and not forced:
-            self.texts.extend((CRITICAL, text) for text in why)
+            self.texts.extend((CRITICAL, text.replace("PreArm: ", "Arm: ")) for text in why)
             return self._kind.refused_arming
         self.armed, self._armed_ns = True, at_ns
         self.home_m = self._estimator.position_m
@@ -189,6 +193,8 @@ class Pilot:
         return ACCEPTED
 
     def _disarm(self) -> None:
+        if self._kind.resumes_mode and (self.failsafe or self.mode.role in PASSING):
+            self.mode = self._meant
         self.armed = self.failsafe = self._returns = False
         self._phase_end_ns = self._lift_ns = None
         self._craft.rest()
@@ -226,7 +232,9 @@ class Pilot:
 
     def fail(self, mode: Mode, at_ns: int, *, returns: bool = False) -> None:
         """A failsafe changes the mode; with `returns`, setpoints that come again end it."""
+        meant = self._meant
         self._enter(mode, at_ns)
+        self._meant = meant  # nobody chose this one
         self.failsafe, self._returns = True, returns
 
     def recover(self, mode: Mode, at_ns: int) -> None:
@@ -234,6 +242,10 @@ class Pilot:
         self._enter(mode, at_ns)
         if mode.role is Role.TAKEOFF and self.phase is not Phase.CLIMB:
             self._climb(at_ns)
+
+    def lacks_stream(self, at_ns: int) -> bool:
+        """Whether it would not arm, as its mode is PX4's OFFBOARD and nobody sends setpoints."""
+        return self.mode.role is Role.EXTERNAL and self._kind.needs_stream and not self._streaming(at_ns)
 
     def _streaming(self, at_ns: int) -> bool:
         limit_ns = min(FRESH_NS, round(self._parameters[self._kind.timeout] * 1e9))
@@ -244,6 +256,8 @@ class Pilot:
     def _enter(self, mode: Mode, at_ns: int) -> None:
         lifts = self._lift_ns is not None and (mode is self.mode or mode.role is Role.TAKEOFF)
         self.mode = mode
+        if mode.role not in PASSING:
+            self._meant = mode
         self.failsafe = self._returns = False
         if lifts:
             return
@@ -288,7 +302,7 @@ class Pilot:
             self.texts.append((INFO, self._disarm_text))
             self._disarm()
         elif self.phase is Phase.CLIMB:
-            self._climbed(at_ns)
+            self._climbed()
         else:
             self._touch(at_ns)
 
@@ -296,14 +310,24 @@ class Pilot:
         self._watch_ns = at_ns + WATCH_NS
         if self.phase is Phase.CLIMB:
             if self._estimator.position_m[2] <= TAKEOFF_DONE_M - self._height_m:
-                self._climbed(at_ns)
+                self._climbed()
         elif self._craft.landed:
             self._settle(at_ns)
         else:
             self._stood_ns = None
 
-    def _climbed(self, at_ns: int) -> None:
-        self._enter(self._kind.by_role(Role.HOLD) if self.mode.role is Role.TAKEOFF else self.mode, at_ns)
+    def _climbed(self) -> None:
+        """Go on to the mode that holds after a take-off by a mode of its own.
+
+        As recorded: a PX4 that knows latitude and longitude does so; one that has only a local position hovers in
+        AUTO.TAKEOFF, and tells that it takes off, until somebody chooses another mode.
+        """
+        if self.mode.role is Role.TAKEOFF and not self._estimator.geographic:
+            return
+        if self.mode.role is Role.TAKEOFF:
+            self.mode = self._meant = self._kind.by_role(Role.HOLD)
+        self.failsafe = self._returns = False
+        self.phase = Phase.AIR  # and goes on to the height that it climbs to
 
     def _settle(self, at_ns: int) -> None:
         """Know some time after that it has landed, as the autopilot of a quadrotor does."""

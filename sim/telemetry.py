@@ -202,7 +202,8 @@ class Telemetry:
 
     def _may_arm(self, at_ns: int) -> bool:
         v = self._v
-        return not preflight(v.kind, v.parameters, v.estimator, v.craft.battery, at_ns - v.boot_ns)
+        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, at_ns - v.boot_ns)
+        return not (why or v.pilot.lacks_stream(at_ns))
 
     def _status(self, at_ns: int) -> Message:
         v, battery = self._v, self._v.craft.battery

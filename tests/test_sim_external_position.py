@@ -78,7 +78,7 @@ def test_ardupilot_arms_24_s_after_its_start_and_wants_an_origin() -> None:
     one.wait(3.9)
     assert one.autopilot.estimator.flags == 0x33F
     assert one.ask(ARM, 1) == 4
-    assert one.texts == ["PreArm: EKF3 still initialising"]
+    assert one.texts == ["Arm: EKF3 still initialising"]
     one.wait(0.2)
     assert one.ask(ARM, 1) == 0
 
@@ -167,10 +167,28 @@ def test_px4_lands_five_seconds_after_the_loss() -> None:
     one.climb(2.0)
     one.external = None
     one.wait(4.8)
-    assert one.mode == "AUTO.LOITER"
+    assert one.mode == "AUTO.TAKEOFF"
     one.wait(0.5)
     assert one.mode == "AUTO.LAND"
-    assert one.texts[-1].startswith("Failsafe activated: no valid position")
+    assert one.texts[-1] == "Failsafe activated"
+
+
+# px4-sih-relay-released-in-climb: no place on the globe, and from 10 to 43 s in AUTO.TAKEOFF at the height;
+# px4-sih-offboard-accel: GPS, and AUTO.LOITER from 0.5 m below the height on. 3 and 2 are landed states.
+@pytest.mark.parametrize(("placed", "mode", "state"), [(False, "AUTO.TAKEOFF", 3), (True, "AUTO.LOITER", 2)])
+def test_px4_without_a_place_on_the_globe_hovers_in_its_take_off_mode(placed: bool, mode: str, state: int) -> None:
+    one = indoors("px4", "VISION_POSITION_ESTIMATE")
+    if placed:
+        one.send(one.client.pack(mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488_000)))
+    one.climb(1.2)
+    one.wait(20.0)
+    assert one.mode == mode
+    assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == state
+    assert one.vehicle.position_m == pytest.approx((0.0, 0.0, -1.2), abs=0.1)
+    assert one.ask(SET_MODE, 1, 3, 0) == 0  # the pilot's POSCTL ends it
+    one.wait(1.5)
+    assert one.mode == "POSCTL" and one.of("EXTENDED_SYS_STATE")[-1].landed_state == 2
+    assert one.vehicle.position_m == pytest.approx((0.0, 0.0, -1.2), abs=0.1)
 
 
 def test_a_jump_is_not_believed_and_a_short_pause_is_survived() -> None:

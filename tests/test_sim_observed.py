@@ -403,3 +403,51 @@ def test_px4_s_take_off_mode_climbs_to_its_parameter() -> None:
     one.wait(12.0)
     assert one.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.15)
     assert "Using default takeoff altitude: 1.2 m" in one.texts
+
+
+# Heights above the floor 0.5, 1, 2 and 4 s after 0.03 m, of the take-offs to these heights.
+@pytest.mark.parametrize(
+    ("name", "height_m", "recorded_m"),
+    [
+        ("ardupilot", 1.2, (0.36, 0.85, 1.30, 1.18)),  # arducopter-relay-pilot-switches
+        ("ardupilot", 2.0, (0.68, 1.26, 2.00, 1.96)),  # arducopter-vicon-guided-accel
+        ("ardupilot", 5.0, (0.67, 1.34, 3.06, 4.88)),  # arducopter-gps-guided-accel
+        ("px4", 1.2, (0.25, 0.47, 0.85, 1.21)),  # px4-sih-relay-released-in-climb
+        ("px4", 5.0, (0.25, 0.63, 1.74, 4.01)),  # px4-sih-offboard-accel
+    ],
+)
+def test_each_climbs_as_fast_as_it_was_recorded_to(name: Name, height_m: float, recorded_m: tuple[float, ...]) -> None:
+    one = Flight(name, airborne=False)
+    if name == "px4":
+        one.set(MIS_TAKEOFF_ALT=height_m)
+    else:
+        assert one.ask(SET_MODE, 1, 4) == 0
+    assert one.ask(ARM, 1) == 0
+    assert one.ask(TAKE_OFF, 0, 0, 0, 0, 0, 0, math.nan if name == "px4" else height_m) == 0
+    while one.vehicle.position_m[2] > -0.03:
+        one.wait(0.01)
+        assert one.now_ns < 10e9
+    climbed_m = []
+    for after_s in (0.5, 0.5, 1.0, 2.0):
+        one.wait(after_s)
+        climbed_m.append(-one.vehicle.position_m[2])
+    assert climbed_m == pytest.approx(recorded_m, abs=0.25)
+    one.wait(6.0)
+    assert one.vehicle.position_m[2] == pytest.approx(-height_m, abs=0.1)
+
+
+def test_px4_that_has_landed_is_in_the_mode_of_before_and_stands_by_only_while_it_is_sent_setpoints() -> None:
+    """As px4-sih-offboard-accel and px4-sih-relay-waypoints end: OFFBOARD, disarmed, UNINIT."""
+    one = Flight("px4")
+    one.stream(1.0, 0.0, 0.0, 0.5)
+    assert one.ask(LAND) == 0 and one.texts[-1] == "Landing at current position"
+    while one.autopilot.pilot.armed:
+        one.wait(0.5)
+        assert one.now_ns < 40e9
+    one.wait(1.1)
+    last = one.of("HEARTBEAT")[-1]
+    assert one.mode == "OFFBOARD" and (last.base_mode, last.system_status) == (17, 0)
+    assert one.ask(ARM, 1) == 1 and one.texts[-1].startswith("Arming denied: Resolve system health")
+    one.stream(1.2, 0.0, 0.0, 0.0)
+    assert one.of("HEARTBEAT")[-1].system_status == 3
+    assert one.ask(ARM, 1) == 0

@@ -139,3 +139,27 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
     flight.run(4.0)
     assert flight.is_in(State.RELEASED) and flight.commands() == before
     assert flight.peers.autopilot.mode_name == "POSCTL"
+
+
+@pytest.mark.fault(61)
+@pytest.mark.parametrize(("deaf_s", "lands"), [(8.8, False), (1000.0, True)])
+def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(deaf_s: float, lands: bool) -> None:
+    flight = Flight("px4", *RELAYED, "sim.streams=onboard").relayed()
+    flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 1.2)
+    flight.take_off().run(30.0, until=State.CLIMBING)
+    deaf_until_ns = flight.now_ns + round(deaf_s * 1e9)
+
+    def hears(data: bytes) -> bool:
+        asked = any(getattr(m, "command", 0) == SET_MODE for m in decode(data))
+        return flight.now_ns >= deaf_until_ns or not asked
+
+    flight.hears = hears
+    flight.run(8.7)
+    assert flight.is_in(State.ENGAGING) and flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
+    assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.15)
+    if lands:
+        flight.run(50.0, until=State.DONE)
+        assert outcome(flight) == "landed" and "landing" in flight.states and flight.loop.failure
+    else:
+        flight.run(20.0, until=State.ENGAGED).run(3.0)
+        assert outcome(flight) == "engaged" and not flight.loop.failure
