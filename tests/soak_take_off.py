@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_rig import Client
 from take_off_rig import RELAYED, Flight
 
 from uavctl.mavlink.mode import State
@@ -15,6 +17,8 @@ AUTOPILOTS = ("px4", "ardupilot")
 LIMIT_S = 60.0  # in which a vehicle is flown, or on the ground again with a reason told
 SETTLED_S = 20.0  # engaged for so long, past all that was to come
 LANDING_S = 90.0  # more for one that lands at the limit
+HEIGHT_M = 1.2
+PLACE = (473977420, 85455940, 488000)  # latitude and longitude [1e-7 deg], altitude [mm]
 LOW_M = 0.3  # a vehicle that is engaged is higher
 # Where a vehicle in the air is somebody's: ours, the pilot's, or on its way down by what was asked for.
 ATTENDED = frozenset(State) - {State.WAITING, State.READY, State.MODE, State.DONE, State.FAILED}
@@ -46,20 +50,30 @@ class TakeOff:
 
 
 def troubled(autopilot: str, seed: int) -> Flight:
-    """A take-off with checks that flicker, and a position that is not valid for a while after arming."""
+    """A take-off with checks that flicker, and a position that is not valid for a while after arming.
+
+    PX4 says all that it says unasked, and climbs to the height of the order by itself, as the guide has it set. With
+    an even seed it has no place on the globe, so it hovers in AUTO.TAKEOFF there; with an odd one, in AUTO.LOITER.
+    """
     rng = random.Random(seed)
     begin_s, length_s = (
         rng.uniform(0.0, rng.choice([1.5, 6.0])),
         rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3),
     )
-    return Flight(
+    flight = Flight(
         autopilot,
         *RELAYED,
+        "sim.streams=onboard",
         f"sim.seed={seed}",
         f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
         f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
         f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
     ).relayed()
+    if autopilot == "px4":
+        flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", HEIGHT_M)
+        if seed % 2:
+            flight.peers.receive("vehicle", Client().pack(mavlink.MAVLink_set_gps_global_origin_message(1, *PLACE)), 0)
+    return flight
 
 
 def outcome(flight: Flight) -> str:
@@ -67,12 +81,13 @@ def outcome(flight: Flight) -> str:
     up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
     if not pilot.armed and flight.peers.autopilot.craft.landed:
         return "landed" if "climbing" in flight.states else "refused"
-    return "engaged" if flight.is_in(State.ENGAGED) and up_m > LOW_M else "hovers"
+    obeys = pilot.external and pilot.helm.obeyed is not None  # whatever the hand-over takes it for
+    return "engaged" if flight.is_in(State.ENGAGED) and obeys and up_m > LOW_M else "hovers"
 
 
 def flown(flight: Flight) -> str:
     """The outcome by the limit; a flight that has ended is over."""
-    flight.take_off()
+    flight.take_off(HEIGHT_M)
     engaged_s = 0.0
     for _ in range(round(LIMIT_S)):
         if flight.loop.finished or engaged_s > SETTLED_S:

@@ -10,14 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sim_rig import LAND, SET_MODE, decode
 from soak_faults import FLIGHT_S, drawn, fly_faults
 from soak_mission import AUTOPILOTS, MISSION, fly_mission, summary
 from soak_rig import prepared_for
-from soak_take_off import fly_take_off, tally_take_offs
+from soak_take_off import fly_take_off, outcome, tally_take_offs
+from take_off_rig import RELAYED, Flight
 
 from logs.reader import read
 from uavctl.cli.prepare import Prepared
 from uavctl.data import Truth, Vec3
+from uavctl.mavlink.mode import State
 
 TOOL = Path(__file__).parent.parent / "tools" / "soak.py"
 
@@ -46,6 +49,46 @@ def test_a_take_off_of_each_autopilot_and_a_judge_that_finds_what_hovers() -> No
     found = tally_take_offs([*flights, hovering])
     assert (found["take_offs"], found["engaged"], found["hovers"]) == (3, 3, 1)
     assert list(found["wrong"]) == ["2"]  # type: ignore[call-overload]
+
+
+def is_setpoint(data: bytes) -> bool:
+    return any(message.get_type() == "SET_POSITION_TARGET_LOCAL_NED" for message in decode(data))
+
+
+def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has its positions, and holds its height in AUTO.TAKEOFF."""
+    flights: list[Flight] = []
+
+    def deaf(*_: str | int) -> Flight:
+        flight = Flight("px4", *RELAYED, "sim.seed=1").relayed()
+        flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 1.2)
+        flight.hears = lambda data: "climbing" not in flight.states or not (is_order(data) or is_setpoint(data))
+        flights.append(flight)
+        return flight
+
+    def is_order(data: bytes) -> bool:
+        return any(getattr(message, "command", 0) in (SET_MODE, LAND) for message in decode(data))
+
+    monkeypatch.setattr("soak_take_off.troubled", deaf)
+    monkeypatch.setattr("soak_take_off.LANDING_S", 30.0)
+    found = fly_take_off("px4", 1)
+    (flight,) = flights
+    assert flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
+    assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.2)
+    assert found.what == "hovers"
+    assert any("was in the air and not flown" in text for text in found.wrong)
+    assert any("nobody has it in the air" in text for text in found.wrong)
+    assert tally_take_offs([found])["hovers"] == 1
+
+
+def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes_it_for() -> None:
+    flight = Flight("ardupilot", *RELAYED).relayed().take_off()
+    flight.run(30.0, until=State.ENGAGED).run(1.0)
+    assert outcome(flight) == "engaged"
+    flight = Flight("ardupilot", *RELAYED).relayed().take_off()
+    flight.hears = lambda data: not is_setpoint(data)
+    flight.run(30.0, until=State.ENGAGED).run(1.0)
+    assert outcome(flight) == "hovers"
 
 
 def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:
