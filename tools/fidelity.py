@@ -9,11 +9,13 @@ cameras at 40 Hz whose packets are lost in bursts, positions through the relay a
 from __future__ import annotations
 
 import argparse
+import math
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -23,10 +25,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from logs.tlog import read_tlog
 from sim.peers import Peers
 from uavctl.build import build_controller, design_of
-from uavctl.config import load_config
+from uavctl.config import Config, load_config
 from uavctl.data import Command, Datagram, Order, Record
 from uavctl.errors import UavctlError
-from uavctl.identify.recorded import from_records, from_tlog
+from uavctl.identify.recorded import History, from_records, from_tlog
 from uavctl.identify.result import Identified, identify
 from uavctl.loop import VEHICLE, ControlLoop
 from uavctl.mavlink.mode import State
@@ -35,18 +37,37 @@ from uavctl.trial.own_loop import EXTERNAL_ONLY
 DOCS = Path(__file__).parents[1] / "docs" / "autopilots.md"
 BEGIN, END = "<!-- fidelity: written by tools/fidelity.py -->\n", "<!-- end of fidelity -->\n"
 TICK_NS, S = 50_000_000, 1e-9
+AFTER_NS = 1_500_000_000  # the end, to see the heartbeat that follows
 LONGEST_S, READY_S, HEIGHT_M = 90.0, 26.0, 1.2
+# What the recordings are called here, their files, and those of the truth; times of the latter are since boot or, where
+# what happened lies beside them, since the first packet.
 FLIGHTS = {
-    "ArduPilot": ("arducopter-relay-bursts-blackouts-wind", "arducopter-relay-pilot-switches"),
-    "PX4": ("px4-sih-relay-waypoints", "px4-sih-relay-blown-away"),
+    "ArduPilot": (
+        ("GPS", "arducopter-gps-guided-accel", "arducopter-gps"),
+        ("vicon", "arducopter-vicon-guided-accel", "arducopter-vicon"),
+        ("bursts", "arducopter-relay-bursts-blackouts-wind", "arducopter-relay-bursts-blackouts-wind"),
+        ("pilot", "arducopter-relay-pilot-switches", "arducopter-relay-pilot-switches"),
+    ),
+    "PX4": (
+        ("GPS", "px4-sih-offboard-accel", "px4-sih"),
+        ("at rest", "px4-sih-false-reboot", "px4-sih-false-reboot"),
+        ("released", "px4-sih-relay-released-in-climb", "px4-sih-relay-released-in-climb"),
+        ("blown away", "px4-sih-relay-blown-away", "px4-sih-relay-blown-away"),
+        ("waypoints", "px4-sih-relay-waypoints", "px4-sih-relay-waypoints"),
+    ),
 }
 AS_RECORDED = (
+    "estimator.inertial_std_mps2=0.0",  # the recordings are of a time when inertial data were not asked for
     *("relay.enabled=true", "sim.plant=quadrotor", "sim.camera.rate_hz=40.0", "sim.camera.noise_std_m=0.002"),
     *("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_enter=0.043", "link.burst_leave=0.1"),
     *("link.delay_s=0.01", "link.jitter_s=0.03", "sim.streams=onboard", "sim.start_position_m=[0.0,0.0,-0.7]"),
     "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.9],[1.5,-1.0,-1.6],[-1.5,1.0,-1.1]]",
 )
-AXES = ("north", "east", "down")
+# What goes wrong in the second flight: PX4's failsafe that clears itself in the climb, ArduPilot's that does not.
+TROUBLED = {
+    "px4": ("sim.checks.invalid=[[0.2,1.4]]", "sim.checks.clears=true"),
+    "ardupilot": ("sim.checks.invalid=[[12.0,1000.0]]",),
+}
 Array = NDArray[np.float64]
 
 
@@ -71,14 +92,31 @@ class Watched:
         return ((at_s, one) for at_s, one in self.messages if one.get_type() == kind)
 
     @property
-    def armed_s(self) -> float:
+    def armed_s(self) -> float | None:
         """When it armed last: by its acknowledgement, as heartbeats come once a second."""
-        return max(at_s for at_s, one in self.of("COMMAND_ACK") if one.command == 400 and one.result == 0)
+        return max(
+            (at_s for at_s, one in self.of("COMMAND_ACK") if one.command == 400 and one.result == 0), default=None
+        )
 
-    def rises_s(self, height_m: float) -> float:
-        """When it was first at a height."""
-        above = self.truth[self.truth[:, 1] > height_m, 0]
-        return float(above[above > self.armed_s][0])
+    @property
+    def asked_s(self) -> float:
+        """When it answered first that it should arm."""
+        return next((at_s for at_s, one in self.of("COMMAND_ACK") if one.command == 400), math.inf)
+
+    def rises_s(self, height_m: float) -> float | None:
+        """When it was first at a height after it had armed."""
+        if self.armed_s is None:
+            return None
+        above = self.truth[(self.truth[:, 1] > height_m) & (self.truth[:, 0] > self.armed_s), 0]
+        return float(above[0]) if above.size else None
+
+    @property
+    def highest_m(self) -> float | None:
+        """How high the take-off went, in the 4 s from the floor on."""
+        off_s = self.rises_s(0.03)
+        if off_s is None:
+            return None
+        return float(self.truth[(self.truth[:, 0] > off_s) & (self.truth[:, 0] < off_s + 4.0), 1].max())
 
     def text_s(self, begin: str) -> float | None:
         """When it said something that begins so, last."""
@@ -106,14 +144,19 @@ class Watched:
         last_s = [float(t[up > height][-1]) for height in (high_m, low_m)]
         return (high_m - low_m) / (last_s[1] - last_s[0]) if last_s[1] > last_s[0] else None
 
-    def rate_hz(self, kind: str) -> float:
-        """Messages of a kind a second."""
-        return sum(1 for _ in self.of(kind)) / (self.messages[-1][0] - self.messages[0][0])
+    def rate_hz(self, kind: str = "") -> float | None:
+        """Messages of a kind a second, or of all, from 5 s after arming on, when requests have been answered."""
+        begin_s = 0.0 if self.armed_s is None else self.armed_s + 5.0
+        times = [at_s for at_s, one in self.messages if at_s > begin_s and (not kind or one.get_type() == kind)]
+        return len(times) / (self.messages[-1][0] - begin_s) if times else None
 
-    @property
-    def every_hz(self) -> float:
-        """All messages of the vehicle a second."""
-        return len(self.messages) / (self.messages[-1][0] - self.messages[0][0])
+    def said(self) -> list[str]:
+        """What it said from the first try to arm on: each text once, in order, its numbers and places left out."""
+        cut = (re.sub(r"\d+\.\d+", "…", text.strip()).partition("./log")[0] for at_s, text in self.texts)
+        at_s = [at_s for at_s, _ in self.texts]
+        return list(
+            dict.fromkeys(text for when_s, text in zip(at_s, cut, strict=True) if when_s > self.asked_s - 0.2 and text)
+        )
 
     def modes(self) -> str:
         """Numbers of its modes in order."""
@@ -124,30 +167,41 @@ class Watched:
         return " ".join(str(one if one < 1 << 16 else f"{one >> 16 & 255}/{one >> 24}") for one in told)
 
 
-def recorded(folder: Path, name: str) -> Watched:
-    """A recorded flight of ours."""
+def recorded(folder: Path, name: str, beside: str) -> Watched:
+    """A recorded flight."""
     packets = read_tlog(folder / f"{name}.tlog").packets
     begin_ns = packets[0].at_ns
-    rows = [line.split(",") for line in (folder / f"{name}-truth.csv").read_text().splitlines()[1:]]
-    truth = np.array([[float(row[0]), -float(row[3])] for row in rows])
-    truth[:, 1] -= truth[:5, 1].mean()
     preset = "room-px4" if name.startswith("px4") else "room-ardupilot"
     config = load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
     heard = _heard(((one.at_ns - begin_ns) * S, one.data) for one in packets if not one.outgoing)
-    seen = [line.split(maxsplit=4) for line in (folder / f"{name}-events.txt").read_text().splitlines()]
-    texts = [(float(one[0]), one[4]) for one in seen if one[1] == "TEXT" and len(one) == 5]
-    return Watched(heard, truth, texts, identify(from_tlog(packets, config), config, lambda: None).result)
+    rows = [line.split(",") for line in (folder / f"{beside}-truth.csv").read_text().splitlines()[1:]]
+    truth = np.array([[float(row[0]), -float(row[3])] for row in rows])
+    if not (folder / f"{beside}-events.txt").exists():
+        stamped = [
+            (at_s, 1e-3 * one.time_boot_ms)
+            for at_s, one in heard
+            if one.get_type() in ("ATTITUDE", "LOCAL_POSITION_NED")
+        ]
+        truth[:, 0] += min(at_s - boot_s for at_s, boot_s in stamped)
+    truth[:, 1] -= np.median(truth[truth[:, 0] < truth[0, 0] + 1.0, 1])
+    events = folder / f"{beside}-events.txt"
+    seen = [line.split(maxsplit=4) for line in events.read_text().splitlines()] if events.exists() else []
+    # On some recorded links nothing was said: what an observer heard on another one counts.
+    texts = _texts(heard) or [(float(one[0]), one[4]) for one in seen if one[1] == "TEXT" and len(one[-1].strip()) > 1]
+    return Watched(heard, truth, texts, _identified(lambda: from_tlog(packets, config), config))
 
 
-def simulated(autopilot: str) -> Watched:
+def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Watched:
     """The same, of the simulator."""
-    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot={autopilot}"])
+    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot={autopilot}", *overrides])
     sink, truth = _Sink(), []
     loop = ControlLoop(config, build_controller(config, design_of(config)), sink, lambda: 0)
     peers = Peers(config, 0, airborne=False)
     for name, value in EXTERNAL_ONLY[config.sim.autopilot].items():
         peers.autopilot.parameters.set(name, value)
-    ready, land = round(READY_S / 0.05), round(LONGEST_S / 0.05)
+    if autopilot == "px4":
+        peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", HEIGHT_M)  # as in the recordings
+    ready, land = round(READY_S / 0.05), round(ends_s / 0.05)
     for tick in range(land + 400):
         at_ns = tick * TICK_NS
         for arrival_ns, link, data in peers.advance(at_ns):
@@ -159,10 +213,23 @@ def simulated(autopilot: str) -> Watched:
         truth.append((at_ns * S, -peers.vehicle.position_m[2]))
         if loop.who_flies is State.DONE:
             break
+    for arrival_ns, link, data in peers.advance(peers.now_ns + AFTER_NS):
+        sink.put("", arrival_ns, Datagram(at_ns=arrival_ns, link=link, outgoing=False, data=data))
     records = sink.entries
     heard = _heard((at_ns * S, one.data) for _, at_ns, one in records if isinstance(one, Datagram) and _of_vehicle(one))
-    texts = [(at_s, one.text) for at_s, one in heard if one.get_type() == "STATUSTEXT"]
-    return Watched(heard, np.array(truth), texts, identify(from_records(records), config, lambda: None).result)
+    return Watched(heard, np.array(truth), _texts(heard), _identified(lambda: from_records(records), config))
+
+
+def _texts(heard: Iterable[tuple[float, Any]]) -> list[tuple[float, str]]:
+    return [(at_s, one.text) for at_s, one in heard if one.get_type() == "STATUSTEXT"]
+
+
+def _identified(history: Callable[[], History], config: Config) -> Identified | None:
+    """The response; none of a flight in which nothing was asked for, or too little to tell."""
+    try:
+        return identify(history(), config, lambda: None).result
+    except UavctlError:
+        return None
 
 
 class _Sink:
@@ -180,22 +247,23 @@ def _of_vehicle(one: Datagram) -> bool:
     return not one.outgoing and one.link == VEHICLE
 
 
-def _heard(packets: Iterable[tuple[float, bytes]]) -> list[tuple[float, Any]]:
+def _heard(packets: Iterable[tuple[float, bytes]], system: int = 1) -> list[tuple[float, Any]]:
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
     found = ((at_s, one) for at_s, data in packets for one in parser.parse_buffer(data) or ())
-    return [(at_s, one) for at_s, one in found if one.get_srcSystem() == 1]
+    return [(at_s, one) for at_s, one in found if system in (0, one.get_srcSystem())]
 
 
 Figure = Callable[[Watched], float | None]
 
-TIMES: tuple[tuple[str, Figure], ...] = (
-    ("armed to off the floor [s]", lambda one: one.rises_s(0.03) - one.armed_s),
-    ("then to 0.9 m [s]", lambda one: one.rises_s(0.9) - one.rises_s(0.03)),
+FIGURES: tuple[tuple[str, Figure], ...] = (
+    ("armed to off the floor [s]", lambda one: _minus(one.rises_s(0.03), one.armed_s)),
+    ("then to 0.9 m [s]", lambda one: _minus(one.rises_s(0.9), one.rises_s(0.03))),
+    ("highest in the 4 s after that [m]", lambda one: one.highest_m),
     ("sinks at 0.7 m [m/s]", lambda one: one.sinks_mps(0.5, 0.9)),
     ("sinks at 0.2 m [m/s]", lambda one: one.sinks_mps(0.1, 0.4)),
     ("floor to disarmed [s]", lambda one: _minus(one.disarmed_s, one.stands_s)),
-    ("all messages [1/s]", lambda one: one.every_hz),
+    ("all messages [1/s]", lambda one: one.rate_hz()),
     ("ATTITUDE [1/s]", lambda one: one.rate_hz("ATTITUDE")),
     ("LOCAL_POSITION_NED [1/s]", lambda one: one.rate_hz("LOCAL_POSITION_NED")),
 )
@@ -206,38 +274,79 @@ def _minus(later_s: float | None, earlier_s: float | None) -> float | None:
 
 
 def table(folder: Path) -> str:
-    """The table, one part for each autopilot."""
+    """The tables, two for each autopilot: what can be measured, and what was said."""
     parts = []
-    for title, names in FLIGHTS.items():
-        real, made = [recorded(folder, name) for name in names], simulated(title.lower())
-        lines = [f"| {title} | real | simulated |", "|---|---|---|"]
-        for what, figure in TIMES:
-            lines.append(f"| {what} | {_spread(list(map(figure, real)))} | {_spread([figure(made)])} |")
-        lines.append(f"| modes | {real[0].modes()} | {made.modes()} |")
-        lines += _responses(real[0].answers, made.answers)
-        parts.append("\n".join(lines) + "\n")
+    for title, recordings in FLIGHTS.items():
+        real = {label: recorded(folder, *files) for label, *files in recordings}
+        kind = title.lower()
+        made = {"simulated": simulated(kind), "in trouble": simulated(kind, *TROUBLED[kind], ends_s=50.0)}
+        every = real | made
+        lines = [_row(title, every), "|---" * (len(every) + 1) + "|"]
+        lines += [_row(what, [_number(figure(one)) for one in every.values()]) for what, figure in FIGURES]
+        lines.append(_row("modes", [one.modes() for one in every.values()]))
+        lines += _responses([one.answers for one in every.values()])
+        parts += ["\n".join(lines) + "\n", _said(title, real, made)]
+        if kind == "ardupilot":
+            parts.append(_requests(folder, recordings, real))
     return "\n".join(parts)
 
 
-def _responses(real: Identified | None, made: Identified | None) -> Iterator[str]:
+def _row(*cells: str | Iterable[str]) -> str:
+    return "| " + " | ".join(text for cell in cells for text in ([cell] if isinstance(cell, str) else cell)) + " |"
+
+
+def _responses(answers: Sequence[Identified | None]) -> Iterator[str]:
     """Dead time and lag are told together better than either."""
-    if real is None or made is None:
-        return
-    dead_s = [one.candidates[0].dead_time_s for one in (real, made)]
-    yield f"| dead time [s] | {dead_s[0]:.2f} | {dead_s[1]:.2f} |"
-    for ours, theirs in zip(real.response, made.response, strict=True):
-        both = [(f"{one.lag_s:.2f}", "" if one.gain is None else f", {one.gain:.2f}") for one in (ours, theirs)]
-        what = f"{ours.axis}: lag [s]" + (", gain" if both[0][1] else "")
-        yield f"| {what} | {''.join(both[0])} | {''.join(both[1])} |"
+    yield _row("dead time [s]", ["–" if one is None else f"{one.candidates[0].dead_time_s:.2f}" for one in answers])
+    for place, axis in enumerate(("north", "east", "down")):
+        of_axis = [None if one is None or len(one.response) <= place else one.response[place] for one in answers]
+        gains = ["" if one is None or one.gain is None else f", {one.gain:.2f}" for one in of_axis]
+        lags = ["–" if one is None else f"{one.lag_s:.2f}" for one in of_axis]
+        what = f"{axis}: lag [s]" + (", gain" if any(gains) else "")
+        yield _row(what, [lag + gain for lag, gain in zip(lags, gains, strict=True)])
 
 
-def _spread(values: Sequence[float | None]) -> str:
-    known = [value for value in values if value is not None]
-    if not known:
+def _said(title: str, real: Mapping[str, Watched], made: Mapping[str, Watched]) -> str:
+    """What each said, in order, and what the others did not."""
+    both = [list(dict.fromkeys(text for one in some.values() for text in one.said())) for some in (real, made)]
+    lines = [_row(title, "said from the first try to arm on, each text once, in order"), "|---|---|"]
+    lines += [_row(label, " · ".join(one.said()) or "–") for label, one in (real | made).items()]
+    for what, ours, others in (("recorded only", *both), ("simulated only", *reversed(both))):
+        lines.append(_row(what, " · ".join(text for text in ours if text not in others) or "–"))
+    return "\n".join(lines) + "\n"
+
+
+def _requests(folder: Path, recordings: Sequence[tuple[str, str, str]], real: Mapping[str, Watched]) -> str:
+    """Rates of what a recorded client asked for, beside those of the simulated vehicle that is asked for the same."""
+    lines = ["| asked for in the recordings | asked [1/s] | real [1/s] | simulated [1/s] |", "|---|---|---|---|"]
+    for label, name, _ in recordings:
+        sent = [one.data for one in read_tlog(folder / f"{name}.tlog").packets if one.outgoing]
+        asked = [one for _, one in _heard(((0.0, data) for data in sent), system=0) if _is_request(one)]
+        last = {int(one.param1): one.param2 for one in asked}
+        peers = Peers(load_config("room-ardupilot", ["sim.autopilot=ardupilot"]), 0, airborne=True)
+        mav = mavlink.MAVLink(None, 255, 0)
+        for number, interval_us in last.items():
+            order = mavlink.MAVLink_command_long_message(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)
+            peers.receive(VEHICLE, order.pack(mav), 0)
+        heard = Counter(
+            one.get_msgId()
+            for _, one in _heard((at * S, data) for at, link, data in peers.advance(10**10) if link == VEHICLE)
+        )
+        for number, interval_us in last.items():
+            kind = mavlink.mavlink_map[number].msgname
+            rates = real[label].rate_hz(kind), heard[number] / 10.0 if number in heard else None
+            lines.append(_row(f"{label}: {kind}", f"{1e6 / interval_us:.0f}", [_number(one) for one in rates]))
+    return "\n".join(lines) + "\n"
+
+
+def _is_request(one: Any) -> bool:
+    return one.get_type() == "COMMAND_LONG" and one.command == 511 and one.param2 > 0.0
+
+
+def _number(value: float | None) -> str:
+    if value is None:
         return "–"
-    digits = 0 if median(known) >= 20 else 1 if median(known) >= 1.0 else 2
-    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
-    return low if low == high else f"{low} to {high}"
+    return f"{value:.{0 if value >= 20 else 1 if value >= 1.0 else 2}f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
