@@ -310,7 +310,7 @@ def _said(title: str, real: Mapping[str, Watched], made: Mapping[str, Watched]) 
     """What each said, in order, and what the others did not."""
     both = [list(dict.fromkeys(text for one in some.values() for text in one.said())) for some in (real, made)]
     lines = [_row(title, "said from the first try to arm on, each text once, in order"), "|---|---|"]
-    lines += [_row(label, " · ".join(one.said()) or "–") for label, one in (real | made).items()]
+    lines += [_row(label, " · ".join(one.said()) or "–") for label, one in {**real, **made}.items()]
     for what, ours, others in (("recorded only", *both), ("simulated only", *reversed(both))):
         lines.append(_row(what, " · ".join(text for text in ours if text not in others) or "–"))
     return "\n".join(lines) + "\n"
@@ -340,7 +340,7 @@ def _requests(folder: Path, recordings: Sequence[tuple[str, str, str]], real: Ma
 
 
 def _is_request(one: Any) -> bool:
-    return one.get_type() == "COMMAND_LONG" and one.command == 511 and one.param2 > 0.0
+    return bool(one.get_type() == "COMMAND_LONG" and one.command == 511 and one.param2 > 0.0)
 
 
 def _number(value: float | None) -> str:
