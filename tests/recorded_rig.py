@@ -6,6 +6,7 @@ import lzma
 import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from logs.flight_data import FlightData
 from logs.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
-from uavctl.data import VehicleStatus
+from uavctl.data import Command, VehicleStatus
 from uavctl.loop import VEHICLE, ControlLoop, make_links
 
 FLIGHTS = DATA / "flights"
@@ -52,6 +53,19 @@ def truth(name: str) -> NDArray[np.float64]:
     return np.array([[float(value) for value in line.split(",")[:4]] for line in text.splitlines()[1:]])
 
 
+@cache
+def events(name: str) -> tuple[tuple[float, str], ...]:
+    """What an observer saw and told the rig to do: seconds since the first packet, and his words."""
+    text = lzma.decompress((FLIGHTS / f"{name}-events.txt.xz").read_bytes()).decode()
+    rows = (line.split(maxsplit=1) for line in text.splitlines())
+    return tuple((float(time), words) for time, words in rows)
+
+
+def seen_s(name: str, begin: str) -> list[float]:
+    """When the observer saw or did what begins so [s]."""
+    return [time_s for time_s, words in events(name) if words.startswith(begin)]
+
+
 def config_of(name: str, *overrides: str) -> Config:
     """The preset of the autopilot that flew, on one link."""
     preset = "room-px4" if name.startswith("px4") else "room-ardupilot"
@@ -73,20 +87,47 @@ def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[
     return {one.name: one.state.value for one in flight.items(begin_ns + tick * TICK_NS)}
 
 
-def watched(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> Memory:
-    """What the control loop records of a part of a recording that it only listens to."""
+@dataclass(frozen=True)
+class Listened:
+    """A control loop that heard a part of a recording, and what it recorded; nobody flew its setpoints."""
+
+    name: str
+    loop: ControlLoop
+    memory: Memory
+
+    def since_s(self, at_ns: int) -> float:
+        """Time since the recording's first packet [s]."""
+        return (at_ns - packets(self.name)[0].at_ns) * 1e-9
+
+
+def listened(
+    name: str,
+    since_s: float = 0.0,
+    seconds: float = 1e9,
+    *overrides: str,
+    orders: Sequence[tuple[float, Command]] = (),
+) -> Listened:
+    """Let a control loop hear a part of a recording; `orders` are an operator's, by time since the first packet [s]."""
     whole = packets(name)
     begin_ns = whole[0].at_ns + round(since_s * SECOND)
     config, memory = config_of(name, "solver.method=exact", *overrides), Memory()
     design, controller = shared(config)
     memory.put("/uavctl/header", begin_ns, header(config, design))
     loop, tick = ControlLoop(config, controller, memory, lambda: 0), 0
+    waiting = deque((whole[0].at_ns + round(time_s * SECOND), command) for time_s, command in orders)
     for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
-        while begin_ns + tick * TICK_NS < one.at_ns:
-            deque(loop.tick(tick, begin_ns + tick * TICK_NS), maxlen=0)
+        while (now_ns := begin_ns + tick * TICK_NS) < one.at_ns:
+            while waiting and waiting[0][0] <= now_ns:
+                assert loop.order(waiting.popleft()[1])
+            deque(loop.tick(tick, now_ns), maxlen=0)
             tick += 1
         loop.receive(VEHICLE, one.data, one.at_ns)
-    return memory
+    return Listened(name, loop, memory)
+
+
+def watched(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> Memory:
+    """What the control loop records of a part of a recording that it only listens to."""
+    return listened(name, since_s, seconds, *overrides).memory
 
 
 def page_of(memory: Memory) -> FlightData:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from loopback_rig import Memory
+from numpy.typing import NDArray
 from recorded_rig import (
     AT_REST,
     EVERY,
@@ -18,8 +20,10 @@ from recorded_rig import (
     RELAYED,
     checked,
     config_of,
+    events,
     packets,
     page_of,
+    seen_s,
     statuses,
     truth,
     watched,
@@ -36,6 +40,7 @@ from uavctl.mavlink.clocksync import RoundTrips
 
 GPS, VICON, OFFBOARD = OF_OTHERS
 WIND, PILOT, BLOWN, RELEASED, WAYPOINTS = RELAYED
+GPS_TRUTH = "arducopter-gps"
 
 
 def words(name: str) -> list[str]:
@@ -133,40 +138,96 @@ def test_the_cameras_delays_are_those_of_the_simulator() -> None:
 # --- identify ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Sent:
-    """The rig's frames by the stamps alone: 40 a second, and how long it was told to send none [s]."""
-
-    name: str
-    blackouts: int
-
-
-RIG = [Sent(WIND, 2), Sent(PILOT, 0), Sent(BLOWN, 2), Sent(RELEASED, 0), Sent(WAYPOINTS, 1)]
-
-
 def link(name: str) -> LinkFit:
     found = history(name)
     return fit_link(found.seen, found.gaps)
 
 
-@pytest.mark.parametrize("sent", RIG, ids=lambda one: one.name)
-def test_the_rig_s_loss_delay_and_blackouts_are_found(sent: Sent) -> None:
-    found = link(sent.name)
-    seen_s = history(sent.name).seen.times_s
-    frames = 1.0 + 40.0 * (seen_s[-1] - seen_s[0])
-    dark = 40.0 * sum(found.outages_s)
-    assert found.loss == pytest.approx(1.0 - found.received / (frames - dark), abs=0.01)
+CAMERA_HZ = 40.0
+QUICKEST_S, SLOWEST_S = 0.010, 0.040  # from a frame to its arrival, alike likely in between
+BLACKOUT = "ORDER blackout "
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The rig's frames by their stamps alone, since the first packet.
+
+    Attributes:
+        stamps_s: Of those that came, each once.
+        delays_s: From each stamp to its arrival.
+        lost: Share that did not come, outside the blackouts that were ordered.
+        within: Frames that came though they are of a blackout.
+    """
+
+    stamps_s: NDArray[np.float64]
+    delays_s: NDArray[np.float64]
+    lost: float
+    within: int
+
+
+@cache
+def frames(name: str) -> Frames:
+    """What the rig sent and what of it came: nothing of `identify` is asked."""
+    first_ns = packets(name)[0].at_ns
+    arrivals_ns: dict[int, int] = {}
+    for one in packets(name):
+        if one.data[5] == 20 and one.data[7] == 102:
+            arrivals_ns.setdefault(1000 * int.from_bytes(one.data[10:18], "little"), one.at_ns)
+    stamps_s = (np.array(sorted(arrivals_ns)) - first_ns) * 1e-9
+    dark = np.zeros(stamps_s.size, dtype=np.bool_)
+    dark_s = 0.0
+    for begin_s, words in events(name):
+        if words.startswith(BLACKOUT):
+            length_s = float(words.removeprefix(BLACKOUT))
+            dark |= (stamps_s > begin_s) & (stamps_s < begin_s + length_s)
+            dark_s += length_s
+    # A late rig stamps late, but catches up: single spacings are off by up to half a period, the count is not.
+    sent = 1.0 + CAMERA_HZ * (stamps_s[-1] - stamps_s[0] - dark_s)
+    return Frames(
+        stamps_s=stamps_s,
+        delays_s=np.array([at_ns - stamp_ns for stamp_ns, at_ns in sorted(arrivals_ns.items())]) * 1e-9,
+        lost=1.0 - float(np.count_nonzero(~dark)) / sent,
+        within=int(np.count_nonzero(dark)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "lost"), [(WIND, 0.292), (PILOT, 0.273), (BLOWN, 0.229), (RELEASED, 0.248), (WAYPOINTS, 0.222)]
+)
+def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: float) -> None:
+    """Within 0.5 % of the frames'; all but one flight met fewer bursts than make 30 %."""
+    found, true = link(name), frames(name)
+    assert true.within <= 1
+    assert true.lost == pytest.approx(lost, abs=0.001)
+    assert found.loss == pytest.approx(true.lost, abs=0.005)
     assert 0.01 < found.loss_std < 0.05
-    assert len(found.outages_s) == sent.blackouts
-    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in found.outages_s)
     assert found.bursts
-    assert found.rate_hz == pytest.approx(40.0, rel=0.01)
-    assert found.delay_s == pytest.approx(0.010, abs=0.002)
-    assert found.delay_quantiles_s[3] == pytest.approx(0.0385, abs=0.010)
+
+
+@pytest.mark.parametrize("name", RELAYED)
+def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
+    found, true = link(name), frames(name)
+    assert len(found.outages_s) == len(seen_s(name, BLACKOUT))
+    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in found.outages_s)
+    assert found.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
+    assert found.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
+    assert found.delay_quantiles_s[3] == pytest.approx(SLOWEST_S - 0.05 * (SLOWEST_S - QUICKEST_S), abs=0.010)
+    assert found.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
+
+
+@pytest.mark.parametrize("name", RELAYED)
+def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(name: str) -> None:
+    """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
+    until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
+    until_ns = packets(name)[0].at_ns + until_s * 1e9
+    found = from_tlog([one for one in packets(name) if one.at_ns < until_ns], config_of(name))
+    late_s = fit_link(found.seen, found.gaps).delay_quantiles_s[4]
+    assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
 
 @pytest.mark.fault(59)
-def test_the_loss_of_arducopter_s_long_flight_is_the_true_one() -> None:
+def test_the_loss_of_arducopter_s_long_flight_is_also_the_one_the_rig_was_told() -> None:
+    """On the mean of a long flight; the other four met fewer bursts, by their frames as well."""
     assert link(WIND).loss == pytest.approx(0.3, abs=0.02)
 
 
