@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -32,10 +33,11 @@ from report_rig import words_of
 
 from uavctl.config import load_config
 from uavctl.data import ControlMode, Decision, Event
+from uavctl.identify.dead_time import choose_dead_time
 from uavctl.identify.exchange import Exchange
 from uavctl.identify.link_fit import LinkFit, fit_link
 from uavctl.identify.recorded import History, from_tlog
-from uavctl.identify.result import identify
+from uavctl.identify.result import flown_stretches, identify, kinds_of
 from uavctl.mavlink.clocksync import RoundTrips
 
 GPS, VICON, OFFBOARD = OF_OTHERS
@@ -269,6 +271,52 @@ def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> No
     assert together_s == pytest.approx([0.24, 0.32], abs=0.09)
     assert [one.drag_1ps for one in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
     assert [one.r2 > 0.99 for one in found.response[:2]] == [True, True]
+
+
+STEP_RAMP_S = 1.0 / 5.0  # which ArduPilot makes of a step of 1 m/s² at PSC_JERK_XY 5
+GRID_S = 0.02  # of the dead times, and of the lags, of the fit to the simulator's log
+
+
+def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
+    """By its log, per step as sent: dead time and lag 0.18 s, gain 1.027 and 1.026, drag 0.009 and 0.011 1/s.
+
+    That fit takes half of a step's ramp for dead time, and knows the true velocity. Ours knows the ramp, and sees what
+    the vehicle's estimator says, which is later than the truth.
+    """
+    config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
+    boot_ns, estimates = _own_estimates(GPS)
+    steps = from_tlog([one for one in packets(GPS) if one.at_ns < boot_ns + 87.4e9], config)
+    flown = flown_stretches(steps, config)
+    found = choose_dead_time(flown, (0, 1), kinds_of(steps, config)[0][:2], lambda: None)
+    assert found.name == "drag-lag" and sum(one.length_s for one in flown) > 30.0
+    for axis, gain, drag_1ps in ((0, 1.027, 0.009), (1, 1.026, 0.011)):
+        fit = found.fits[axis]
+        late_s = _lateness_s(estimates, axis, (55.4, 71.4) if axis == 0 else (71.4, 87.4))
+        assert 0.0 < late_s < 0.06
+        as_sent_s = found.dead_time_s + fit.value("lag_s") + 0.5 * STEP_RAMP_S - late_s
+        assert as_sent_s == pytest.approx(0.18, abs=GRID_S)
+        assert fit.value("gain") == pytest.approx(gain, abs=0.02)
+        assert fit.value("drag_1ps") == pytest.approx(drag_1ps, abs=0.01)
+
+
+def _own_estimates(name: str) -> tuple[int, NDArray[np.float64]]:
+    """When the autopilot booted [ns], and rows of its own estimate: time since then [s], position [m]."""
+    boot_ns, rows = 0, []
+    for one in packets(name):
+        if not one.outgoing and one.data[7:10] == b"\x20\x00\x00":  # LOCAL_POSITION_NED, zeros at its end cut
+            boot_ms, *position_m = struct.unpack("<I3f", one.data[10:-2].ljust(16, b"\0")[:16])
+            boot_ns = boot_ns or one.at_ns - 1_000_000 * boot_ms
+            rows.append((boot_ms * 1e-3, *position_m))
+    return boot_ns, np.array(rows)
+
+
+def _lateness_s(estimates: NDArray[np.float64], axis: int, span_s: tuple[float, float]) -> float:
+    """By how much an estimate is later than the truth, where both are most alike [s]."""
+    rows = truth(GPS_TRUTH)
+    part = estimates[(estimates[:, 0] > span_s[0]) & (estimates[:, 0] < span_s[1])]
+    tried_s = np.arange(-0.1, 0.2, 0.005)
+    apart = [part[:, 1 + axis] - np.interp(part[:, 0] - one, rows[:, 0], rows[:, 1 + axis]) for one in tried_s]
+    return float(tried_s[np.argmin(np.std(apart, axis=1))])
 
 
 # --- check -------------------------------------------------------------------------------------------------------
