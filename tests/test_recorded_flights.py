@@ -39,6 +39,7 @@ from uavctl.identify.link_fit import LinkFit, fit_link
 from uavctl.identify.recorded import History, from_tlog
 from uavctl.identify.result import flown_stretches, identify, kinds_of
 from uavctl.mavlink.clocksync import RoundTrips
+from uavctl.trial.room import room_of
 
 GPS, VICON, OFFBOARD = OF_OTHERS
 WIND, PILOT, BLOWN, RELEASED, WAYPOINTS = RELAYED
@@ -326,7 +327,14 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 
 @pytest.mark.parametrize(
     ("name", "since_s", "seconds"),
-    [(AT_REST, 0.0, 3.4), (WAYPOINTS, 10.0, 10.0), (BLOWN, 10.0, 10.0), (PILOT, 20.0, 10.0)],
+    [
+        (AT_REST, 0.0, 3.4),
+        (WAYPOINTS, 10.0, 10.0),
+        (BLOWN, 10.0, 10.0),
+        (PILOT, 20.0, 10.0),
+        (WIND, 25.0, 10.0),
+        (RELEASED, 10.0, 10.0),
+    ],
 )
 def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
     name: str, since_s: float, seconds: float
@@ -335,6 +343,71 @@ def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
     assert [one for one, state in items.items() if state == BAD] == []
     assert items["own position"] == GOOD
     assert items["position loss"] == GOOD
+    assert items["position in the room"] == GOOD
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds", "noted", "good"),
+    [
+        (
+            GPS,  # "EKF3 IMU0 is using GPS" comes 41.5 s after the boot: before, it sends no position
+            42.0,
+            ["GUID_TIMEOUT", "EK3_SRC1_POSXY"],
+            ["GUID_OPTIONS", "EK3_SRC1_YAW", "FS_EKF_ACTION", "FS_EKF_THRESH", "position age"],
+        ),
+        (
+            VICON,  # 25 to 142 ms late, while the preset counts on 30 to 70
+            20.0,
+            ["GUID_TIMEOUT", "position age", "source clock"],
+            ["EK3_SRC1_POSXY", "EK3_SRC1_POSZ", "EK3_SRC1_YAW", "VISO_TYPE", "own position", "FS_EKF_THRESH"],
+        ),
+        (OFFBOARD, 8.0, ["MIS_TAKEOFF_ALT"], ["COM_OF_LOSS_T", "COM_OBL_RC_ACT", "position noise"]),
+    ],
+)
+def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_up(
+    name: str, seconds: float, noted: list[str], good: list[str]
+) -> None:
+    """At rest before the flight. TIMESYNC is noted of each: it was the other client's that was answered."""
+    items = checked(name, 0.0, seconds)
+    assert [one for one, state in items.items() if state == BAD] == []
+    assert {one: items[one] for one in noted} == dict.fromkeys(noted, NOTE)
+    assert {one: items[one] for one in good} == dict.fromkeys(good, GOOD)
+    standing = ["vehicle", "armed", "landed", "position rate", "position loss", "position in the room"]
+    assert {one: items[one] for one in standing} == dict.fromkeys(standing, GOOD)
+    assert items["vehicle clock"] == NOTE
+
+
+@pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
+def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
+    """Both took off to 5 m."""
+    lower, _ = room_of(config_of(name))
+    assert lower[2] > -5.0
+    items = checked(name, since_s, 10.0)
+    assert [one for one, state in items.items() if state == BAD] == ["position in the room"]
+    assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
+
+
+@pytest.mark.parametrize(("name", "since_s"), [(VICON, 84.0), (WIND, 44.0)])
+def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_s: float) -> None:
+    """VICON's for good, 86.4 s after the boot, WIND's for the 4 s that were ordered."""
+    items = checked(name, since_s, 8.0)
+    assert items["longest gap"] == BAD
+    assert items["position in the room"] == GOOD
+
+
+def test_a_link_that_loses_half_of_the_positions_is_told_at_rest() -> None:
+    """In the first 3 s of WIND its bursts took more than half of the frames."""
+    stamps_s = frames(WIND).stamps_s
+    assert np.count_nonzero((stamps_s > 0.0) & (stamps_s < 3.0)) < 0.5 * 3.0 * CAMERA_HZ
+    assert checked(WIND, 0.0, 3.0)["position loss"] == BAD
+
+
+def test_a_px4_whose_position_is_not_valid_yet_is_not_called_bad() -> None:
+    """RELEASED arms at 1.77 s and takes until 3.2 s to have one: then the origins are compared, before nothing is."""
+    before, after = checked(RELEASED, 0.0, 1.6), checked(RELEASED, 2.0, 1.6)
+    assert (before["own position"], after["own position"]) == ("undetermined", GOOD)
+    assert (before["armed"], after["armed"]) == (GOOD, NOTE)
+    assert BAD not in (*before.values(), *after.values())
 
 
 def test_a_px4_at_rest_has_a_position_of_its_own() -> None:
