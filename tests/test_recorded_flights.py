@@ -19,9 +19,11 @@ from recorded_rig import (
     OF_OTHERS,
     OWN_ESTIMATE,
     RELAYED,
+    Listened,
     checked,
     config_of,
     events,
+    listened,
     packets,
     page_of,
     seen_s,
@@ -32,7 +34,7 @@ from recorded_rig import (
 from report_rig import words_of
 
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Decision, Event
+from uavctl.data import Command, ControlMode, Decision, Event, Order
 from uavctl.identify.dead_time import choose_dead_time
 from uavctl.identify.exchange import Exchange
 from uavctl.identify.link_fit import LinkFit, fit_link
@@ -441,17 +443,6 @@ def _pilot(memory: Memory) -> None:
     assert any("-> released (LOITER" in text for text in told(memory))
 
 
-def _released(memory: Memory) -> None:
-    assert told(memory)[0].startswith("waiting -> ready")
-    assert not any("failed" in text for text in told(memory))
-
-
-def _wind(memory: Memory) -> None:
-    found = codes(memory)
-    assert "fallback-land" in found
-    assert any("engaged -> landing" in text for text in told(memory))
-
-
 def _rest(memory: Memory) -> None:
     assert "vehicle-reboot" not in codes(memory)
     assert any("REJECTED" in event.text for event in memory.of(Event))
@@ -481,8 +472,6 @@ def _landed(memory: Memory) -> None:
     [
         (WIND, 40.0, 12.0, _lost, "positions did not come back"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),
-        (BLOWN, 50.0, 12.0, _wind, "landing"),
-        (RELEASED, 0.0, 20.0, _released, "ready"),
         (WAYPOINTS, 68.0, 14.0, _land, "AUTO.LAND"),
         (AT_REST, 0.0, 4.0, _rest, "REJECTED"),
         (VICON, 80.0, 26.0, _failsafe, "EKF Failsafe"),
@@ -499,6 +488,74 @@ def test_the_page_of_each_says_what_matters(
     page = words_of(page_of(memory))
     assert on_the_page in " ".join(page.text)
     assert page.plots
+
+
+def times_s(heard: Listened, begin: str, code: str = "hand-over") -> list[float]:
+    """When events of a code came whose texts begin so, since the first packet [s]."""
+    found = heard.memory.of(Event)
+    return [heard.since_s(one.at_ns) for one in found if one.code == code and one.text.startswith(begin)]
+
+
+def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_out_of_the_room() -> None:
+    """The real flight stayed in mode `track`, without a word, until it was 24 m outside."""
+    heard = listened(BLOWN, 50.0, 12.0)
+    ordered_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0]
+    (noticed_s,) = times_s(heard, "", "envelope-response")
+    assert noticed_s == pytest.approx(57.65, abs=0.01)
+    assert noticed_s - ordered_s == pytest.approx(0.95, abs=0.1)
+    (landing_s,) = times_s(heard, "engaged -> landing")
+    assert 0.0 < landing_s - noticed_s < 0.11
+    assert codes(heard.memory).index("envelope-response") < codes(heard.memory).index("fallback-land")
+
+    # What the console, the exit code and the page say of it: the reason is the envelope's own.
+    (reason,) = [one.text for one in heard.memory.of(Event) if one.code == "envelope-response"]
+    assert heard.loop.let_go == reason and reason in heard.loop.ending.sentence
+    assert heard.loop.ending.exit_code == 1
+    assert [one.text for one in heard.loop.notices if "engaged -> landing" in one.text]
+    assert "bias-at-bound" in [one.code for one in heard.loop.news]
+    assert reason in " ".join(words_of(page_of(heard.memory)).text)
+
+    rows = truth(BLOWN)
+    where_m = np.array([np.interp(noticed_s, rows[:, 0], rows[:, 1 + axis]) for axis in range(2)])
+    furthest_m = np.abs(rows[:, 1:3]).max()
+    assert np.all(np.abs(where_m) < (3.0, 2.5)) and furthest_m > 20.0
+
+
+def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
+    """In 25 s of hovering, and from the blackout's end to the order of the wind."""
+    for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
+        heard = listened(BLOWN, since_s, seconds)
+        assert not heard.loop.let_go and not heard.loop.notices
+        assert not [code for code in codes(heard.memory) if code.startswith(("envelope", "fallback"))]
+
+
+def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_time() -> None:
+    """Its client had let go for good in the climb, so OFFBOARD is waited for until the operator's order."""
+    patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")
+    take_off, engage = Command(order=Order.TAKE_OFF, height_m=1.2), Command(order=Order.ENGAGE)
+    ordered_s = seen_s(RELEASED, "ORDER mark engage")[0]
+    heard = listened(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
+    pilot_s = seen_s(RELEASED, "MODE 3/0")
+    passages = {
+        "climbing -> failsafe (AUTO.LAND": seen_s(RELEASED, "MODE 4/6"),
+        "failsafe -> climbing (AUTO.TAKEOFF": seen_s(RELEASED, "MODE 4/2")[1:],
+        "engaging -> released (POSCTL": pilot_s[:1],
+        "released -> returning (POSCTL": [ordered_s],
+        "returning -> engaged": seen_s(RELEASED, "MODE 6/0"),
+        "landing -> released (POSCTL": pilot_s[1:],
+    }
+    for begin, at_s in passages.items():
+        assert times_s(heard, begin) == pytest.approx(at_s, abs=0.15), begin
+    # The vehicle took the order: it is to the pilot, at 62.4 s, that it refuses OFFBOARD, on his own connection.
+    answers_s = times_s(heard, "DO_SET_MODE: ACCEPTED", "command-ack")
+    assert ordered_s < answers_s[-1] < ordered_s + 0.5
+    assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
+    assert not any("REJECTED" in one.text or "DENIED" in one.text for one in heard.memory.of(Event))
+
+    noticed = " ".join(one.text for one in heard.loop.notices)
+    assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
+    on_the_page = " ".join(words_of(page_of(heard.memory)).text)
+    assert all(begin in on_the_page for begin in passages)
 
 
 def test_stamps_of_the_recordings_never_go_back() -> None:
