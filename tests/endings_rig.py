@@ -5,16 +5,20 @@ from __future__ import annotations
 import html
 import json
 import re
+import select
 import signal
 import socket
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import LIMIT_S
 from recording_fakes import Disk
 from sim_rig import decode
 
@@ -25,12 +29,13 @@ from logs.recorder import SyncRecorder
 from logs.summary import summarise
 from sim.peers import Peers
 from sim.personality import PERSONALITIES
-from uavctl.cli import fly_cmd
+from uavctl import control_socket
+from uavctl.cli import fly_cmd, tune_flight
 from uavctl.cli.app import run
 from uavctl.clock import Ticker
 from uavctl.config import load_config
 from uavctl.daemon import fly
-from uavctl.data import Ending
+from uavctl.data import Ending, RelayStats
 from uavctl.health import HealthWatch
 from uavctl.lock import lock_paths
 from uavctl.loop import ControlLoop
@@ -78,6 +83,7 @@ class Line:
         return taken
 
     def send(self, data: bytes) -> None:
+        self._rig.sent.append((self._rig.now_ns, data))
         if self._rig.hears(data):
             self._rig.peers.receive(self._name, data, self._rig.now_ns)
 
@@ -107,19 +113,32 @@ class Endings:
     Attributes:
         hears: Whether the vehicle hears a datagram of ours.
         told: Whether we hear one of the vehicle's.
+        sent: Each datagram of ours, with its time.
         steps: (when, what) in their order.
+        statuses: What `uavctl ctl status --json` has answered.
     """
 
-    def __init__(self, folder: Path, *overrides: str, airborne: bool = False, peers: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *overrides: str,
+        airborne: bool = False,
+        peers: tuple[str, ...] = (),
+        preset: str = "room-hahn-stursberg",
+    ) -> None:
         self.overrides = (*(() if airborne else ON_THE_FLOOR), *overrides)
         settings = [*self.overrides, 'solver.method="exact"', *peers]
-        self.config = load_config("room-hahn-stursberg", settings)
+        self.config = load_config(preset, settings)
         self.folder, self.now_ns = folder, BEGUN_NS
         self.peers = Peers(self.config, BEGUN_NS, airborne=airborne)
         self.lines = {"vehicle": Line(self, "vehicle"), "mocap": Line(self, "mocap")}
         self.hears: Callable[[bytes], bool] = lambda data: True
         self.told: Callable[[bytes], bool] = lambda data: True
+        self.sent: list[tuple[int, bytes]] = []
         self.steps: list[Step] = []
+        self.statuses: list[dict[str, Any]] = []
+        self.listener: socket.socket | None = None
+        self._asking: list[subprocess.Popen[str]] = []
         self.loop: ControlLoop | None = None
         self.watch: HealthWatch | None = None
         self.notified: list[str] = []
@@ -155,11 +174,28 @@ class Endings:
         self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND, do))
         return self
 
+    def ask_status(self) -> None:
+        """Ask the daemon as an operator does, in a process beside it; its answer comes with one of the next ticks."""
+        assert self.listener is not None
+        folder = Path(self.listener.getsockname()).parent
+        words = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
+        self._asking.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        assert select.select([self.listener], [], [], LIMIT_S)[0], "nobody has asked"
+
+    def _take_answers(self) -> None:
+        for process in list(self._asking):
+            with suppress(subprocess.TimeoutExpired):
+                out, _ = process.communicate(timeout=0.02)  # time stands still meanwhile, for it and the flight
+                self._asking.remove(process)
+                assert process.returncode == 0
+                self.statuses.append(json.loads(out))
+
     # Time
 
     def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
         assert self.now_ns < LONGEST_S * SECOND, "the flight does not end"
         self.now_ns = max(self.now_ns, deadline_ns)
+        self._take_answers()
         while self.steps and self.steps[0][0](self):
             self.steps.pop(0)[1](self)
         if self.now_ns > self.peers.now_ns:
@@ -179,6 +215,11 @@ def interrupt(rig: Endings) -> None:
     signal.raise_signal(signal.SIGINT)
 
 
+def words_of(page: Path) -> str:
+    """The text of a page."""
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.read_text())).split())
+
+
 class Told:
     """How a flight ended, as every place tells it."""
 
@@ -190,8 +231,10 @@ class Told:
         self.records = [record for _, _, record in read(self.path)]
         self.recorded = [one for one in self.records if isinstance(one, Ending)]
         page = self.path.with_suffix(".html")
-        self.page = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.read_text())).split()) if page.exists() else ""
-        self.status = "" if rig.watch is None else rig.watch.look().ending
+        self.page = words_of(page) if page.exists() else ""
+        health = None if rig.watch is None else rig.watch.look()
+        self.status = "" if health is None else health.ending
+        self.relay = None if health is None else health.relay
         self.notified = rig.notified
 
     @property
@@ -205,12 +248,27 @@ class Told:
         assert f"ended: {sentence}" in self.console
         assert self.status == sentence
         assert self.notified[-1] == f"ended: {sentence}"
+        self._agrees_on_the_relay()
         assert self.page.count(sentence) == 2  # first of what happened, and in the table
         assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
         assert self.ending["cause"] == self.summary["ended"]
         assert [one.sentence for one in self.recorded] == [sentence]
         again = summarise(FlightData.from_records(read(self.path)), wall_s=None)
         assert (again.ending.sentence, again.ending.exit_code) == (sentence, self.code)
+
+    def _agrees_on_the_relay(self) -> None:
+        """The positions for the vehicle are counted alike in status, summary, recording and on the page."""
+        (recorded,) = self.recorded
+        assert recorded.relay == self.ending["relay"]
+        assert (self.relay is not None) == bool(recorded.relay)
+        if self.relay is None:
+            return
+        count, kept = self.relay.sent, sum(self.relay.kept.values())
+        assert [int(one) for one in re.findall(r"\d+(?= positions| back)", recorded.relay)] == [count, kept]
+        assert self.relay.last_s is not None and self.relay.last_s < 5.0
+        stats = [one for one in self.records if isinstance(one, RelayStats)]
+        assert stats and stats[-1].sent <= count and stats[-1].alone == self.relay.alone
+        assert f"relay: {recorded.relay}" in self.console and recorded.relay in self.page
 
 
 @contextmanager
@@ -226,11 +284,19 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
             super().__init__(*given)
             rig.watch = self
 
+    @contextmanager
+    def listening(*given: Any) -> Iterator[socket.socket]:
+        with control_socket.listening(*given) as rig.listener:
+            yield rig.listener
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fly_cmd, "connected", connected)
+        for module in (fly_cmd, tune_flight):
+            patch.setattr(module, "connected", connected)
+            patch.setattr(module, "monotonic_ns", lambda: rig.now_ns)
+        patch.setattr(tune_flight, "wait", rig.wait)
+        patch.setattr(fly_cmd, "listening", listening)
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
-        patch.setattr(fly_cmd, "monotonic_ns", lambda: rig.now_ns)
         patch.setattr(fly_cmd, "Recorder", Sync)
         patch.setattr(fly_cmd, "checked_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.operation.HealthWatch", Watched)

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
-from endings_rig import TAKE_OFF, Endings, Sync, Told, flown, interrupt, is_a
+from endings_rig import PRESET, TAKE_OFF, Endings, Sync, Told, flown, interrupt, is_a, words_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from logs import report
+from logs.flight_data import FlightData
+from logs.reader import read
+from logs.summary import summarise
 from sim.personality import FAILED, PERSONALITIES, Role
 from uavctl import loop as control
+from uavctl.cli import flying
+from uavctl.cli.app import run
 from uavctl.data import Command, Order
 from uavctl.ending import Cause, FlightCourse, make_ending
 from uavctl.lock import sole_daemon
@@ -223,6 +232,15 @@ def test_the_fallback_lands_it(tmp_path: Path, typed: Type) -> None:
     assert "age of information" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.parametrize("words", [TAKE_OFF, ()])
+def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
+    # The cameras take another body for ours: its positions are not believed, and ours do not come back.
+    swapped = 'sim.fault=[{at_s=9.0,kind="swapped",for_s=100.0}]'
+    rig = Endings(tmp_path, "fallback.land=false", swapped, airborne=not words)
+    told = typed(rig, Cause.FALLBACK_STOPPED, *words)
+    assert "jumped" in told.ending["sentence"]
+
+
 def test_landing_fails(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=6.0").at(State.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
@@ -302,6 +320,31 @@ def test_the_controller_fails_and_the_relay_goes_on(
     assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
     assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console
     assert told.ending["relay"] in told.page
+    assert told.relay is not None and told.relay.alone
+
+
+def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
+    rig.at(State.ENGAGED, Endings.ask_status, after_s=1.0).at(State.ENGAGED, stick("POSCTL"), after_s=2.0)
+    rig.at(State.RELEASED, interrupt, after_s=1.0).at(State.RELEASED, Endings.ask_status, after_s=3.0)
+    rig.at(State.RELEASED, stick("AUTO.LAND"), after_s=5.0).at(State.RELEASED, Endings.ask_status, after_s=6.0)
+    told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
+    flying, alone, landing = rig.statuses
+    assert (flying["ending"], flying["relay"]["alone"]) == ("", False)
+    assert flying["relay"]["sent"] < alone["relay"]["sent"] < landing["relay"]["sent"]
+    for one, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
+        assert one["relay"]["alone"] and one["relay"]["sent_hz"] > 0.0 and one["relay"]["last_s"] < 3.0
+        assert one["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in one["ending"]
+        assert one["who_flies"] == State.RELEASED
+    assert told.relay is not None and told.relay.alone
+
+
+def test_the_operator_is_answered_with_the_end_that_is_under_way(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(State.ENGAGED, interrupt, after_s=2.0).at(State.LANDING, Endings.ask_status, after_s=0.5)
+    typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    (status,) = rig.statuses
+    assert status["ending"].lower().startswith(Cause.OPERATOR) and "in the air" in status["ending"]
+    assert status["who_flies"] in (State.LANDING, State.SETTLING) and status["relay"] is None
 
 
 # Ends that leave less behind
@@ -314,6 +357,10 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
     assert (recorded.cause, recorded.exit_code) == (Cause.SIGNALLED, 130)
     assert told.code == 130 and f"ended: {recorded.sentence}" in told.console and told.status == recorded.sentence
     assert "in the air" in recorded.sentence
+    page = told.path.with_name("again.html")
+    code = run(["log", "report", str(told.path), "--out", str(page)])
+    capsys.readouterr()
+    assert code == 0 and words_of(page).count(recorded.sentence) == 2
 
 
 def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
@@ -332,6 +379,44 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
 
 
 # What the daemon has no part in
+
+
+def test_an_end_that_is_cut_off_is_told_everywhere(
+    tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
+    monkeypatch.setattr(flying, "LANDING_S", 1.0)
+    rig = Endings(tmp_path, airborne=True).at(State.ENGAGED, deafen("COMMAND_LONG"))
+    told = typed(rig.at(State.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
+    assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
+
+
+def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["loopback", *PRESET, "--duration", "4", "--out", str(tmp_path), "--json"]
+    code = run(arguments)
+    out, err = capsys.readouterr()
+    ending, path = json.loads(out)["ending"], tmp_path / "flight.mcap"
+    assert (code, ending["cause"], ending["exit_code"]) == (0, Cause.IN_FLIGHT, 0)
+    assert f"ended: {ending['sentence']}" in " ".join(err.split())
+    assert words_of(path.with_suffix(".html")).count(ending["sentence"]) == 2
+    flight = FlightData.from_records(read(path))
+    assert [msgspec.to_builtins(one) for one in flight.endings] == [ending]
+    assert summarise(flight, wall_s=None).ending.sentence == ending["sentence"]
+
+
+def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # As an older daemon left it: nobody flew the vehicle, and there is no last word.
+    path = flown(Endings(tmp_path).after(4.0, interrupt), capsys).path
+    flight = replace(FlightData.from_records(read(path), path), endings=())
+    summary = summarise(flight, wall_s=None)
+    report.write_report(flight, summary, tmp_path / "again.html")
+    assert (summary.ending.cause, summary.ending.as_ordered, summary.ending.exit_code) == (Cause.WAITING, False, 1)
+    assert summary.ended == Cause.WAITING
+    assert words_of(tmp_path / "again.html").count(summary.ending.sentence) == 2
 
 
 def test_an_end_that_was_cut_off_says_so() -> None:

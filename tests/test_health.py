@@ -6,10 +6,11 @@ import msgspec
 from loopback_rig import Memory, make_loop
 
 from sim.peers import Peers
+from uavctl.cli.ctl_cmd import _relay
 from uavctl.clock import Due
 from uavctl.config import load_config
 from uavctl.data import ControlMode
-from uavctl.health import Health, HealthWatch, RecorderHealth, line
+from uavctl.health import Health, HealthWatch, RecorderHealth, RelayHealth, line
 
 TICK_NS = 50_000_000
 
@@ -103,3 +104,20 @@ def test_a_disk_that_gets_low_is_told_once_in_a_line_of_its_own() -> None:
         "recording is well again",
     ]
     assert any(one.endswith("dropped 0 (800 bytes free)") for one in flight.lines)
+
+
+def test_a_relay_that_goes_on_alone_is_told_apart() -> None:
+    relay = RelayHealth(sent=90, sent_hz=30.0, kept={}, last_s=0.1, alone=False)
+    health = msgspec.structs.replace(Flight().watch.look(), relay=relay)
+    alone = msgspec.structs.replace(health, relay=msgspec.structs.replace(relay, alone=True))
+    without = msgspec.structs.replace(health, relay=None)
+    fields = [line(one).split("  ") for one in (health, alone, without)]
+    assert "relay 30 /s" in fields[0] and "relay 30 /s alone" in fields[1]
+    assert not any(one.startswith("relay") for one in fields[2])
+
+
+def test_the_operator_is_told_a_relay_that_goes_on_alone() -> None:
+    relay = RelayHealth(sent=90, sent_hz=30.0, kept={}, last_s=0.1, alone=False)
+    both = _relay(relay)
+    alone = _relay(msgspec.structs.replace(relay, alone=True))
+    assert alone != both and alone.startswith(both)
