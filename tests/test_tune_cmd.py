@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,9 +15,22 @@ from tune_rig import BOX, START, short_flights, typed, words
 from logs.reader import header, segment_files
 from uavctl.cli import loopback_cmd, tune_cmd
 from uavctl.cli.app import run
+from uavctl.cli.tune_flight import left_whole
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
+from uavctl.tune.excitation import parse_box
+from uavctl.tune.run_folder import (
+    AFTER,
+    BEFORE,
+    FIT_PAGE,
+    PAGE,
+    SETTINGS,
+    STATE,
+    TUNED,
+    TuneAsked,
+    TuneFolder,
+    sole_run,
+)
 
 PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
@@ -162,6 +176,10 @@ def test_a_recording_takes_the_place_of_the_first_flight(
         ((BOX, "--loopback"), "sim.start_position_m"),
         ((BOX, "--loopback", "--arm", "--takeoff", "0.2", "--set", START), "--takeoff"),
         (("--box=-9,-1,-2,9,1,-0.4", "--loopback"), "north"),
+        (("--box=nan,-1,-2,1,1,-0.4", "--loopback"), "--box=nan"),
+        (("--box=inf,-1,-2,1,1,-0.4", "--loopback"), "--box=inf"),
+        (("--box=1,-1,-2,1,1", "--loopback"), "--box=1"),
+        ((BOX, "--loopback", "--arm", "--takeoff", "nan", "--set", START), "--takeoff"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_made(
@@ -178,3 +196,152 @@ def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     asked = iter(["", "\n"])
     monkeypatch.setattr("sys.stdin.readline", lambda: next(asked), raising=False)
     assert [tune_cmd.agreed(), tune_cmd.agreed()] == [False, True]
+
+
+# What a careless user does
+
+
+@pytest.fixture
+def copy(done: Path, tmp_path: Path) -> Callable[..., Path]:
+    """The run as it was before some of its steps were noted."""
+
+    def make(**noted: object) -> Path:
+        folder = tmp_path / "copy"
+        shutil.copytree(done, folder)
+        state = json.loads((folder / STATE).read_text())
+        (folder / STATE).write_text(json.dumps({**state, "comparison": None, **noted}))
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown"))
+
+
+def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, str]:
+    """The same command on a folder."""
+    with short_flights():
+        return typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000", "--json"))
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_them(
+    copy: Callable[..., Path], done: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copy(before="", after="", tuned=None)
+    code, out, _ = again(capsys, folder)
+    document = json.loads(out)
+    assert (code, document["stopped"]) == (0, "")
+    there = json.loads((done / STATE).read_text())
+    assert (document["before"], document["after"]) == (there["before"], there["after"])
+    assert document["comparison"]["new_errors"] == there["comparison"]["new_errors"]
+
+
+def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(done: Path, tmp_path: Path) -> None:
+    config = parse(header(done / BEFORE / "flight.mcap").config_toml, "before").config
+    assert left_whole(config, done / BEFORE) == done / BEFORE / "flight.mcap"
+    assert left_whole(config, done / AFTER) is None and left_whole(config, tmp_path) is None
+    (tmp_path / "flight.mcap").write_bytes((done / BEFORE / "flight.mcap").read_bytes())  # its first file alone
+    assert left_whole(config, tmp_path) is None
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_tuned_configuration_that_was_cut_is_not_flown(
+    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copy(after="")
+    lines = (folder / TUNED).read_text().splitlines(keepends=True)
+    cut = "".join(lines[: len(lines) // 2])
+    (folder / TUNED).write_text(cut)
+    code, out, err = again(capsys, folder)
+    assert (code, out) == (2, "") and str(folder / TUNED) in " ".join(err.split())
+    assert (folder / TUNED).read_text() == cut and (folder / AFTER / "flight.mcap").exists()
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_ctrl_c_beside_a_flight_keeps_what_is_done(
+    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = copy(after="", tuned=None)
+    monkeypatch.setattr(tune_cmd, "identify", pressed)
+    code, out, err = again(capsys, folder)
+    document = json.loads(out)
+    assert code == document["exit_code"] == tune_cmd.INTERRUPTED
+    assert document["stopped"] and document["before"] and str(folder) in " ".join(err.split())
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_second_run_in_the_same_folder_is_refused(
+    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copy(after="")
+    stamp = (folder / STATE).read_bytes()
+    with sole_run(folder):
+        code, out, err = again(capsys, folder)
+    assert (code, out) == (2, "") and "--folder" in err
+    assert (folder / STATE).read_bytes() == stamp
+
+
+@pytest.mark.usefixtures("no_flight")
+def test_a_folder_that_takes_no_more_is_told_before_a_flight(
+    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copy(before="", after="", tuned=None)
+    stamp = (folder / STATE).read_bytes()
+    (folder / f"{STATE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
+    code, out, err = again(capsys, folder)
+    assert (code, out) == (1, "") and STATE in err
+    assert (folder / STATE).read_bytes() == stamp
+
+
+def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / f"{STATE}.part").write_text("{")
+    asked = TuneAsked(box="b", flight="", simulated=True, take_off_m=None)
+    TuneFolder.opened(folder, load_config("room"), asked)
+    (folder / SETTINGS).unlink()
+    TuneFolder.opened(folder, load_config("room"), asked)
+    assert (folder / STATE).is_file() and (folder / SETTINGS).is_file()
+
+
+@pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n"])
+def test_what_is_no_flight_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes
+) -> None:
+    flight, folder = tmp_path / "f.mcap", tmp_path / "run"
+    flight.write_bytes(content)
+    code, out, err = typed(capsys, "tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback")
+    assert (code, out) == (1, "") and str(flight) in " ".join(err.split())
+    assert not folder.exists() and flight.read_bytes() == content
+
+
+@pytest.mark.parametrize("below", ["file", "file/run"])
+def test_a_folder_that_cannot_be_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    code, out, err = typed(capsys, *words(tmp_path / below))
+    assert (code, out) == (2, "") and "--folder" in err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_corners_in_any_order_are_one_box() -> None:
+    boxes = [parse_box(text) for text in ("-1,-2,-3,1,2,-0.4", "1,2,-0.4,-1,-2,-3", "1,-2,-0.4,-1,2,-3")]
+    assert boxes[0] == boxes[1] == boxes[2]
+    assert boxes[0].lower == (-1.0, -2.0, -3.0) and boxes[0].upper == (1.0, 2.0, -0.4)
+
+
+def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    with short_flights(steps=1, hold_s=7.5):
+        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot=ardupilot", "--json"))
+    document = json.loads(out)
+    assert (code, document["stopped"]) == (0, "")
+    comparison = document["comparison"]
+    new, old = (comparison[key]["rms_m"] for key in ("new_errors", "old_errors"))
+    assert new[0][3] < 0.9 * old[0][3] and new[1][3] < 0.9 * old[1][3]
+    assert comparison["after"]["beyond_box_m"] < 0.0 and comparison["after"]["hold_s"] > 2.0

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import io
+import json
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+from endings_rig import ON_THE_FLOOR, TAKE_OFF, Endings, in_virtual_time
+from sim_rig import decode
 
 from uavctl.cli.app import run
+from uavctl.lock import lock_paths
 from uavctl.tune import excitation
 
 BOX = "--box=-1.2,-1.1,-2,1.2,1.1,-0.4"
 START = "sim.start_position_m=[0.0,0.0,-1.2]"
+REQUEST_STREAM = 511
+VEHICLE = "udpin://127.0.0.1:1"  # never opened: the connections are the rig's
+FLIES = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET", "COMMAND_LONG", "COMMAND_INT", "SET_MODE"})
 
 
 def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
@@ -28,9 +39,70 @@ def words(folder: Path, *more: str) -> list[str]:
 
 
 @contextmanager
-def short_flights() -> Iterator[None]:
-    """Half of the steps, and a third of the hold: enough to identify, in a third of the time."""
+def short_flights(steps: int = 2, hold_s: float = 8.0) -> Iterator[None]:
+    """Fewer steps, and a third of the hold: enough to identify, in a third of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(excitation, "STEPS", 2)
-        patch.setattr(excitation, "HOLD_S", 8.0)
+        patch.setattr(excitation, "STEPS", steps)
+        patch.setattr(excitation, "HOLD_S", hold_s)
         yield
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What one call of the command left.
+
+    Attributes:
+        code: Its exit code.
+        document: Of `--json`; empty where there was none.
+        told: Standard error.
+        rig: The flight, if there was one.
+        folder: Of the run.
+    """
+
+    code: int
+    document: dict[str, Any]
+    told: str
+    rig: Endings
+    folder: Path
+
+    def flies_after(self, at_ns: int) -> list[str]:
+        """What we sent after a time that makes a vehicle move, or asks it for anything."""
+        found = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
+        asks = [one for one in found if getattr(one, "command", None) != REQUEST_STREAM]
+        return [name for one in asks if (name := one.get_type()) in FLIES]
+
+
+def real_rig(*overrides: str) -> Endings:
+    """The simulated peers behind the connections of a real vehicle."""
+    return Endings(Path(), "sim.plant=quadrotor", *overrides, preset="room")
+
+
+def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseException] = "") -> Tuned:
+    """Type `uavctl tune` of a real vehicle, armed by us; `enter` is what is typed when it asks."""
+
+    def readline() -> str:
+        if isinstance(enter, str):
+            return enter
+        raise enter
+
+    sets = [word for setting in (*ON_THE_FLOOR, "sim.plant=quadrotor") for word in ("--set", setting)]
+    arguments = ["tune", "room", BOX, "--folder", str(folder), "--vehicle", VEHICLE, *sets, *TAKE_OFF, "--json", *more]
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            in_virtual_time(rig),
+            short_flights(steps=1, hold_s=7.5),
+            # A folder with a short name: a socket's path has 107 bytes.
+            tempfile.TemporaryDirectory(prefix="uavctl-") as control,
+            redirect_stdout(out),
+            redirect_stderr(err),
+        ):
+            patch.setenv("UAVCTL_CONTROL", control)
+            patch.setattr("sys.stdin.readline", readline, raising=False)
+            code = run(arguments)
+    finally:
+        for path in lock_paths(VEHICLE):
+            path.unlink(missing_ok=True)
+    text = out.getvalue()
+    return Tuned(code, json.loads(text) if text else {}, err.getvalue(), rig, folder)

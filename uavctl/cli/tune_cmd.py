@@ -20,7 +20,7 @@ from uavctl.build import design_of
 from uavctl.cli.common import HEIGHT_M, SEED, Common, Json, Overrides, can_be_read, located, messages, warn
 from uavctl.cli.engagement import checked_take_off
 from uavctl.cli.identify_cmd import design_doubts, fitting
-from uavctl.cli.tune_flight import TuneEnd, TuneFlown, fly_once, where_it_stands
+from uavctl.cli.tune_flight import TuneEnd, TuneFlown, fly_once, left_whole, where_it_stands
 from uavctl.cli.tune_picture import changes_picture, comparison_picture
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse, parse_toml
@@ -33,7 +33,7 @@ from uavctl.tune.comparison import TuneComparison, figures_of
 from uavctl.tune.excitation import DOWN, SafeBox, check_start, excited, parse_box
 from uavctl.tune.page import write_page
 from uavctl.tune.response import PinnedAxis, PredictionErrors, believed, held_out_errors
-from uavctl.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, TUNED, TuneAsked, TuneFolder
+from uavctl.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, TUNED, TuneAsked, TuneFolder, read_tuned, sole_run
 
 FAILED, INTERRUPTED, PILOT = 1, 130, 4  # exit codes: a flight went otherwise, Ctrl-C, the pilot has the vehicle
 _LEVEL = (0, 1)
@@ -100,8 +100,12 @@ def tune(
         simulated=loopback,
         take_off_m=take_off_m,
     )
-    run = _TuneRun(TuneFolder.opened(folder, loaded.config, asked), loaded.config, made, yes=yes or loopback)
-    code, why = run.go()
+    with sole_run(folder):
+        run = _TuneRun(TuneFolder.opened(folder, loaded.config, asked), loaded.config, made, yes=yes or loopback)
+        try:
+            code, why = run.go()
+        except KeyboardInterrupt:  # beside a flight, which has its own end
+            code, why = INTERRUPTED, "interrupted by the operator"
     if why:
         messages().print(f"[bold yellow]stopped:[/] {escape(why)}", soft_wrap=True)
         messages().print(f"Go on with the same command; what is done stays in {escape(str(folder))}.", soft_wrap=True)
@@ -207,8 +211,8 @@ class _TuneRun:
                 warn(f"{cut}: identified from what comes before")
             self.folder.note(before=str(self._made.flight.absolute()))
             return 0, ""
-        if not self._made.simulated and self._made.box is not None:
-            check_start(self._made.box, where_it_stands(self._config), "where the vehicle stands", _LEVEL)
+        if (done := self._flown_before(self._made.mission, BEFORE)) is not None:
+            return done
         self._say_what_comes("The first flight, with the configuration as it is")
         return self._fly(self._made.mission, BEFORE)
 
@@ -235,9 +239,6 @@ class _TuneRun:
     def _refly(self) -> tuple[int, str]:
         if self.folder.progress.after:
             return self._told("the second flight is there")
-        self._say_what_comes("The second flight: the same mission with the tuned configuration")
-        if not self._yes and not agreed():
-            return INTERRUPTED, "the second flight was not agreed to"
         mission = self._made.mission
         again = msgspec.structs.replace(
             self._tuned(),
@@ -246,6 +247,11 @@ class _TuneRun:
             target=mission.target,
             duration_s=mission.duration_s,
         )
+        if (done := self._flown_before(again, AFTER)) is not None:
+            return done
+        self._say_what_comes("The second flight: the same mission with the tuned configuration")
+        if not self._yes and not agreed():
+            return INTERRUPTED, "the second flight was not agreed to"
         return self._fly(again, AFTER)
 
     def _compare(self) -> tuple[int, str]:
@@ -282,10 +288,20 @@ class _TuneRun:
         return found[0], found[1]
 
     def _tuned(self) -> Config:
-        path = self.folder.path / TUNED
-        return parse(path.read_text(encoding="utf-8"), str(path)).config
+        return read_tuned(self.folder.path / TUNED)
+
+    def _flown_before(self, config: Config, name: str) -> tuple[int, str] | None:
+        """Take up a flight that came to its end when nobody was left to note it; None if there is none."""
+        newest = self.folder.newest(name)
+        recording = None if newest is None else left_whole(config, newest)
+        if recording is None:
+            return None
+        self.folder.note(**{name: self.folder.relative(recording)})
+        return self._told(f"the flight in {newest} came to its end, and counts")
 
     def _fly(self, config: Config, name: str) -> tuple[int, str]:
+        if not self._made.simulated and self._made.box is not None:
+            check_start(self._made.box, where_it_stands(self._config), "where the vehicle stands", _LEVEL)
         flown = fly_once(
             config, self.folder.free(name), simulated=self._made.simulated, take_off_m=self._made.take_off_m
         )

@@ -5,16 +5,19 @@ Every step writes its files first and its note last, so a run that was cut off g
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
 from logs.outputs import write_whole
 from uavctl.config import Config
-from uavctl.config.load import dump_config
+from uavctl.config.load import dump_config, parse
 from uavctl.errors import UsageError
 from uavctl.tune.change import TunedResult
 from uavctl.tune.comparison import TuneComparison
@@ -66,12 +69,12 @@ class TuneFolder:
         text = dump_config(config)
         digest = hashlib.sha256(text.encode()).hexdigest()
         if not (path / STATE).exists():
-            if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            if path.exists() and (not path.is_dir() or any(map(_is_anothers, path.iterdir()))):
                 raise UsageError(f"--folder {path}: is no run of `uavctl tune`, and not empty; choose another folder")
             path.mkdir(parents=True, exist_ok=True)
-            write_whole(path / SETTINGS, text)
             folder = cls(path, TuneProgress(asked=asked, digest=digest))
             folder.note()
+            write_whole(path / SETTINGS, text)
             return folder
         progress = _read(path / STATE)
         if progress.digest != digest:
@@ -85,7 +88,12 @@ class TuneFolder:
             raise UsageError(
                 f"--folder {path}: is a run that was begun with {told}. Go on with the same, or choose another folder"
             )
-        return cls(path, progress)
+        folder = cls(path, progress)
+        if not (path / SETTINGS).exists():
+            write_whole(path / SETTINGS, text)
+        if progress.comparison is None:
+            folder.note()  # a folder that takes no more is told before anything is flown
+        return folder
 
     def note(self, **done: object) -> None:
         """Write down that a step is done.
@@ -98,10 +106,17 @@ class TuneFolder:
 
     def free(self, name: str) -> Path:
         """A folder for one more flight: the first of NAME, NAME-2, NAME-3, … that is not there yet."""
-        number = 1
+        return self._attempts(name)[1]
+
+    def newest(self, name: str) -> Path | None:
+        """The folder of the newest attempt at a flight; None before the first."""
+        return self._attempts(name)[0]
+
+    def _attempts(self, name: str) -> tuple[Path | None, Path]:
+        newest, number = None, 1
         while (found := self.path / (name if number == 1 else f"{name}-{number}")).exists():
-            number += 1
-        return found
+            newest, number = found, number + 1
+        return newest, found
 
     def recording(self, noted: str) -> Path:
         """Path of a recording that the progress names."""
@@ -113,6 +128,57 @@ class TuneFolder:
             return str(recording.relative_to(self.path))
         except ValueError:
             return str(recording.absolute())
+
+
+@contextmanager
+def sole_run(path: Path) -> Iterator[None]:
+    """Hold the folder of a run, which is made if there is none; the kernel lets go of it when its holder ends.
+
+    Raises:
+        UsageError: Another process has it, or it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise UsageError(f"--folder {path}: no folder can be had there ({error.strerror}); choose another") from error
+    try:
+        _lock(descriptor, path)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"--folder {path}: another `uavctl tune` is at work in it; wait for it, or end it") from None
+
+
+def read_tuned(path: Path) -> Config:
+    """The tuned configuration, as it was written or as its owner has changed it since.
+
+    Raises:
+        UsageError: It was cut: what it lacks would be a preset's, and nobody has seen that fly.
+        ConfigError: It is wrong.
+    """
+    text = path.read_text(encoding="utf-8")
+    config = parse(text, str(path)).config
+    there = dict(_dotted(tomllib.loads(text), ""))
+    lacking = [key for key, _ in _dotted(tomllib.loads(dump_config(config)), "") if key not in there]
+    if lacking:
+        more = f" and {len(lacking) - 1} more keys" if len(lacking) > 1 else ""
+        raise UsageError(
+            f"{path}: is not whole, {lacking[0]}{more} are missing; put them back, or remove the file: the same "
+            "command then writes it anew"
+        )
+    return config
+
+
+def _is_anothers(path: Path) -> bool:
+    """Whether a file is none of a run that was cut off while it wrote its first one."""
+    return path.name != f"{STATE}.part"
 
 
 def _read(path: Path) -> TuneProgress:
