@@ -1,0 +1,149 @@
+"""`uavctl tune` of a real vehicle: its own daemon, arming, the pilot's stick and the question, in virtual time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from endings_rig import Endings, interrupt
+from tune_rig import Tuned, fly_real, real_rig
+
+from logs.reader import header
+from uavctl.cli import tune_cmd, tune_flight
+from uavctl.config import load_config
+from uavctl.config.load import parse
+from uavctl.ending import Cause
+from uavctl.errors import NotReachedError, VehicleTakenError
+from uavctl.lock import sole_daemon
+from uavctl.mavlink.mode import State
+from uavctl.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
+
+STICK = "POSCTL"
+
+
+def land(rig: Endings) -> None:
+    """The pilot lands with the stick."""
+    rig.stick("AUTO.LAND")
+
+
+def taken(state: State, after_s: float, folder: Path, *, lands: bool) -> tuple[Tuned, int]:
+    """A call in which the pilot takes over, and lands or leaves the end to the operator; and when we had heard it."""
+    released_ns: list[int] = []
+    rig = real_rig().at(state, lambda one: one.stick(STICK), after_s=after_s)
+    rig.at(State.RELEASED, lambda one: released_ns.append(one.now_ns))
+    rig.at(State.RELEASED, land if lands else interrupt, after_s=2.0)
+    result = fly_real(rig, folder, enter="\n")
+    return result, released_ns[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("real") / "run"
+
+
+@pytest.fixture(scope="module")
+def in_the_climb(folder: Path) -> tuple[Tuned, int]:
+    return taken(State.CLIMBING, 0.6, folder, lands=False)
+
+
+@pytest.fixture(scope="module")
+def under_way(folder: Path, in_the_climb: tuple[Tuned, int]) -> tuple[Tuned, int]:
+    return taken(State.ENGAGED, 8.0, folder, lands=True)
+
+
+@pytest.fixture(scope="module")
+def not_agreed(folder: Path, under_way: tuple[Tuned, int]) -> Tuned:
+    return fly_real(real_rig(), folder, enter="")
+
+
+@pytest.fixture(scope="module")
+def in_the_second(folder: Path, not_agreed: Tuned) -> tuple[Tuned, int]:
+    return taken(State.ENGAGED, 5.0, folder, lands=True)
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path, in_the_second: tuple[Tuned, int]) -> Tuned:
+    return fly_real(real_rig(), folder, "--yes")
+
+
+def recorded(folder: Path, noted: str) -> str:
+    return header(folder / noted / "flight.mcap").config_toml
+
+
+def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, int], folder: Path) -> None:
+    result, since_ns = in_the_climb
+    assert result.code == result.document["exit_code"] == tune_cmd.PILOT
+    assert Cause.PILOT in result.document["stopped"].lower() and result.document["before"] == ""
+    assert not result.flies_after(since_ns)
+    assert (folder / BEFORE / "flight.mcap").exists()
+
+
+def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
+    result, since_ns = under_way
+    assert result.code == result.document["exit_code"] == tune_cmd.PILOT
+    assert Cause.PILOT_LANDED in result.document["stopped"].lower() and result.document["before"] == ""
+    assert result.flies_after(0) and not result.flies_after(since_ns)
+    assert (folder / f"{BEFORE}-2" / "flight.mcap").exists()
+    assert not result.rig.peers.autopilot.pilot.armed
+
+
+def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder: Path) -> None:
+    assert not_agreed.code == not_agreed.document["exit_code"] == tune_cmd.INTERRUPTED
+    assert not_agreed.document["before"] == f"{BEFORE}-3/flight.mcap" and not_agreed.document["after"] == ""
+    assert not_agreed.document["config"] == str(folder / TUNED) and not_agreed.document["stopped"]
+    assert str(folder) in not_agreed.told
+    assert (folder / TUNED).exists() and (folder / FIT_PAGE).exists() and not (folder / AFTER).exists()
+    assert not not_agreed.rig.peers.autopilot.pilot.armed
+
+
+def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
+    stamp = (folder / STATE).read_bytes()
+    again = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
+    assert again.code == again.document["exit_code"] == tune_cmd.INTERRUPTED
+    assert again.document["stopped"] and str(folder) in again.told
+    assert not again.rig.sent and (folder / STATE).read_bytes() == stamp
+
+
+def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[Tuned, int], folder: Path) -> None:
+    result, since_ns = in_the_second
+    assert result.code == result.document["exit_code"] == tune_cmd.PILOT
+    assert result.document["before"] == f"{BEFORE}-3/flight.mcap" and result.document["after"] == ""
+    assert result.flies_after(0) and not result.flies_after(since_ns)
+    assert (folder / AFTER / "flight.mcap").exists() and (folder / TUNED).exists()
+
+
+def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
+    assert (done.code, done.document["stopped"]) == (0, "")
+    assert done.document["after"] == f"{AFTER}-2/flight.mcap" and (folder / PAGE).exists()
+    comparison = done.document["comparison"]
+    assert comparison["new_errors"]["rms_m"][0][3] < comparison["old_errors"]["rms_m"][0][3]
+    assert comparison["after"]["hold_s"] > 2.0 and comparison["after"]["judged_by"] == "estimate"
+    assert not done.rig.peers.autopilot.pilot.armed
+    before, after = (parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE}-3", f"{AFTER}-2"))
+    assert before.mission == after.mission and before.mission.then == "land" and before.plant != after.plant
+
+
+def test_a_vehicle_that_stands_outside_of_the_box_is_not_flown(tmp_path: Path) -> None:
+    result = fly_real(real_rig("sim.start_position_m=[1.9,0.0,-0.7]"), tmp_path / "run")
+    assert result.code == 2 and "north" in result.told and "1.9" in result.told
+    assert not result.flies_after(0) and not (tmp_path / "run" / BEFORE).exists()
+
+
+def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
+    rig = real_rig("link.blackout=[[0.0, 1000.0]]")
+    result = fly_real(rig, tmp_path / "run")
+    assert result.code == NotReachedError.exit_code and "uavctl check" in result.told
+    assert not result.flies_after(0) and rig.now_ns >= tune_flight.LISTENS_S * 1e9
+    assert not (tmp_path / "run" / BEFORE).exists()
+
+
+def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
+    config = load_config("room", ["daemon.vehicle='udpin://127.0.0.1:1'"])
+    with sole_daemon(config.daemon.vehicle), pytest.raises(VehicleTakenError):
+        tune_flight.where_it_stands(config)
+
+
+def test_the_state_is_that_of_the_document(done: Tuned, folder: Path) -> None:
+    state = json.loads((folder / STATE).read_text())
+    assert all(done.document[key] == value for key, value in state.items())
