@@ -127,14 +127,15 @@ def _times(flight: FlightData, key: str, title: str, t_s: Floats, values_us: Flo
         ax = one.axes(title, "time [s]", "duration (log scale)", _DURATIONS_IN)
         ax.set_yscale("log")
         shown_s, shown_us = largest(t_s, np.maximum(values_us, 1.0))
+        low, high = float(shown_us.min()), float(shown_us.max())
+        # Before anything is drawn: one value alone makes limits that a logarithmic axis cannot invert.
+        ax.set_ylim(low / 2, high * 2)
         dots(ax, shown_s, shown_us, "estimate", 2.0)
         p50, p99 = np.percentile(values_us, [50, 99])
         for value, name, side in ((p50, "median", "top"), (p99, "99 %", "bottom")):
             ax.axhline(max(value, 1.0), color=colour("muted"), lw=0.9, ls=DASHED)
             at, off = (1.0, max(value, 1.0)), (-2, -1 if side == "top" else 1)
             ax.annotate(name, at, off, ("axes fraction", "data"), "offset points", va=side, ha="right", bbox=_BEHIND)
-        low, high = float(shown_us.min()), float(shown_us.max())
-        ax.set_ylim(low / 2, high * 2)
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
         ax.yaxis.set_minor_locator(NullLocator())
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value)))
