@@ -104,6 +104,11 @@ class Scene:
     def mode(self) -> str:
         return self.truths[-1].mode if self.truths else ""
 
+    @property
+    def has_landed(self) -> bool:
+        """Whether it has been landing; once disarmed, a PX4 takes up the mode of before."""
+        return any(one.mode == "AUTO.LAND" for one in self.truths)
+
     def wait_on_board(self, seconds: float) -> None:
         """Let some of the vehicle's own time go by."""
         end_ns = self.truths[-1].at_ns + round(seconds * 1e9)

@@ -79,16 +79,20 @@ def fly_true(
     begins_s = min((fault.at_s for fault in config.sim.fault), default=0.0)
     outside_m, speed_mps, moved_m, hold_mps2 = -math.inf, 0.0, 0.0, 0.0
     start: Vec3 | None = None
+    ended = ""
     worlds: list[World] = []
 
     def look(world: World, watch: Watch, at_ns: int) -> None:
-        nonlocal outside_m, speed_mps, moved_m, hold_mps2, start
+        nonlocal outside_m, speed_mps, moved_m, hold_mps2, start, ended
         if not worlds:
             worlds.append(world)
             if not own_motion:
                 silence_motion(world)
         place, decision = world.peers.vehicle.position_m, watch.loop.decision
         outside_m = max(outside_m, beyond_m(config, place))
+        pilot = world.peers.autopilot
+        if pilot.pilot.armed:  # disarmed, a PX4 takes up the mode of before
+            ended = pilot.mode_name
         speed_mps = max(speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
         if at_ns * 1e-9 >= begins_s:
             start = start or place
@@ -98,7 +102,6 @@ def fly_true(
 
     config = replace(config, duration_s=flight_s)
     watch = fly(prepared, config, look, path=path, lands=True)
-    pilot = worlds[0].peers.autopilot
     wrong = list(watch.wrong)
     if outside_m > OUTSIDE_M:
         wrong.append(f"{outside_m:.2f} m outside")
@@ -111,7 +114,7 @@ def fly_true(
         speed_mps=speed_mps,
         moved_m=moved_m,
         hold_mps2=hold_mps2,
-        ended=pilot.mode_name,
+        ended=ended,
         alarms=tuple(watch.alarms),
         wrong=tuple(wrong),
     )

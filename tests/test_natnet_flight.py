@@ -75,7 +75,7 @@ def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
             process.send_signal(signal.SIGINT)
             _, told = process.communicate(timeout=LIMIT_S)
         assert process.returncode == 0, told
-        until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
+        until(lambda: air.has_landed, "the vehicle lands")
         samples = [one for step in records(recording, StepInput) for one in step.samples]
         assert {one.source for one in samples} == {"ODOMETRY 246/197"}
         # The body was where the vehicle went, whatever the clocks say.

@@ -71,7 +71,7 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
         assert air.status()["recorder"]["ok"]
         until(lambda: (air.status()["vehicle"] or {}).get("armed", False), "a vehicle in flight is shown")
         assert air.ctl("land", "--vehicle", name)[0] == 0
-        until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
+        until(lambda: air.has_landed, "the vehicle lands")
         process.communicate(timeout=LIMIT_S)
     ordered = [c.order for i in records(air.folder / "f" / "flight.mcap", StepInput) for c in i.commands]
     assert ordered == [Order.GOTO, Order.LAND]  # what was refused at the socket never reached a tick
@@ -133,7 +133,7 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     last = len(modes) - modes[::-1].index(ControlMode.TRACK)
     assert modes[last:][:3] == [ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND]
     assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
-    until(lambda: air.mode == "AUTO.LAND", "the vehicle lands")
+    until(lambda: air.has_landed, "the vehicle lands")
     spoken = air.tap.spoken_by_now()
     air.wait_on_board(1.0)
     assert air.tap.spoken_by_now() == spoken

@@ -276,6 +276,8 @@ def test_landing_descends_touches_and_disarms(command: str) -> None:
         ("px4", (1, 4, 6), ["Landing detected"], "Disarmed by landing"),
         ("ardupilot", (1, 9, 0), [], "Disarming motors"),
     ):
+        if (autopilot, command) == ("px4", "command"):  # as recorded
+            landed = ["Landing at current position", *landed]
         one = bench(autopilot, "sim.start_velocity_mps=[1.0,-0.5,0.0]")
         assert one.ask(LAND) == 0 if command == "command" else one.ask(SET_MODE, *mode) == 0
         one.wait(2.0)
@@ -297,7 +299,7 @@ def test_setpoints_do_not_stop_a_landing() -> None:
     one.stream(1.0, 0.0, 0.0, 0.0)
     assert one.ask(LAND) == 0
     one.stream(8.0, 0.0, 0.0, -1.0)
-    assert one.texts == ["Landing detected", "Disarmed by landing"]
+    assert one.texts == ["Landing at current position", "Landing detected", "Disarmed by landing"]
 
 
 def test_a_landing_can_be_called_off() -> None:
@@ -344,7 +346,7 @@ def test_without_a_vertical_axis_take_off_and_landing_take_a_fixed_time() -> Non
     assert one.peers.autopilot.mode_name == "AUTO.LOITER"
     assert one.ask(LAND) == 0
     one.wait(4.9)
-    assert one.texts[-1] == "Armed by external command"
+    assert one.texts[-2:] == ["Armed by external command", "Landing at current position"]
     one.wait(2.2)
     assert one.texts[-2:] == ["Landing detected", "Disarmed by landing"]
     assert one.peers.vehicle.velocity_mps == (0.0, 0.0, 0.0)

@@ -21,7 +21,7 @@ def test_one_bad_datagram_does_not_spoil_the_next() -> None:
 def test_two_messages_in_one_datagram_are_both_read() -> None:
     one = bench("px4")
     answers = one.send(one.client.timesync(1) + one.client.command(LAND))
-    assert [msg.get_type() for msg in answers] == ["TIMESYNC", "COMMAND_ACK"]
+    assert [msg.get_type() for msg in answers] == ["TIMESYNC", "COMMAND_ACK", "STATUSTEXT"]
 
 
 def mutants(seed: int, n: int) -> list[bytes]:
