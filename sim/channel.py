@@ -8,13 +8,31 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from sim.spans import within
+from uavctl.config.document import Spans
 from uavctl.config.link import LinkConfig
+
+# Spans of time of a configuration, and which of several times is the next.
+
+
+def within(spans: Spans, since_ns: int) -> bool:
+    """Whether a time since the start [ns] lies in one of the spans [s], their ends included."""
+    return any(begin * 1e9 <= since_ns <= end * 1e9 for begin, end in spans)
+
+
+def earliest(times_ns: Iterable[int | None]) -> int | None:
+    """The first of some times [ns], None for none."""
+    first_ns = None
+    for at_ns in times_ns:
+        if at_ns is not None and (first_ns is None or at_ns < first_ns):
+            first_ns = at_ns
+    return first_ns
+
 
 OVERSIZE_BYTES = 5000
 _TO_DRAW = -1  # no run of losses is under way: the next packet begins one (of 0 or more)
@@ -85,7 +103,6 @@ class Channel(UnderWay):
 
     Args:
         link: The section `[link]`.
-        seed: Of all draws.
         start_ns: Where spans and steps count from [ns].
         step_ns: Δt, the step of `link.probability` [ns].
 

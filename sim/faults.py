@@ -7,15 +7,14 @@ from typing import Literal
 
 import msgspec
 
-from sim.autopilot import Autopilot
-from sim.mocap import AXES, Cameras
-from sim.parameters import Parameters
-from sim.personality import PERSONALITIES
-from sim.quadrotor import Quadrotor
-from sim.spans import within
-from sim.vehicle import Vehicle
+from sim.autopilot.autopilot import Autopilot
+from sim.autopilot.profile import PERSONALITIES, Parameters
+from sim.cameras import AXES, Cameras
+from sim.channel import within
+from sim.vehicle.linear import LinearVehicle
+from sim.vehicle.quadrotor import Quadrotor
+from uavctl.config.document import ConfigProblem
 from uavctl.config.load import find_nearest
-from uavctl.config.problem import Problem
 from uavctl.config.sim import FaultConfig
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
@@ -40,42 +39,37 @@ def with_spans(config: Config) -> Config:
     return replace(config, link=link, sim=replace(config.sim, camera=camera))
 
 
-def problems(autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfig], key: str) -> Iterator[Problem]:
-    """What an autopilot of this kind cannot do of a list of faults: parameters, values and modes that it has not.
-
-    Args:
-        autopilot: the kind.
-        faults: the list.
-        key: key path of the list.
-    """
+def problems(
+    autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfig], key: str
+) -> Iterator[ConfigProblem]:
+    """What an autopilot of this kind cannot do of a list of faults: parameters, values and modes that it has not."""
     parameters, modes = Parameters(autopilot), tuple(mode.name for mode in PERSONALITIES[autopilot].modes)
     for i, fault in enumerate(faults):
         if fault.kind == "frame":
             yield from _unknown(f"{key}[{i}].name", "there are no axes", fault.name, tuple(AXES))
         elif fault.kind == "noise" and not 0.0 <= fault.value <= MOST_NOISE_M:
-            yield Problem(f"{key}[{i}].value", f"{fault.value:g} m is no noise", f"give 0 to {MOST_NOISE_M:g} m")
+            yield ConfigProblem(f"{key}[{i}].value", f"{fault.value:g} m is no noise", f"give 0 to {MOST_NOISE_M:g} m")
         elif fault.kind == "mode":
             yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no mode", fault.name, modes)
         elif fault.kind == "parameter" and fault.name not in parameters:
             yield from _unknown(f"{key}[{i}].name", f"{autopilot} has no parameter", fault.name, parameters.names)
         elif fault.kind == "parameter" and not parameters.takes(fault.name, fault.value):
             few = " or ".join(f"{value:g}" for value in parameters.allowed(fault.name)) or "a number up to 1e9"
-            yield Problem(f"{key}[{i}].value", f"{fault.value:g} is not simulated for {fault.name}", f"give {few}")
+            yield ConfigProblem(
+                f"{key}[{i}].value", f"{fault.value:g} is not simulated for {fault.name}", f"give {few}"
+            )
 
 
-def _unknown(key: str, what: str, name: str, names: Sequence[str]) -> Iterator[Problem]:
+def _unknown(key: str, what: str, name: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
     if name and name not in names:
         nearest = find_nearest(name, names)
-        yield Problem(key, f'{what} "{name}"{nearest}', "rename it" if nearest else f"give one of {', '.join(names)}")
+        yield ConfigProblem(
+            key, f'{what} "{name}"{nearest}', "rename it" if nearest else f"give one of {', '.join(names)}"
+        )
 
 
 def active(config: Config, since_ns: int) -> tuple[str, ...]:
-    """What is amiss at a time since the start [ns]: the spans that it lies in, and the changes made by then.
-
-    Args:
-        config: as `with_spans` gives it.
-        since_ns: the time.
-    """
+    """What is amiss at a time since the start [ns]: the spans that it lies in, and the changes made by then."""
     sections = ((config.link, OF_LINK), (config.sim.camera, OF_CAMERA))
     spans = [name for section, names in sections for name in names if within(getattr(section, name), since_ns)]
     made = [one for one in config.sim.fault if one.at_s * 1e9 <= since_ns]
@@ -95,7 +89,7 @@ class Faults:
     """
 
     def __init__(
-        self, config: Config, vehicle: Vehicle | Quadrotor, autopilot: Autopilot, cameras: Cameras, start_ns: int
+        self, config: Config, vehicle: LinearVehicle | Quadrotor, autopilot: Autopilot, cameras: Cameras, start_ns: int
     ) -> None:
         wrong = tuple(problems(config.sim.autopilot, config.sim.fault, "sim.fault"))
         if wrong:

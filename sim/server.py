@@ -1,4 +1,4 @@
-"""The simulated peers on real sockets, in real time or a multiple of it."""
+"""The simulation on real sockets; fleets."""
 
 from __future__ import annotations
 
@@ -6,19 +6,301 @@ import math
 import signal
 import socket
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from selectors import EVENT_READ, SelectSelector
+from typing import Protocol
+from urllib.parse import urlsplit
 
-from sim.look import Look
-from sim.peers import MOCAP, VEHICLE, Peers
-from sim.personality import PERSONALITIES
-from sim.sockets import Port, open_port
+import msgspec
+
+from sim.autopilot.profile import PERSONALITIES
+from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
+from uavctl.config.checks import outside
+from uavctl.config.sim import ids
 from uavctl.config.types import Config
-from uavctl.data import Truth
+from uavctl.errors import ConfigError, ConnectionSpecError
+from uavctl.records import Truth, Vec3
+
+# The simulator's own sockets: datagrams in and out over UDP or TCP; nothing blocks.
+
+
+LARGEST_DATAGRAM = 65535
+LARGEST_BACKLOG = 1 << 16  # a TCP client that leaves more unread is dropped [bytes]
+MOST_CLIENTS = 8  # of a TCP port
+V1, V2 = 0xFE, 0xFD
+SIGNED = 0x01
+Greeting = tuple[bytes, ...]
+# What a peer that is not there, or not there any more, does to a socket.
+GONE = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
+
+
+class Port(Protocol):
+    """One end of a connection."""
+
+    @property
+    def url(self) -> str:
+        """The URL with the port number that is really used."""
+        ...
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """What to wait for."""
+        ...
+
+    def read(self) -> list[bytes]:
+        """Everything that has come, one MAVLink datagram or frame each."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram; lost if nobody is there."""
+        ...
+
+    def close(self) -> None:
+        """Close every socket."""
+        ...
+
+
+class UdpPort:
+    """UDP: `udpout` sends to an address, `udpin` to whoever spoke last."""
+
+    def __init__(self, scheme: str, address: tuple[str, int]) -> None:
+        self._peer: tuple[str, int] | None = None
+        self._scheme = scheme
+        if scheme == "udpout":  # a host that is not known is told now
+            self._peer = socket.gethostbyname(address[0]), address[1]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(("", 0) if scheme == "udpout" else address)
+        except OSError:
+            self._socket.close()
+            raise
+        self._address = address if scheme == "udpout" else self._socket.getsockname()
+
+    @property
+    def url(self) -> str:
+        """The URL with the port number that is really used."""
+        return f"{self._scheme}://{self._address[0]}:{self._address[1]}"
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """What to wait for."""
+        return (self._socket,)
+
+    def read(self) -> list[bytes]:
+        """Everything that has come."""
+        taken = []
+        with suppress(BlockingIOError):
+            while True:
+                with suppress(*GONE):
+                    data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+                    if self._scheme == "udpin":
+                        self._peer = sender
+                    taken.append(data)
+        return taken
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram."""
+        if self._peer is not None:
+            with suppress(OSError):  # no way there, or no room: lost, as on a radio
+                self._socket.sendto(data, self._peer)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+@dataclass
+class _TcpClient:
+    """One connection to a `TcpPort`."""
+
+    socket: socket.socket
+    greeting: list[bytes]  # what of it is still to come
+    stream: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
+    backlog: bytearray = field(default_factory=bytearray)  # to go
+
+    def read(self) -> bool:
+        """Take all that has come; False when the client is gone."""
+        try:
+            while data := self.socket.recv(LARGEST_DATAGRAM):
+                self.stream += data
+        except BlockingIOError:
+            return True
+        except GONE:
+            pass
+        return False
+
+    def write(self, data: bytes) -> bool:
+        """Send in order what the socket takes now; False when the client is gone or leaves too much unread."""
+        if self.greeting:
+            self.backlog += self.greeting.pop(0)
+        self.backlog += data
+        try:
+            del self.backlog[: self.socket.send(self.backlog)]
+        except BlockingIOError:
+            return len(self.backlog) <= LARGEST_BACKLOG
+        except GONE:
+            return False
+        return True
+
+
+class TcpPort:
+    """A listening TCP socket, as ArduPilot's simulator has on port 5760; every client gets everything.
+
+    Args:
+        greeting: text for each client, whose parts go before its first, second, ... packet.
+    """
+
+    def __init__(self, address: tuple[str, int], greeting: Greeting = ()) -> None:
+        self._greeting = greeting
+        self._listener = socket.create_server(address, backlog=MOST_CLIENTS)
+        self._listener.setblocking(False)
+        self._clients: list[_TcpClient] = []
+
+    @property
+    def url(self) -> str:
+        """The URL with the port number that is really used."""
+        host, port = self._listener.getsockname()
+        return f"tcpin://{host}:{port}"
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """What to wait for."""
+        return self._listener, *(client.socket for client in self._clients)
+
+    def read(self) -> list[bytes]:
+        """Accept who is there; then every whole frame that has come."""
+        with suppress(BlockingIOError):
+            while True:
+                self._accept()
+        frames = []
+        for client in self._clients.copy():
+            stays = client.read()
+            frames += cut_frames(client.stream)
+            if not stays:
+                self._drop(client)
+        return frames
+
+    def _accept(self) -> None:
+        one, _ = self._listener.accept()
+        if len(self._clients) >= MOST_CLIENTS:
+            one.close()
+            return
+        one.setblocking(False)
+        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients.append(_TcpClient(one, list(self._greeting)))
+
+    def write(self, data: bytes) -> None:
+        """Send to every client."""
+        for client in self._clients.copy():
+            if not client.write(data):
+                self._drop(client)
+
+    def _drop(self, client: _TcpClient) -> None:
+        client.socket.close()
+        self._clients.remove(client)
+
+    def close(self) -> None:
+        """Close the clients and the listening socket."""
+        for client in self._clients.copy():
+            self._drop(client)
+        self._listener.close()
+
+
+class Ports:
+    """Several ports as one: what is sent goes out at all of them."""
+
+    def __init__(self, ports: list[Port]) -> None:
+        self._ports = ports
+
+    @property
+    def url(self) -> str:
+        """The URLs, separated by commas."""
+        return ",".join(port.url for port in self._ports)
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """What to wait for."""
+        return tuple(one for port in self._ports for one in port.sockets())
+
+    def read(self) -> list[bytes]:
+        """Everything that has come, at any port."""
+        return [data for port in self._ports for data in port.read()]
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram at every port."""
+        for port in self._ports:
+            port.write(data)
+
+    def close(self) -> None:
+        """Close every port."""
+        for port in self._ports:
+            port.close()
+
+
+def cut_frames(stream: bytearray) -> list[bytes]:
+    """Take the whole MAVLink frames off a stream's front; bytes before a start mark are passed over."""
+    frames = []
+    while stream:
+        if stream[0] not in (V1, V2):
+            del stream[0]
+            continue
+        if len(stream) < 3:
+            break
+        length = stream[1] + (8 if stream[0] == V1 else 12)
+        if stream[0] == V2 and stream[2] & SIGNED:
+            length += 13
+        if len(stream) < length:
+            break
+        frames.append(bytes(stream[:length]))
+        del stream[:length]
+    return frames
+
+
+def open_port(url: str, greeting: Greeting = ()) -> Port:
+    """Open a port from its URL, or several from URLs separated by commas; a TCP port greets each client.
+
+    Raises:
+        ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
+    """
+    opened: list[Port] = []
+    try:
+        for one in url.split(","):
+            opened.append(_open(one.strip(), greeting))
+    except ConnectionSpecError:
+        Ports(opened).close()
+        raise
+    return opened[0] if len(opened) == 1 else Ports(opened)
+
+
+def _open(url: str, greeting: Greeting) -> Port:
+    kinds: dict[str, Callable[[tuple[str, int]], Port]] = {
+        "udpout": lambda address: UdpPort("udpout", address),
+        "udpin": lambda address: UdpPort("udpin", address),
+        "tcpin": lambda address: TcpPort(address, greeting),
+    }
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ConnectionSpecError(f"{url}: {error}; write udpout://127.0.0.1:14540") from error
+    if port == 0 and parts.scheme == "udpout":
+        raise ConnectionSpecError(f"{url}: port 0 is no address to send to; write udpout://127.0.0.1:14540")
+    if parts.scheme not in kinds or host is None or port is None:
+        raise ConnectionSpecError(f'"{url}": the simulator speaks {", ".join(kinds)}; write udpout://127.0.0.1:14540')
+    try:
+        return kinds[parts.scheme]((host, port))
+    except socket.gaierror as error:
+        raise ConnectionSpecError(f"{url}: no such host ({error.strerror}); check its name") from error
+    except OSError as error:
+        raise ConnectionSpecError(
+            f"{url}: cannot be opened ({error.strerror or error}); choose another port"
+        ) from error
+
+
+# The simulated peers on real sockets, in real time or a multiple of it.
+
 
 Door = Callable[[str, Port], Port]
 """Puts something around the port of a connection, which is named `vehicle` or `mocap`."""
@@ -78,7 +360,7 @@ def serve_all(
     on_ready: Callable[[Ready], None],
     stop: Callable[[], bool],
     speed: float = 1.0,
-    on_look: Callable[[tuple[Look, ...]], None] | None = None,
+    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
     door: Door | None = None,
 ) -> None:
     """Run the peers of each seat until `stop()` or the end of the duration.
@@ -92,7 +374,6 @@ def serve_all(
         airborne: start flying in the external mode, else on the floor and disarmed.
         on_ready: called once for each vehicle, all ports being open.
         stop: asked at least every 50 ms.
-        speed: simulated time per real time.
         on_look: gets a look at all the vehicles four times a second of real time, and one at the end; it must not wait.
         door: put around every port, None leaves them as they are.
 
@@ -151,7 +432,7 @@ def _run(
     clock: _Clock,
     end_ns: int | None,
     stop: Callable[[], bool],
-    on_look: Callable[[tuple[Look, ...]], None] | None,
+    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
 ) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
     last_ns = None if end_ns is None else end_ns - 1  # what happens at the end itself is not told any more
@@ -229,3 +510,92 @@ def serve_in_child(
         return  # nobody listens any more
     finally:
         pipe.close()
+
+
+# Several simulated vehicles from one configuration, each with ports of its own.
+
+
+LARGEST_ID = 250
+APART_M = 1.0
+TCP_PORTS = 10  # from one vehicle to the next, as ArduPilot's simulator counts instances; UDP counts by one
+
+
+def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]) -> tuple[Seat, ...]:
+    """Seats of `count` vehicles, the first as configured.
+
+    Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
+    (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
+    rows, each 1 m north of the one before. What is configured to happen happens to all.
+
+    Raises:
+        ConfigError: the system ids run out or meet the daemon's, or the limits have no room for all.
+        ConnectionSpecError: two vehicles would have one port.
+    """
+    last = config.sim.system_id + count - 1
+    if last > LARGEST_ID:
+        raise ConfigError(
+            (f"sim.system_id: {count} vehicles would go up to {last}; set {LARGEST_ID + 1 - count} or less",)
+        )
+    places = _places(config, count)
+    configs = [_another(config, i, place) for i, place in enumerate(places)]
+    wrong = [problem for one in configs for problem in ids(one.sim, one.daemon)]
+    if wrong:
+        raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
+    seats = tuple(Seat(configs[i], _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
+    taken: dict[str, int] = {}
+    for i, seat in enumerate(seats):
+        for url in _fixed(seat):
+            if taken.setdefault(url, i) != i:
+                raise ConnectionSpecError(
+                    f"{url}: vehicles {taken[url] + 1} and {i + 1} would both have it; choose ports further apart"
+                )
+    return seats
+
+
+def _places(config: Config, count: int) -> list[Vec3]:
+    """Where they start."""
+
+    def fits(place: Vec3) -> bool:
+        return not any(outside(config.plant, config.sets, place, "", ""))
+
+    north, east, down = config.sim.start_position_m
+    places = [(north, east, down)]
+    while len(places) < count:
+        at_north, at_east, _ = places[-1]
+        places.append((at_north, at_east + APART_M, down))
+        if not fits(places[-1]):
+            places[-1] = (at_north + APART_M, east, down)
+        if not fits(places[-1]):
+            reason = f"the limits of the position (sets) have room for {len(places) - 1} of {count} vehicles from here"
+            raise ConfigError((f"sim.start_position_m: {reason}; start further south and west, or serve fewer",))
+    return places
+
+
+def _another(config: Config, number: int, place: Vec3) -> Config:
+    sim, replace = config.sim, msgspec.structs.replace
+    other = replace(sim, system_id=sim.system_id + number, seed=sim.seed + number, start_position_m=place)
+    return replace(config, sim=other)
+
+
+def _shifted(urls: str, number: int) -> str:
+    return ",".join(_higher(url.strip(), number) for url in urls.split(","))
+
+
+def _higher(url: str, number: int) -> str:
+    """The URL with a higher port; one that is none stays as it is, for `open_port` to refuse."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        return url
+    if not port or parts.hostname is None:
+        return url
+    step = TCP_PORTS if parts.scheme == "tcpin" else 1
+    return f"{parts.scheme}://{parts.hostname}:{port + step * number}"
+
+
+def _fixed(seat: Seat) -> Iterator[str]:
+    """The URLs of a seat, but for those that stand for any free port."""
+    for url in {*seat.vehicle.split(","), *seat.mocap.split(",")}:
+        if not url.endswith(":0"):
+            yield url

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammainc
 
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 FOOT_M = 0.3048
 LOWEST_M, HIGHEST_M = 10.0 * FOOT_M, 1000.0 * FOOT_M  # where the model holds; held at its ends outside
@@ -25,19 +25,12 @@ CALM: Vec3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Dryden:
-    """Intensities and time scales of the gusts along, across and up and down.
+    """Intensities and time scales of the gusts along, across and up and down."""
 
-    Attributes:
-        sigma_mps: standard deviation along and across the wind.
-        sigma_down_mps: standard deviation up and down.
-        time_s: L_u / V, that of the gusts along and across.
-        time_down_s: L_w / V.
-    """
-
-    sigma_mps: float
-    sigma_down_mps: float
-    time_s: float
-    time_down_s: float
+    sigma_mps: float  # standard deviation along and across the wind
+    sigma_down_mps: float  # standard deviation up and down
+    time_s: float  # L_u / V, that of the gusts along and across
+    time_down_s: float  # L_w / V
 
 
 def dryden(gust_wind_mps: float, height_m: float, speed_mps: float) -> Dryden:
@@ -45,7 +38,6 @@ def dryden(gust_wind_mps: float, height_m: float, speed_mps: float) -> Dryden:
 
     Args:
         gust_wind_mps: wind speed at 20 ft that sets the intensity (light 7.7, moderate 15.4, severe 23.2 m/s).
-        height_m: above the ground.
         speed_mps: at which the field passes the vehicle.
     """
     feet = min(max(height_m, LOWEST_M), HIGHEST_M) / FOOT_M
@@ -108,7 +100,6 @@ class Wind:
         mean_mps: steady wind, the velocity of the air in NED.
         gust_wind_mps: wind speed at 20 ft that sets the gusts' intensity; 0 is none.
         height_m: height for which the gusts' scales are taken.
-        step_s: length of a step.
         seed: of the gusts, which begin in their stationary distribution.
     """
 

@@ -26,9 +26,9 @@ from patience import LIMIT_S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, SECOND, SignedPeer
 
-from logs.reader import read
-from logs.topics import RecorderNote
-from uavctl.data import ControlMode, Decision, Refused
+from logs.recording.reader import read
+from logs.recording.topics import RecorderNote
+from uavctl.records import ControlMode, Decision, Refused
 
 POSITION_CONTROL = 3 << 16
 SETPOINT, COMMAND = 84, 76

@@ -11,11 +11,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import WITH_SIH_DRAG, quadrotor, steady
 from sim_rig import ARM, TAKE_OFF, Client, S, decode
 
-from sim.autopilot import Autopilot
-from sim.craft import heading_rad
-from sim.quadrotor import Quadrotor
+from sim.autopilot.autopilot import Autopilot
+from sim.vehicle.interface import heading_rad
+from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config import load_config
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 Name = Literal["px4", "ardupilot"]
 GUIDED, LAND_MODE, STABILIZE = (1, 4), (1, 9), (1, 0)
@@ -31,7 +31,7 @@ class Flight:
         self.name: Name = name
         airframe = {"airframe": WITH_SIH_DRAG} if name == "px4" else {}  # the one of the recorded flights
         self.vehicle: Quadrotor = quadrotor(name, wind=steady(wind), at=(0.0, 0.0, -5.0), speed=speed, **airframe)
-        config = load_config("room-hahn-stursberg", [f"sim.autopilot={name}"])
+        config = load_config("room-hahn-stursberg", [f"sim.autopilot.autopilot={name}"])
         self.autopilot = Autopilot(config, self.vehicle, 0, np.random.SeedSequence(1), airborne=airborne)
         self.client = Client()
         self.seen: list[tuple[int, Any]] = []

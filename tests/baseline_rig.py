@@ -11,19 +11,19 @@ from design_rig import spec
 from numpy.typing import NDArray
 from plant_cases import NAMED, spec_of
 
-from uavctl.campaign.world import Flown, Scene, fly
+from uavctl.lab.campaign.world import Flown, Scene, fly
 from uavctl.smpc.baselines import (
     CascadedPid,
+    ControlProblem,
     HoldLast,
     Lqg,
     PacketisedPredictive,
     PidGains,
-    Problem,
     WorstCaseDelay,
     ZeroOnLoss,
 )
 from uavctl.smpc.batch import BatchController, News
-from uavctl.smpc.design import DesignSpec
+from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -31,10 +31,10 @@ Counts = NDArray[np.intp]
 PAPER_START = np.array([35.0, -2.0, -20.0, -4.0])
 
 
-def problem_of(asked: DesignSpec, **changes: Any) -> Problem:
+def problem_of(asked: DesignSpec, **changes: Any) -> ControlProblem:
     plant = asked.plant
     target = plant.equilibrium(asked.target_m)
-    given = Problem(
+    given = ControlProblem(
         plant=plant,
         state_set=asked.state_set,
         input_set=asked.input_set,
@@ -49,12 +49,12 @@ def problem_of(asked: DesignSpec, **changes: Any) -> Problem:
     return replace(given, **changes)
 
 
-def problem(name: str, **changes: Any) -> Problem:
+def problem(name: str, **changes: Any) -> ControlProblem:
     """The problem of a preset, or of a shape of `plant_cases`."""
     return problem_of(spec_of(NAMED[name]) if name in NAMED else spec(name), **changes)
 
 
-def unlimited(given: Problem) -> Problem:
+def unlimited(given: ControlProblem) -> ControlProblem:
     """The same with limits that nothing ever meets."""
     n_x, n_u = given.plant.n_x, given.plant.n_u
     return replace(given, state_set=cube(n_x, 1e9), input_set=cube(n_u, 1e9))
@@ -70,7 +70,7 @@ def gains(axes: int) -> PidGains:
     return PidGains(*(np.full(axes, value) for value in rates))
 
 
-MAKERS: dict[str, Callable[[Problem], BatchController]] = {
+MAKERS: dict[str, Callable[[ControlProblem], BatchController]] = {
     "lqg": Lqg,
     "packetised": PacketisedPredictive,
     "hold": HoldLast,
@@ -87,7 +87,7 @@ def arrivals(runs: int, steps: int, loss: float, seed: int) -> Counts:
     return np.maximum.accumulate(np.where(arrived, np.arange(steps), 0), axis=1)
 
 
-def noise(given: Problem, runs: int, steps: int, seed: int) -> Array:
+def noise(given: ControlProblem, runs: int, steps: int, seed: int) -> Array:
     plant = given.plant
     values, vectors = np.linalg.eigh(plant.w)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -95,7 +95,9 @@ def noise(given: Problem, runs: int, steps: int, seed: int) -> Array:
     return drawn
 
 
-def flown(given: Problem, controller: BatchController, start: Array, newest: Counts, disturbances: Array) -> Flown:
+def flown(
+    given: ControlProblem, controller: BatchController, start: Array, newest: Counts, disturbances: Array
+) -> Flown:
     """Fly the very plant that the problem is about; `start` (n_x,) or (N, n_x)."""
     scene = Scene(
         plant=given.plant,
@@ -113,7 +115,7 @@ def flown(given: Problem, controller: BatchController, start: Array, newest: Cou
 class Fed:
     """Feeds a controller one run, step by step: its own plant moves by what is asked, without noise."""
 
-    def __init__(self, given: Problem, controller: BatchController, start: Array) -> None:
+    def __init__(self, given: ControlProblem, controller: BatchController, start: Array) -> None:
         self._plant, self._controller = given.plant, controller
         self.states, self.inputs = [np.asarray(start, dtype=np.float64)], np.zeros((1, 0, given.plant.n_u))
         controller.begin(1)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from uavctl.campaign.cells import Cell, cells_of
-from uavctl.campaign.compose import Campaign
-from uavctl.campaign.read import read_campaign
 from uavctl.cli.prepare import ready_library
+from uavctl.lab.campaign.spec import Campaign, read_campaign
+from uavctl.lab.campaign.tasks import Cell, cells_of
 
 HEAD = 'name = "small"\nconfig = "paper"\n'
 

@@ -24,10 +24,11 @@ from flight_rig import (
 )
 from numpy.typing import NDArray
 
-from uavctl.data import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
-from uavctl.flight.reach import GateParameters
-from uavctl.flight.step import Controller, StepOutput, initial_state, step
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+from uavctl.flight.controller import Controller
+from uavctl.flight.gating import GateParameters
+from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ class WildSolver(StubSolver):
         super().__init__(small_plant(("north", "east")), HORIZON)
         self.rng = rng
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """A steady answer, spoiled in a third of the cases."""
         self.asked.clear()  # a long run is not to fill the memory
         answer = super().solve(seq, x, target, outlook)

@@ -10,8 +10,8 @@ from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client, decode
 
-from sim.peers import VEHICLE, Peers
-from uavctl.check.item import Item, State
+from sim.simulation import VEHICLE, Peers
+from uavctl.check.findings import Item, ItemState
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
@@ -33,7 +33,7 @@ class Checked:
 
     @property
     def bad(self) -> list[str]:
-        return [name for name, one in self.items.items() if one.state is State.BAD]
+        return [name for name, one in self.items.items() if one.state is ItemState.BAD]
 
 
 def look(

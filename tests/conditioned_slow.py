@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from uavctl.smpc.answer import Outlook
-from uavctl.smpc.baselines import Problem
-from uavctl.smpc.lqg_bound import lqr
+from uavctl.smpc.answer import Preview
+from uavctl.smpc.baselines import ControlProblem
+from uavctl.smpc.bounds import lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
 Array = NDArray[np.float64]
@@ -24,14 +24,14 @@ class SlowPlan:
     slack: float
 
 
-def first_side(given: Problem, side: float, sent: Array) -> Array:
+def first_side(given: ControlProblem, side: float, sent: Array) -> Array:
     """How far the first setpoint may be from the one sent last (n_axes,), for a box of inputs."""
     low, high = given.input_set.bounds
     away = np.abs(given.plant.accel_map @ (np.clip(sent, low, high) - sent))
     return np.maximum(side, away + 1e-8 * (1.0 + away))  # two sets that only touch are no program
 
 
-def met(given: Problem, sides: Array) -> Array:
+def met(given: ControlProblem, sides: Array) -> Array:
     """Sides (H, m_x) of the state rows; where those of opposite rows cross, both are in the middle."""
     c, found = given.state_set.c, sides.copy()
     for i in range(len(c)):
@@ -40,7 +40,7 @@ def met(given: Problem, sides: Array) -> Array:
     return found
 
 
-def deviations(given: Problem, cov: Array | None) -> Array:
+def deviations(given: ControlProblem, cov: Array | None) -> Array:
     """Standard deviations (H, m_x) from the definition."""
     plant, found = given.plant, []
     spread = np.zeros((plant.n_x, plant.n_x)) if cov is None else cov
@@ -51,7 +51,7 @@ def deviations(given: Problem, cov: Array | None) -> Array:
 
 
 def plan_slowly(
-    given: Problem, budgets: Array, x: Array, reference: Array, outlook: Outlook, slew_mps3: float = np.inf
+    given: ControlProblem, budgets: Array, x: Array, reference: Array, outlook: Preview, slew_mps3: float = np.inf
 ) -> SlowPlan:
     """The plan to a reference; every stage and every row is in every program."""
     plant, steps, n_u = given.plant, given.horizon, given.plant.n_u
@@ -131,5 +131,5 @@ def plan_slowly(
     return SlowPlan(of_u[:, :, 0] + of_u[:, :, 1:] @ z + hold, backoff, slack)
 
 
-def hard_of(given: Problem, of_u: Array) -> Array:
+def hard_of(given: ControlProblem, of_u: Array) -> Array:
     return (given.input_set.c @ of_u)[:, :, 0]

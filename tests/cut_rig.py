@@ -16,7 +16,7 @@ from mcap import records
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from logs.reader import segment_files
+from logs.recording.reader import segment_files
 from uavctl.cli.app import run
 
 NAME = "flight.mcap"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.design import DesignSpec
+from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope

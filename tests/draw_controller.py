@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build import design_of
+from uavctl.build.controller import design_of
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError

@@ -8,11 +8,11 @@ import numpy as np
 from draw_controller import draw_controller, fits
 from msgspec.structs import replace
 
-from sim.personality import PERSONALITIES
+from sim.autopilot.profile import PERSONALITIES
 from uavctl.config import Config, load_config
 from uavctl.config.link import LinkConfig
 from uavctl.config.sim import FaultConfig
-from uavctl.data import Command, Order, Vec3
+from uavctl.records import Command, Order, Vec3
 
 SPANS = ("blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen")
 

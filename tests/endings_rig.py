@@ -22,27 +22,27 @@ from patience import LIMIT_S
 from recording_fakes import Disk
 from sim_rig import decode
 
-from logs import report
-from logs.flight_data import FlightData
-from logs.reader import read
-from logs.recorder import SyncRecorder
-from logs.summary import summarise
-from sim.peers import Peers
-from sim.personality import PERSONALITIES
-from uavctl import control_socket
-from uavctl.cli import fly_cmd, tune_flight
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+from logs.recording.recorder import SyncRecorder
+from logs.recording.summary import summarise
+from logs.report import flight_page as report
+from sim.autopilot.profile import PERSONALITIES
+from sim.simulation import Peers
+from uavctl.cli import fly as fly_cmd
+from uavctl.cli import tune as tune_flight
 from uavctl.cli.app import run
 from uavctl.clock import Ticker
 from uavctl.config import load_config
-from uavctl.daemon import fly
-from uavctl.data import Ending, RelayStats
-from uavctl.ending import Cause
-from uavctl.health import HealthWatch
-from uavctl.lock import lock_paths
+from uavctl.daemon import control_socket
+from uavctl.daemon.daemon import fly
+from uavctl.daemon.health import HealthWatch, Notifier
+from uavctl.daemon.lock import lock_paths
+from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.mode import State
-from uavctl.notify import Notifier
-from uavctl.transport import Connection
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.outcome import Cause
+from uavctl.records import Ending, RelayStats
 
 SECOND = 1_000_000_000
 BEGUN_NS = 1  # a tick before the grid
@@ -146,7 +146,7 @@ class Endings:
 
     # What a step may look at, and do
 
-    def is_in(self, state: State) -> bool:
+    def is_in(self, state: HandoverState) -> bool:
         return self.loop is not None and self.loop.who_flies is state
 
     @property
@@ -158,7 +158,7 @@ class Endings:
         kind = PERSONALITIES[self.config.sim.autopilot]
         self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
 
-    def at(self, state: State, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:
+    def at(self, state: HandoverState, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:
         """A step once the hand-over has been in a state for a while."""
         since: list[int] = []
 
@@ -301,7 +301,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
         patch.setattr(fly_cmd, "checked_before_arming", lambda *_: ())
-        patch.setattr("uavctl.cli.operation.HealthWatch", Watched)
+        patch.setattr("uavctl.cli.fly.HealthWatch", Watched)
         patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
         sections = report._sections
         patch.setattr(report, "_sections", lambda *given: [next(iter(sections(*given)))])  # its words, no drawings

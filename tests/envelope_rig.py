@@ -11,9 +11,9 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from numpy.typing import NDArray
 
-from uavctl.data import PositionSample, Vec3, VehicleMotion
 from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Observer, Watching, watch
 from uavctl.flight.limits import ZERO
+from uavctl.records import PositionSample, Vec3, VehicleMotion
 
 Array = NDArray[np.float64]
 
@@ -45,13 +45,7 @@ def motion(velocity_mps: Vec3, at_ns: int) -> VehicleMotion:
 
 def seen(at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, own: VehicleMotion | None = None) -> Observation:
     return Observation(
-        at_ns=at_ns,
-        samples=samples,
-        sent_mps2=sent,
-        position_m=None,
-        velocity_mps=NAN3,
-        motion=own,
-        braking=False,
+        at_ns=at_ns, samples=samples, sent_mps2=sent, position_m=None, velocity_mps=NAN3, motion=own, braking=False
     )
 
 

@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from uavctl.data import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.fallback import FallbackParameters
+from uavctl.flight.gating import GateParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Room, hold
-from uavctl.flight.reach import GateParameters
-from uavctl.flight.step import Controller, ControlState, StepOutput, initial_state, step
-from uavctl.naming import names_of
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.labels import names_of
+from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
@@ -104,7 +105,7 @@ class StubSolver:
     faults: Mapping[int, Fault] = field(default_factory=dict)
     asked: list[tuple[int, Array]] = field(default_factory=list)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         self.asked.append((seq, x))
         answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
         fault = self.faults.get(seq)

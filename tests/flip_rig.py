@@ -11,13 +11,12 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import HEADER, Clock, Item, flight, own
 
-from logs.chunks import Message, scan
-from logs.info import RecordingInfo, info
-from logs.reader import header, read
-from logs.recorder import SyncRecorder
-from logs.recover import recover
-from logs.topics import definition
-from uavctl.config.log import LogConfig
+from logs.recording.info import RecordingInfo, info
+from logs.recording.reader import RecordedMessage, header, read, scan
+from logs.recording.recorder import SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.topics import definition
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 
 DATA_END = b"\x0f\x04\0\0\0\0\0\0\0"
@@ -46,7 +45,7 @@ class Flips:
         if not finished:
             self.data = self.data[: self.data.rindex(DATA_END)]
             self._path.write_bytes(self.data)
-        offsets = [item.offset for item in scan(self._path) if isinstance(item, Message)]
+        offsets = [item.offset for item in scan(self._path) if isinstance(item, RecordedMessage)]
         self._most = max(Counter(offsets).values())  # messages in one chunk
         self._info = info(self._path)
         assert own(list(read(self._path))) == self._items and len(set(offsets)) > 3

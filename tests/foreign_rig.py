@@ -9,9 +9,8 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
-from logs.replay_tlog import ForeignReplay, replay_tlog
-from logs.tlog import TlogPacket, read_tlog
-from uavctl.build import build_controller
+from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
+from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.loop import VEHICLE, ControlLoop
 

@@ -8,9 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.components import Component, decompose
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import Horizon, horizon_of
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, horizon_of
 
 Array = NDArray[np.float64]
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.data import Command, Event, Order, VehicleStatus
-from uavctl.mavlink.hand_over import HandOver, Told
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover import HandOver, HandoverStep
+from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.mode import Sending, State
-from uavctl.mavlink.request import COMMANDS, Ask
-from uavctl.mavlink.sight import View
+from uavctl.mavlink.requests import COMMANDS, RequestKind
+from uavctl.records import Command, Event, Order, VehicleStatus
 
 SECOND, TICK_NS = 1_000_000_000, 50_000_000
 NOW = 100 * SECOND
@@ -34,12 +33,12 @@ class Rig:
             at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True
         )
         self.mute = False
-        self.view = View(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
-        self.asked: list[tuple[int, Ask]] = []
+        self.view = HandoverView(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
+        self.asked: list[tuple[int, RequestKind]] = []
         self.events: list[Event] = []
 
     @property
-    def state(self) -> State:
+    def state(self) -> HandoverState:
         return self.hand_over.state
 
     def be(self, **fields: object) -> None:
@@ -49,13 +48,13 @@ class Rig:
         external = mode in ("OFFBOARD", "GUIDED")
         self.vehicle = replace(self.vehicle, **{"external": external, **fields})
 
-    def is_in(self, *states: State) -> bool:
+    def is_in(self, *states: HandoverState) -> bool:
         return self.state in states
 
-    def asked_last(self, ask: Ask) -> bool:
+    def asked_last(self, ask: RequestKind) -> bool:
         return self.asked[-1][1] is ask
 
-    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> Told:
+    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> HandoverStep:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
@@ -66,66 +65,73 @@ class Rig:
         self.events += told.events
         return told
 
-    def run(self, seconds: float, *, until: State | None = None) -> None:
+    def run(self, seconds: float, *, until: HandoverState | None = None) -> None:
         for _ in range(round(seconds * SECOND) // TICK_NS):
             if self.state is until:
                 return
             self.tick()
         assert until is None or self.state is until
 
-    def answer(self, result: int, ask: Ask | None = None, text: str = "") -> Told:
+    def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverStep:
         """The vehicle answers the last request, or this one."""
         words = (Text(system=1, component=1, severity=2, text=text),) if text else ()
         return self.tick(ack(result, ask or self.asked[-1][1]), *words)
 
-    def to(self, state: State) -> Rig:
+    def to(self, state: HandoverState) -> Rig:
         """Go on the usual way as far as a state, with a vehicle that does what it is asked for."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
-        if state is State.WAITING:
+        if state is HandoverState.WAITING:
             return self
         self.tick()
-        if state is State.READY:
+        if state is HandoverState.READY:
             return self
         if (
-            state in (State.ENGAGED, State.RELEASED, State.RETURNING, State.LANDING, State.SETTLING)
+            state
+            in (
+                HandoverState.ENGAGED,
+                HandoverState.RELEASED,
+                HandoverState.RETURNING,
+                HandoverState.LANDING,
+                HandoverState.SETTLING,
+            )
             and not self.view.commands
         ):
             self.be(armed=True, landed=False, mode="OFFBOARD" if px4 else "GUIDED")
             self.tick()
             return self._beyond(state)
         self.tick(commands=(TAKE_OFF,))
-        if state is State.MODE:
+        if state is HandoverState.MODE:
             return self
         self.be(mode="AUTO.TAKEOFF" if px4 else "GUIDED")
         self.tick()
-        if state is State.ARMING:
+        if state is HandoverState.ARMING:
             return self
         self.be(armed=True)
         self.tick()
-        if state is State.CLIMBING:
+        if state is HandoverState.CLIMBING:
             return self
-        if state is State.FAILSAFE:
+        if state is HandoverState.FAILSAFE:
             self.fail()
             return self
         self.tick(up_m=1.9)
         return self
 
-    def fail(self, mode: str = "") -> Told:
+    def fail(self, mode: str = "") -> HandoverStep:
         """A failsafe of the vehicle's own lands it, or chooses this mode."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
         self.be(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)
         return self.tick()
 
-    def _beyond(self, state: State) -> Rig:
-        if state in (State.RELEASED, State.RETURNING):
+    def _beyond(self, state: HandoverState) -> Rig:
+        if state in (HandoverState.RELEASED, HandoverState.RETURNING):
             self.be(mode="POSCTL")
             self.tick()
-        if state is State.RETURNING:
+        if state is HandoverState.RETURNING:
             self.tick(commands=(ENGAGE,))
-        if state in (State.LANDING, State.SETTLING):
+        if state in (HandoverState.LANDING, HandoverState.SETTLING):
             self.tick(land=True)
             self.view = replace(self.view, land=False)
-        if state is State.SETTLING:
+        if state is HandoverState.SETTLING:
             self.be(mode="AUTO.LAND")
             self.tick()
         return self
@@ -134,5 +140,5 @@ class Rig:
         return [event.text for event in self.events if event.code == code]
 
 
-def ack(result: int, ask: Ask) -> Ack:
+def ack(result: int, ask: RequestKind) -> Ack:
     return Ack(system=1, component=1, command=COMMANDS[ask], result=result, target_system=245, target_component=25)

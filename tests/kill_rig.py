@@ -15,14 +15,13 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import Item, flight, own
 
-from logs.disk import segment_path
-from logs.encoding import encode
-from logs.journal import Journal
-from logs.reader import read, segment_files
-from logs.recorder import RECORDS as AT_ONCE
-from logs.recorder import Recorder, SyncRecorder
-from logs.recover import recover
-from uavctl.config.log import LogConfig
+from logs.recording.disk import segment_path
+from logs.recording.reader import read, segment_files
+from logs.recording.recorder import RECORDS as AT_ONCE
+from logs.recording.recorder import Recorder, SyncRecorder, WriteQueue
+from logs.recording.recover import recover
+from logs.recording.topics import encode
+from uavctl.config.types import LogConfig
 
 KINDS = ("sync", "thread")
 LOG = LogConfig(segment_bytes=60_000)  # so that kills hit the change of files, too
@@ -85,14 +84,14 @@ def kill_once(folder: Path, kind: str, seed: int, items: list[Item]) -> Killed:
 
 
 def _record(path: Path, kind: str, items: list[Item], counts: memoryview) -> None:
-    drain = Journal.drain
+    drain = WriteQueue.drain
 
-    def watched(journal: Journal, records: int, views: int) -> None:
+    def watched(journal: WriteQueue, records: int, views: int) -> None:
         begun = counts[0] - max(0, len(journal.queue) - AT_ONCE)
         drain(journal, records, views)
         counts[1] = begun
 
-    with patch.object(Journal, "drain", watched):
+    with patch.object(WriteQueue, "drain", watched):
         _put_all(SyncRecorder(path, LOG) if kind == "sync" else Recorder(path, LOG), items, counts)
 
 

@@ -11,19 +11,17 @@ import numpy as np
 from full_problem import backoff_table, horizons
 from numpy.typing import NDArray
 
-from uavctl.build import build_design
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
 from uavctl.config import load_config
-from uavctl.library_store import library_for
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook, Path
-from uavctl.smpc.components import Component, decompose
-from uavctl.smpc.conic import PartSolver
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import horizon_of
-from uavctl.smpc.library import Library
-from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.meanqp import MeanProblem, Question
-from uavctl.smpc.mixture import Mixture
-from uavctl.smpc.policies import Policy
+from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import PartSolver
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
+from uavctl.smpc.hahn_stursberg.mixture import Mixture
+from uavctl.smpc.hahn_stursberg.policies import Policy
 
 Array = NDArray[np.float64]
 
@@ -75,7 +73,7 @@ class Case:
         """The library without the exact program."""
         return LibrarySolver(self.design, self.library, exact=False)
 
-    def question(self, i: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Question:
+    def question(self, i: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
         part = self.components[i]
         return self.problems[i].question(x[part.states], target[part.states], outlook)
 
@@ -153,7 +151,7 @@ class Asked:
     kind: str
     x: Array
     target: Array
-    outlook: Outlook = NOMINAL
+    outlook: Preview = NOMINAL
 
 
 KINDS = ("uniform", "near", "far target", "outside", "limits", "path", "limits and path")
@@ -171,7 +169,7 @@ def asked(design: Design, kind: str, rng: np.random.Generator) -> Asked:
         return Asked(kind, uniform(design, rng, 1.5), home)
     limits = moving_limits(design, rng) if "limits" in kind else None
     along = path(design, rng) if "path" in kind else None
-    return Asked(kind, uniform(design, rng), equilibrium(design, rng), Outlook(limits, along))
+    return Asked(kind, uniform(design, rng), equilibrium(design, rng), Preview(limits, along))
 
 
 def all_kinds(design: Design, seed: int, count: int) -> Iterator[Asked]:
@@ -203,9 +201,9 @@ def hard_questions(design: Design) -> list[Asked]:
     for _ in range(6):
         x = uniform(design, rng)
         at = x[design.plant.position_index[0]] - rng.uniform(0.1, 0.3) * (upper - lower)[0]
-        found.append(Asked("fence that shuts the drone out", x, home, Outlook(limits=fence(design, 0, at))))
+        found.append(Asked("fence that shuts the drone out", x, home, Preview(limits=fence(design, 0, at))))
     shut = -np.abs(limits(design))
-    found.append(Asked("no place left", home, home, Outlook(limits=shut)))
+    found.append(Asked("no place left", home, home, Preview(limits=shut)))
     return found
 
 

@@ -7,16 +7,16 @@ from typing import TypeVar
 
 import msgspec
 
-from logs.flight_data import FlightData
-from sim.world import World
-from uavctl.build import build_controller, design_of, record_of
+from logs.recording.flight import FlightData
+from sim.simulation import World
+from uavctl.build.controller import build_controller, design_of, record_of
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
-from uavctl.data import Header, Record, Sink
 from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
-from uavctl.smpc.conditioned_design import AnyDesign
-from uavctl.smpc.library import Library
+from uavctl.records import Header, Record, Sink
+from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.hahn_stursberg.library import Library
 
 R = TypeVar("R", bound=Record)
 

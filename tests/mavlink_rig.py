@@ -9,10 +9,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Event, PositionSample, VehicleStatus
-from uavctl.mavlink.link import Item, Link
+from uavctl.mavlink.connection import Item, MavlinkConnection
+from uavctl.records import Event, PositionSample, VehicleStatus
 
 DATA = Path(__file__).resolve().parent / "data"
 MS, SECOND = 1_000_000, 1_000_000_000
@@ -71,8 +71,8 @@ def make_link(
     source: SourceConfig | None = None,
     estimator: EstimatorConfig | None = None,
     daemon: DaemonConfig | None = None,
-) -> Link:
-    return Link(
+) -> MavlinkConnection:
+    return MavlinkConnection(
         "vehicle",
         roles=frozenset(roles),
         daemon=daemon or DaemonConfig(tick_s=0.05),

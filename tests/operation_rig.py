@@ -23,8 +23,8 @@ from sim_rig import Client
 from sim.server import serve
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.data import Truth
-from uavctl.lock import lock_paths
+from uavctl.daemon.lock import lock_paths
+from uavctl.records import Truth
 
 # The machine may stand still for a while, and then neither side has failed: the vehicle bears with a pause in the
 # setpoints that is long for a flight, and the daemon with one in the positions and in the vehicle's answers.
@@ -164,7 +164,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
         peers.start()
         try:
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", LIMIT_S)
+                patch.setattr("uavctl.cli.ctl.ANSWER_LIMIT_S", LIMIT_S)
                 yield found
         finally:
             done.set()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope
@@ -83,21 +83,11 @@ def paper(**changes: Any) -> Design:
 
 def coupled() -> Design:
     """Two axes that drag at one another, with a short horizon and a good link."""
-    return paper(
-        plant=paper_plant(coupling=0.1),
-        horizon=5,
-        tau=1,
-        delays=2,
-        link=bernoulli(np.array([0.95])),
-    )
+    return paper(plant=paper_plant(coupling=0.1), horizon=5, tau=1, delays=2, link=bernoulli(np.array([0.95])))
 
 
 # A shorter delay for the room: stages 4 and 5 feed nothing back, so that enough likelihood is left.
-TAU_3: dict[str, Any] = {
-    "tau": 3,
-    "k_tau": kron(np.eye(3), [[-1.060, -1.444, -0.696]]),
-    "delays": [6] * 7 + [4] * 5,
-}
+TAU_3: dict[str, Any] = {"tau": 3, "k_tau": kron(np.eye(3), [[-1.060, -1.444, -0.696]]), "delays": [6] * 7 + [4] * 5}
 
 
 def room(**changes: Any) -> Design:

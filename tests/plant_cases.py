@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, solve_discrete_are
 from scipy.stats import chi2
 
-from uavctl.data import SolveStatus
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import AXES, Plant
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.terminal import make_terminal
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 
 Array = NDArray[np.float64]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.design import Design, DesignSpec
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
+from uavctl.smpc.hahn_stursberg.terminal import Terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.terminal import Terminal
 
 Array = NDArray[np.float64]
 

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from sim.airframe import CRAZYFLIE_2, Airframe
-from sim.battery import Battery
-from sim.quadrotor import STEP_NS, STEP_S, Quadrotor
-from sim.vehicle import linear_model
+from sim.vehicle.linear import linear_model
+from sim.vehicle.quadrotor import STEP_NS, STEP_S, Quadrotor
+from sim.vehicle.rigid_body import CRAZYFLIE_2, Airframe, BatteryModel
 from sim.wind import Wind
 from uavctl.config import load_config
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
 Autopilot = Literal["px4", "ardupilot"]
@@ -147,9 +146,9 @@ def tilt(vehicle: Quadrotor) -> float:
     return math.acos(1.0 - 2.0 * (x * x + y * y))
 
 
-def allowing(speed_rps: float) -> Battery:
+def allowing(speed_rps: float) -> BatteryModel:
     """A battery that allows this rotor speed."""
-    return Battery(replace(CRAZYFLIE_2, speed_at_0v_rps=speed_rps, speed_per_v_rps=0.0))
+    return BatteryModel(replace(CRAZYFLIE_2, speed_at_0v_rps=speed_rps, speed_per_v_rps=0.0))
 
 
 def gusty(seed: int) -> Wind:

@@ -15,12 +15,12 @@ from loopback_rig import Memory, header, shared
 from mavlink_rig import DATA
 from numpy.typing import NDArray
 
-from logs.flight_data import FlightData
-from logs.tlog import TlogPacket, read_tlog
+from logs.recording.flight import FlightData
+from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
-from uavctl.data import Command, VehicleStatus
 from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.records import Command, VehicleStatus
 
 FLIGHTS = DATA / "flights"
 TICK_NS, SECOND = 50_000_000, 1_000_000_000
@@ -101,11 +101,7 @@ class Listened:
 
 
 def listened(
-    name: str,
-    since_s: float = 0.0,
-    seconds: float = 1e9,
-    *overrides: str,
-    orders: Sequence[tuple[float, Command]] = (),
+    name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str, orders: Sequence[tuple[float, Command]] = ()
 ) -> Listened:
     """Let a control loop hear a part of a recording; `orders` are an operator's, by time since the first packet [s]."""
     whole = packets(name)

@@ -6,10 +6,10 @@ import errno
 from collections.abc import Callable
 from pathlib import Path
 
-from logs.disk import DiskFile, OutputFile
-from logs.recorder import SyncRecorder
-from uavctl.config.log import LogConfig
-from uavctl.data import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity, raw_topic
+from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.recorder import SyncRecorder
+from uavctl.config.types import LogConfig
+from uavctl.records import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity, raw_topic
 
 HEADER = Header(
     started_ns=5,

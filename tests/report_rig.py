@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from synthetic_flight import Item, fly
 from synthetic_scene import Scene
 
-from logs.flight_data import FlightData
-from logs.report import report_html
-from logs.summary import summarise
-from uavctl.data import Record
+from logs.recording.flight import FlightData
+from logs.recording.summary import summarise
+from logs.report.flight_page import report_html
+from uavctl.records import Record
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 

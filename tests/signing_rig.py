@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.gate import Gate
-from uavctl.mavlink.signing import Signing, SigningKey, Stamps
+from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
 
 KEY, OTHER_KEY = bytes(range(1, 33)), bytes(range(2, 34))
 EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970

@@ -7,7 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.peers import MOCAP, VEHICLE, Peers
+from sim.simulation import MOCAP, VEHICLE, Peers
 from uavctl.config import Config, load_config
 
 S = 1_000_000_000
@@ -112,7 +112,8 @@ class Bench:
 
 def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
     return Bench(
-        load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne
+        load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot.autopilot={autopilot}", *overrides]),
+        airborne=airborne,
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from soak_rig import Watch, fly
 
-from sim.world import World
+from sim.simulation import World
 from uavctl.cli.prepare import Prepared
 from uavctl.config import load_config
-from uavctl.data import ControlMode
+from uavctl.records import ControlMode
 
 Array = NDArray[np.float64]
 
@@ -170,7 +170,7 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
         seed: Of every draw.
         path: Recording; None for none.
     """
-    config = load_config("room-hahn-stursberg", [*MISSION, f"sim.autopilot={autopilot}", f"sim.seed={seed}"])
+    config = load_config("room-hahn-stursberg", [*MISSION, f"sim.autopilot.autopilot={autopilot}", f"sim.seed={seed}"])
     ground = _Ground(prepared)
     worlds: list[World] = []
 

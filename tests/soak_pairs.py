@@ -11,12 +11,12 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from soak_rig import Watch, fly
 
-from sim.mocap import AXES
-from sim.world import World
+from sim.cameras import AXES
+from sim.simulation import World
 from uavctl.cli.prepare import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
-from uavctl.data import ControlMode, Vec3
+from uavctl.records import ControlMode, Vec3
 
 FLIGHT_S = 30.0
 OUTSIDE_M = 1.0  # beyond the position limits of `[sets]`, ceiling included
@@ -68,12 +68,7 @@ def silence_motion(world: World) -> None:
 
 
 def fly_true(
-    prepared: Prepared,
-    config: Config,
-    path: Path | None = None,
-    flight_s: float = FLIGHT_S,
-    *,
-    own_motion: bool = True,
+    prepared: Prepared, config: Config, path: Path | None = None, flight_s: float = FLIGHT_S, *, own_motion: bool = True
 ) -> TrueFlight:
     """Fly from the air, and look at the true vehicle in every tick; with or without its own word of how it moves."""
     begins_s = min((fault.at_s for fault in config.sim.fault), default=0.0)
@@ -134,7 +129,7 @@ def drawn_pair(seed: int) -> Config:
     rng = np.random.default_rng([seed, 14])
     plant, autopilot = WORLDS[seed % len(WORLDS)]
     config = load_config(
-        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.seed={seed}"]
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", f"sim.seed={seed}"]
     )
     sim, link = config.sim, config.link
     wind = sim.wind

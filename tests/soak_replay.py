@@ -16,22 +16,19 @@ from draw_flight import Drawn, drawn
 from msgspec.structs import replace
 from signing_rig import KEY, OFFSET_NS
 
-from logs.info import info
-from logs.onlookers import Onlookers
-from logs.recorder import SyncRecorder
-from logs.replay import ReplayResult
-from logs.views import Views
-from sim.peers import Peers
-from sim.world import World
+from logs.recording.info import info
+from logs.recording.recorder import DerivedTopics, SyncRecorder
+from logs.recording.replay import ReplayResult
+from logs.recording.views import Views
+from sim.simulation import Peers, World
 from uavctl.cli.flying import put_header
 from uavctl.cli.prepare import Prepared
-from uavctl.cli.replaying import replay_flight
+from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
-from uavctl.data import Command, Order, Outgoing, Record, Sink
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan
-from uavctl.mavlink.gate import Gate
-from uavctl.mavlink.signing import Signing, SigningKey, Stamps
+from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.records import Command, Order, Outgoing, Record, Sink
 
 SECOND_NS = 1_000_000_000
 
@@ -199,7 +196,7 @@ def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
     """Fly a seed's flight into the new recording `path`."""
     plan = drawn(seed)
     config, prepared = plan.config, prepared_of(plan.config)
-    recorder = SyncRecorder(path, config.log, onlookers=Onlookers(Views()) if plan.viewers else None)
+    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(Views()) if plan.viewers else None)
     sink = _Seen(recorder)
     try:
         put_header(recorder, prepared, started_ns=plan.start_ns)

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from logs.recorder import SyncRecorder
-from sim.world import World
-from uavctl.build import design_of
+from logs.recording.recorder import SyncRecorder
+from sim.simulation import World
+from uavctl.build.controller import design_of
 from uavctl.cli.flying import put_header, stop_limit_s
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
-from uavctl.data import Command, ControlMode, Decision, Event, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
 from uavctl.loop import ControlLoop
+from uavctl.records import Command, ControlMode, Decision, Event, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
 
 ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell

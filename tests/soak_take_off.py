@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 from take_off_rig import RELAYED, Flight
 
-from uavctl.mavlink.mode import State
+from uavctl.mavlink.handover_guards import HandoverState
 
 AUTOPILOTS = ("px4", "ardupilot")
 LIMIT_S = 60.0  # in which a vehicle is flown, or on the ground again with a reason told
@@ -21,7 +21,13 @@ HEIGHT_M = 1.2
 PLACE = (473977420, 85455940, 488000)  # latitude and longitude [1e-7 deg], altitude [mm]
 LOW_M = 0.3  # a vehicle that is engaged is higher
 # Where a vehicle in the air is somebody's: ours, the pilot's, or on its way down by what was asked for.
-ATTENDED = frozenset(State) - {State.WAITING, State.READY, State.MODE, State.DONE, State.FAILED}
+ATTENDED = frozenset(HandoverState) - {
+    HandoverState.WAITING,
+    HandoverState.READY,
+    HandoverState.MODE,
+    HandoverState.DONE,
+    HandoverState.FAILED,
+}
 
 
 @dataclass(frozen=True)
@@ -65,9 +71,9 @@ def troubled(autopilot: str, seed: int) -> Flight:
         *RELAYED,
         "sim.streams=onboard",
         f"sim.seed={seed}",
-        f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
-        f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
-        f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
+        f"sim.autopilot.autopilot.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
+        f"sim.autopilot.autopilot.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
+        f"sim.autopilot.autopilot.clears={'true' if autopilot == 'px4' else 'false'}",
     ).relayed()
     if autopilot == "px4":
         flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", HEIGHT_M)
@@ -82,7 +88,7 @@ def outcome(flight: Flight) -> str:
     if not pilot.armed and flight.peers.autopilot.craft.landed:
         return "landed" if "climbing" in flight.states else "refused"
     obeys = pilot.external and pilot.helm.obeyed is not None  # whatever the hand-over takes it for
-    return "engaged" if flight.is_in(State.ENGAGED) and obeys and up_m > LOW_M else "hovers"
+    return "engaged" if flight.is_in(HandoverState.ENGAGED) and obeys and up_m > LOW_M else "hovers"
 
 
 def flown(flight: Flight) -> str:
@@ -93,7 +99,7 @@ def flown(flight: Flight) -> str:
         if flight.loop.finished or engaged_s > SETTLED_S:
             break
         flight.run(1.0)
-        engaged_s = engaged_s + 1.0 if flight.is_in(State.ENGAGED) else 0.0
+        engaged_s = engaged_s + 1.0 if flight.is_in(HandoverState.ENGAGED) else 0.0
     return outcome(flight)
 
 

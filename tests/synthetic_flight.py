@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm, logm
 from synthetic_scene import Array, Scene, box
 
-from uavctl.data import (
+from uavctl.records import (
     ControlMode,
     Decision,
     Estimate,
@@ -212,15 +212,7 @@ def _truth(scene: Scene, x: Array, u: Array, at_ns: int, sent: int, lost: int) -
 
 
 def _spoken(
-    scene: Scene,
-    pilot: _Pilot,
-    u: Array,
-    tick: int,
-    step: int,
-    at_ns: int,
-    boundary: bool,
-    heard: bool,
-    solved: bool,
+    scene: Scene, pilot: _Pilot, u: Array, tick: int, step: int, at_ns: int, boundary: bool, heard: bool, solved: bool
 ) -> Iterator[Item]:
     """Estimate, decision and events of a tick."""
     n = len(pilot.mean)

@@ -8,13 +8,13 @@ from typing import Any
 from loopback_rig import Memory, header, shared
 from sim_rig import decode
 
-from sim.peers import Peers
-from sim.personality import PERSONALITIES
+from sim.autopilot.profile import PERSONALITIES
+from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.data import Command, Datagram, Event, Order, Setpoint
+from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.mode import State
-from uavctl.trial.own_loop import EXTERNAL_ONLY
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.records import Command, Datagram, Event, Order, Setpoint
 
 # Positions come through the relay alone, from cameras whose packets a third of are lost in bursts of ten on the mean.
 RELAYED = [
@@ -38,7 +38,9 @@ class Flight:
     """The loop and the peers; between them the test may change, drop or add what is said."""
 
     def __init__(self, autopilot: str, *overrides: str) -> None:
-        self.config = load_config("room-hahn-stursberg", [*ON_THE_FLOOR, f"sim.autopilot={autopilot}", *overrides])
+        self.config = load_config(
+            "room-hahn-stursberg", [*ON_THE_FLOOR, f"sim.autopilot.autopilot={autopilot}", *overrides]
+        )
         self.memory = Memory()
         design, controller = shared(self.config)
         self.memory.put("/uavctl/header", 0, header(self.config, design))
@@ -53,10 +55,10 @@ class Flight:
         return self.tick * TICK_NS
 
     @property
-    def state(self) -> State:
+    def state(self) -> HandoverState:
         return self.loop.who_flies
 
-    def is_in(self, *states: State) -> bool:
+    def is_in(self, *states: HandoverState) -> bool:
         return self.state in states
 
     def relayed(self) -> Flight:
@@ -69,7 +71,7 @@ class Flight:
         self.loop.order(Command(order=Order.TAKE_OFF, height_m=height_m))
         return self
 
-    def run(self, seconds: float, *, stop: bool = False, until: State | None = None) -> Flight:
+    def run(self, seconds: float, *, stop: bool = False, until: HandoverState | None = None) -> Flight:
         for _ in range(round(seconds * SECOND) // TICK_NS):
             if self.state is until:
                 return self

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.age import at_most, information_probability
-from uavctl.smpc.link import bernoulli
+from uavctl.smpc.link import at_most, bernoulli, information_probability
 
 Array = NDArray[np.float64]
 LINKS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8).map(np.array)

@@ -47,8 +47,8 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
         ("uavctl.config", "uavctl.smpc", "Layers"),
         ("uavctl.smpc", "uavctl.flight", "Layers"),
         ("uavctl.flight", "uavctl.loop", "Layers"),
-        ("uavctl.loop", "uavctl.daemon", "Layers"),
-        ("uavctl.data", "uavctl.frames", "Layers"),
+        ("uavctl.loop", "uavctl.daemon.daemon", "Layers"),
+        ("uavctl.records", "uavctl.frames", "Layers"),
         ("logs", "sim", "Layers"),
         ("uavctl.smpc", "uavctl.config", "The control core is pure"),
         ("uavctl.flight", "uavctl.mavlink", "The control core is pure"),
@@ -58,8 +58,8 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
         ("uavctl.mavlink", "socket", "MAVLink is sans IO"),
         ("sim", "uavctl.smpc", "The simulator knows nothing of the controller"),
         ("sim", "uavctl.loop", "The simulator knows nothing of the controller"),
-        ("uavctl.daemon", "logs", "The daemon sees a sink, never the recordings"),
-        ("uavctl.cli.replaying", "logs.report", "A replay does not wait for what draws pages"),
+        ("uavctl.daemon.daemon", "logs", "The daemon sees a sink, never the recordings"),
+        ("uavctl.cli.replay", "logs.report.flight_page", "A replay does not wait for what draws pages"),
     ],
 )
 def test_one_planted_import_breaks_its_contract(

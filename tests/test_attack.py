@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from attack_rig import stalls
 
-from uavctl.build import build_design
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
 from uavctl.config import load_config
-from uavctl.library_store import library_for
 
 
 @pytest.fixture(scope="module", autouse=True)

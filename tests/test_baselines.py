@@ -9,14 +9,14 @@ import pytest
 from baseline_rig import MAKERS, arrivals, cube, flown, noise, problem
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import Problem
+from uavctl.smpc.baselines import ControlProblem
 
 Array = NDArray[np.float64]
 RUNS, STEPS, LOSS = 12, 30, 0.4
 GENERAL = ("coupled 1", "second input 0", "free chain 0", "lagged 0", "redundant inputs 1", "calm axis, no column")
 
 
-def size(given: Problem) -> Array:
+def size(given: ControlProblem) -> Array:
     """About the room of each state to its limits (n_x,), 1 where it has none."""
     margin = np.append(given.state_set.margin(given.target), np.inf)
     rows = [np.append(given.state_set.c[:, i] != 0, True) for i in range(given.plant.n_x)]
@@ -24,7 +24,7 @@ def size(given: Problem) -> Array:
     return np.where(np.isfinite(room), room, 1.0)
 
 
-def starts(given: Problem, seed: int) -> Array:
+def starts(given: ControlProblem, seed: int) -> Array:
     spread = np.random.default_rng(seed).uniform(-0.9, 0.9, (RUNS, given.plant.n_x))
     return np.asarray(given.target + size(given) * spread)
 

@@ -9,14 +9,14 @@ from baseline_rig import PAPER_START, arrivals, flown, noise, problem, unlimited
 from numpy.typing import NDArray
 
 from uavctl.smpc.baselines import Governor, Lqg, MeanQp, PacketisedPredictive
-from uavctl.smpc.baselines.problem import Problem
 from uavctl.smpc.batch import News, predict
-from uavctl.smpc.lqg_bound import lqr
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import ControlProblem
 
 Array = NDArray[np.float64]
 
 
-def sigma(given: Problem, steps: int) -> Array:
+def sigma(given: ControlProblem, steps: int) -> Array:
     """Standard deviation (m,) of each row after so many steps without a position."""
     plant, cov = given.plant, np.zeros((given.plant.n_x, given.plant.n_x))
     for _ in range(steps):

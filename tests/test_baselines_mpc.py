@@ -13,9 +13,9 @@ import pytest
 from baseline_rig import PAPER_START, arrivals, cube, flown, noise, problem, unlimited
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, Problem, ZeroOnLoss
-from uavctl.smpc.baselines.mpc import BatchMpc
-from uavctl.smpc.lqg_bound import lqr
+from uavctl.smpc.baselines import ControlProblem, HoldLast, Lqg, PacketisedPredictive, ZeroOnLoss
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import BatchMpc
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ GENERAL = ("coupled 1", "second input 0", "free chain 0", "lagged 0", "redundant
 class Printed:
     """The program as one would print it, in states, inputs and slacks."""
 
-    def __init__(self, given: Problem, backoff_x: Array, backoff_u: Array) -> None:
+    def __init__(self, given: ControlProblem, backoff_x: Array, backoff_u: Array) -> None:
         plant, steps = given.plant, given.horizon
         self.x0 = cp.Parameter(plant.n_x)
         self.x, self.u = cp.Variable((steps + 1, plant.n_x)), cp.Variable((steps, plant.n_u))
@@ -49,7 +49,7 @@ class Printed:
         return float(self.problem.value)
 
 
-def cost_of(given: Problem, backoff_x: Array, x: Array, plan: Array) -> tuple[float, float]:
+def cost_of(given: ControlProblem, backoff_x: Array, x: Array, plan: Array) -> tuple[float, float]:
     """Cost of a plan, slack and all, and the sum of the slack."""
     total, slack = 0.0, 0.0
     for t, u in enumerate(plan):
@@ -63,14 +63,14 @@ def cost_of(given: Problem, backoff_x: Array, x: Array, plan: Array) -> tuple[fl
     return total + float(off_x @ lqr(given.plant, given.q_x, given.q_u).p @ off_x), slack
 
 
-def reach(given: Problem) -> Array:
+def reach(given: ControlProblem) -> Array:
     """Size (n_x,) of the states to try: the room of each state to its limits, 2 where it has none."""
     margin = given.state_set.margin(given.target)
     room = [margin[given.state_set.c[:, i] != 0].max(initial=0.0) for i in range(given.plant.n_x)]
     return np.where(np.array(room) > 0.0, room, 2.0)
 
 
-def paper_with(**changes: Any) -> Problem:
+def paper_with(**changes: Any) -> ControlProblem:
     return replace(problem("paper"), **changes)
 
 
@@ -78,7 +78,7 @@ def with_row(limits: Polytope, row: list[float], side: float) -> Polytope:
     return Polytope(np.vstack([limits.c, row]), np.append(limits.b, side))
 
 
-PROBLEMS: dict[str, Callable[[], Problem]] = {
+PROBLEMS: dict[str, Callable[[], ControlProblem]] = {
     **{name: partial(problem, name) for name in ("paper", "room-hahn-stursberg", *GENERAL)},
     "axes that share weights of states": lambda: paper_with(
         q_x=np.diag([10.0, 0.1, 10.0, 0.1]) + 5.0 * np.eye(4)[[2, 3, 0, 1]] * [1.0, 0.0, 1.0, 0.0]

@@ -9,12 +9,12 @@ import pytest
 from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, gains, noise, problem
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import CascadedPid, PidGains, Problem, tune
-from uavctl.smpc.baselines.pid_tuning import _costs
+from uavctl.smpc.baselines import CascadedPid, ControlProblem, PidGains, tune
+from uavctl.smpc.baselines.feedback import _costs
 from uavctl.smpc.batch import News
 
 Array = NDArray[np.float64]
-Scene = tuple[Problem, NDArray[np.intp], Array]
+Scene = tuple[ControlProblem, NDArray[np.intp], Array]
 ACCEL = 0.49429632181478  # [m/s²] per unit of input
 
 
@@ -149,9 +149,7 @@ def test_the_tuner_s_cost_is_the_world_s(scene: Scene) -> None:
     assert _costs(given, some, PAPER_START, newest, disturbances)[0] == pytest.approx(wanted, rel=1e-9)
 
 
-def test_tuned_gains_beat_all_of_300_random_ones_and_are_the_same_each_time(
-    scene: Scene,
-) -> None:
+def test_tuned_gains_beat_all_of_300_random_ones_and_are_the_same_each_time(scene: Scene) -> None:
     given, newest, disturbances = scene
     tuned = tune(given, PAPER_START, newest, disturbances)
     assert values(tune(given, PAPER_START, newest, disturbances)).tobytes() == values(tuned).tobytes()

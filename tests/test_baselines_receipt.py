@@ -9,7 +9,7 @@ import pytest
 from baseline_rig import PAPER_START, Fed, problem
 
 from uavctl.smpc.baselines import HoldLast, PacketisedPredictive, ZeroOnLoss
-from uavctl.smpc.baselines.mpc import BatchMpc
+from uavctl.smpc.nominal import BatchMpc
 from uavctl.smpc.sets import Polytope
 
 # Newest position known in the steps 0, 1 …: one that is lost in between, a late one (step 5 sees that of step 4).

@@ -10,16 +10,16 @@ from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, noise, problem
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.baselines import Lqg, Problem, WorstCaseDelay
-from uavctl.smpc.baselines.worst_case import _backoffs, _prediction_gain
+from uavctl.smpc.baselines import ControlProblem, Lqg, WorstCaseDelay
+from uavctl.smpc.baselines.mpc import _backoffs, _prediction_gain
 from uavctl.smpc.batch import News
-from uavctl.smpc.lqg_bound import lqr
+from uavctl.smpc.bounds import lqr
 
 Array = NDArray[np.float64]
 DELAY = 4
 
 
-def asked_in(given: Problem, states: Array, newest: NDArray[np.intp], inputs: Array) -> Array:
+def asked_in(given: ControlProblem, states: Array, newest: NDArray[np.intp], inputs: Array) -> Array:
     """What is asked for in each step (T, n_u) along a trajectory that goes its own way."""
     controller = WorstCaseDelay(given, DELAY, 1.0, 1.0)
     controller.begin(1)

@@ -14,33 +14,38 @@ from baseline_rig import problem
 from numpy.typing import NDArray
 from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
 
-from sim.world import World
-from uavctl.bench import BenchResult, Sizes, run, run_bench
-from uavctl.bench.decisions import questions, time_decisions
-from uavctl.bench.flown import ROUNDS, time_flight
-from uavctl.bench.frozen_qp import FrozenProgram, time_frozen_qp
-from uavctl.bench.growth import copies, few_policies, growth_with_axes, lengthened
-from uavctl.bench.in_flight import InFlight
-from uavctl.bench.plot import bench_svg
-from uavctl.bench.states import LOOP_STEPS, closed_loops, draw_states
-from uavctl.bench.timing import FROZEN, Case, exponent, timed
-from uavctl.build import build_conditioned, build_controller
-from uavctl.cli import bench_cmd
+from sim.simulation import World
+from uavctl.build.controller import build_conditioned, build_controller
+from uavctl.cli import bench as bench_cmd
 from uavctl.cli.app import run as command
 from uavctl.config import load_config
-from uavctl.data import Plan, Record, SolveStatus
 from uavctl.errors import UavctlError
+from uavctl.lab.bench import run
+from uavctl.lab.bench.decisions import ROUNDS, questions, time_decisions, time_flight
+from uavctl.lab.bench.run import LOOP_STEPS, BenchSizes, InFlight, bench_svg, closed_loops, draw_states, run_bench
+from uavctl.lab.bench.timing import (
+    FROZEN,
+    BenchResult,
+    Case,
+    FrozenProgram,
+    copies,
+    exponent,
+    few_policies,
+    growth_with_axes,
+    lengthened,
+    time_frozen_qp,
+    timed,
+)
 from uavctl.loop import ControlLoop
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
-from uavctl.smpc.components import decompose
-from uavctl.smpc.conditioned import ConditionedSolver
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import horizon_of
-from uavctl.smpc.library import Library
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.records import Plan, Record, SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.meanqp import MeanProblem
 
 Array = NDArray[np.float64]
 
@@ -49,7 +54,9 @@ WANTED = {
     "ratio_exact_library", "growth_h", "growth_axes", "qp_us", "ratio_cvxpy_library", "shares", "gap", "library_s",
     "library_bytes", "memory_mb", "ready_s", "frozen_us", "mixture_us", "conditioned",
 }  # fmt: skip
-SMALL = Sizes(states=12, printed=1, cvxpy=3, exact=6, runs=2, horizons=(5, 8, 12), policies=3, growth_states=30, axes=3)
+SMALL = BenchSizes(
+    states=12, printed=1, cvxpy=3, exact=6, runs=2, horizons=(5, 8, 12), policies=3, growth_states=30, axes=3
+)
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +116,10 @@ def test_the_conditioned_decision_is_timed_on_the_same_states(result: BenchResul
 
 
 def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
-    asked: list[Outlook] = []
+    asked: list[Preview] = []
 
     class Recorder(ConditionedSolver):
-        def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+        def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
             asked.append(outlook)
             return super().solve(seq, x, target, outlook)
 
@@ -245,7 +252,7 @@ def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
 
 
 def test_a_box_without_a_feasible_state_ends_with_exit_code_1(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.bench.states._MOST_MISSES", 3)
+    monkeypatch.setattr("uavctl.lab.bench.run._MOST_MISSES", 3)
     beyond = replace(design, target=np.array([60.0, 0.0, 0.0, 0.0]))
     with pytest.raises(UavctlError, match=r"no state was found .* \[sets\]") as caught:
         draw_states(beyond, ConicSolver(beyond), 2, 0.3, 0, lambda _: None)
@@ -275,7 +282,7 @@ class Stub:
         self.asked: list[float] = []
         self.collected: list[bool] = []
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         self.asked.append(float(x[0]))
         self.collected.append(gc.isenabled())
         return Answer.failed(seq, SolveStatus.FAILED, FROZEN)
@@ -284,7 +291,7 @@ class Stub:
 class Breaks(Stub):
     """Breaks down once it is timed."""
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         if not gc.isenabled():
             raise ArithmeticError
         return super().solve(seq, x, target, outlook)
@@ -427,7 +434,7 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
     given: list[tuple[float, int, int]] = []
 
     def fake(
-        _design: Design, loss: float, seed: int, advance: run.Advance, sizes: Sizes, conditioned: ConditionedSolver
+        _design: Design, loss: float, seed: int, advance: run.Advance, sizes: BenchSizes, conditioned: ConditionedSolver
     ) -> BenchResult:
         assert conditioned.problem.horizon == 12
         for done in range(3):

@@ -9,14 +9,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from uavctl.bench.loop_result import LoopBench, LoopRun, Spread
 from uavctl.cli.app import run
+from uavctl.lab.bench.loop import LoopBench, LoopRun, TimeQuantiles
 
 NO_LIBRARY = ("--set", 'solver.method="exact"')  # none has to be made
 
 
-def spread(us: float) -> Spread:
-    return Spread(p50=us, p99=us, p999=us, max=us)
+def spread(us: float) -> TimeQuantiles:
+    return TimeQuantiles(p50=us, p99=us, p999=us, max=us)
 
 
 def one(us: float, missed: float = 0.0) -> LoopRun:
@@ -28,7 +28,7 @@ def one(us: float, missed: float = 0.0) -> LoopRun:
 
 
 def test_a_spread_is_in_microseconds() -> None:
-    times = Spread.of(np.arange(1001) * 1000)
+    times = TimeQuantiles.of(np.arange(1001) * 1000)
     assert (times.p50, times.p99, times.p999, times.max) == (500.0, 990.0, 999.0, 1000.0)
 
 

@@ -30,18 +30,16 @@ from flight_rig import (
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uavctl.build import build_controller, build_design, build_spec
+from uavctl.build.controller import build_controller, build_design, build_spec
 from uavctl.config import load_config
-from uavctl.data import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.errors import ConfigError
-from uavctl.flight.bias_bound import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
-from uavctl.flight.step import initial_state, step
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
-from uavctl.smpc.bias import with_bias
-from uavctl.smpc.innovation import innovations
+from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, initial_state, step
+from uavctl.records import ControlMode, PositionSample, StepInput, VehicleMotion
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
+from uavctl.smpc.estimate import innovations, with_bias
 
 Array = NDArray[np.float64]
 
@@ -202,7 +200,7 @@ def test_a_plan_is_shifted_by_it_and_says_so() -> None:
 class Steady(StubSolver):
     """Asks for the same all the time."""
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         answer = super().solve(seq, x, target, outlook)
         return replace(answer, inputs=np.full_like(answer.inputs, 0.2))
 

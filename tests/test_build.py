@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.build import build_controller, build_design, build_plant, build_solver, build_spec
+from uavctl.build.controller import build_controller, build_design, build_plant, build_solver, build_spec
+from uavctl.build.library import library_for
 from uavctl.config import load_config, presets
-from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
-from uavctl.library_store import library_for
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.printed import PrintedSolver
+from uavctl.records import SolveStatus
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 
 
 def test_the_paper_s_plant_is_as_printed() -> None:

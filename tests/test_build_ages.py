@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from uavctl.build import build_conditioned
-from uavctl.build_late import build_ages, build_delayed_link
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
+from uavctl.build.controller import build_conditioned
+from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
+from uavctl.lab.campaign.world import draw, newest
 
 Array = NDArray[np.float64]
 RUNS, STEPS, OLDEST = 20_000, 80, 12

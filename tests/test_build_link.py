@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim.channel import Channel
-from uavctl.build import build_design, build_spec
-from uavctl.build_link import Packets, build_link, packets_per_step, promised
+from uavctl.build.controller import build_design, build_spec
+from uavctl.build.link import Packets, build_link, packets_per_step, promised
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 

@@ -8,20 +8,16 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, read, table
 
-from uavctl.build import build_problem
-from uavctl.campaign.cells import cell_of, cells_of, document, told
-from uavctl.campaign.chance import draw
-from uavctl.campaign.controllers import TUNING_FIRST, build, built
-from uavctl.campaign.links import newest
-from uavctl.campaign.setting import Met, met, start_of
-from uavctl.campaign.spec import CHUNK
-from uavctl.campaign.tasks import tasks_of
-from uavctl.campaign.world import fly
+from uavctl.build.controller import build_problem
 from uavctl.cli.prepare import ready_library
 from uavctl.config import load_config
+from uavctl.lab.campaign.controllers import TUNING_FIRST, Met, build, built, met, start_of
+from uavctl.lab.campaign.spec import CHUNK
+from uavctl.lab.campaign.tasks import cell_of, cells_of, document, tasks_of, told
+from uavctl.lab.campaign.world import draw, fly, newest
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive, WorstCaseDelay
-from uavctl.smpc.batch_smpc import BatchSmpc
-from uavctl.smpc.risk import kappa
+from uavctl.smpc.batch import BatchSmpc
+from uavctl.smpc.hahn_stursberg.design import kappa
 
 LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
 WEAK = table("plant", "weak", 'set = ["plant.b=[[0.1, 0.0], [0.2, 0.0], [0.0, 0.1], [0.0, 0.2]]"]')

@@ -16,9 +16,9 @@ import pytest
 from campaign_rig import HEAD, controller, table
 from distributed import LocalCluster
 
-from uavctl.campaign.spec import CHUNK
-from uavctl.cli import campaign_cmd
+from uavctl.cli import campaign as campaign_cmd
 from uavctl.cli.app import run
+from uavctl.lab.campaign.spec import CHUNK
 
 LIMIT_S = 120.0
 RUNS = CHUNK + 3  # two tasks a cell
@@ -70,7 +70,7 @@ def contents(folder: Path) -> bytes:
 
 HELD = """
 import sys
-from uavctl.campaign.store import Store
+from uavctl.lab.campaign.store import Store
 from uavctl.cli.app import run
 
 def keep_and_wait(store, task, columns):

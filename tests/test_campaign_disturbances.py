@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from uavctl.campaign.disturbances import disturbances
-from uavctl.campaign.spec import DisturbanceSpec, Shape
+from uavctl.lab.campaign.controllers import disturbances
+from uavctl.lab.campaign.spec import DisturbanceSpec, Shape
 
 RUNS, STEPS = 4000, 50
 NORMAL: NDArray[np.float64] = np.random.default_rng(3).standard_normal((RUNS, STEPS, 2))

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.build import build_design
-from uavctl.campaign.read import read_campaign
-from uavctl.campaign.setting import Setting, met
-from uavctl.campaign.trial_read import is_trial, read_trial
+from uavctl.build.controller import build_design
 from uavctl.errors import DesignError
+from uavctl.lab.campaign.controllers import Setting, met
+from uavctl.lab.campaign.spec import read_campaign
+from uavctl.lab.campaign.trials import is_trial, read_trial
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "campaigns"
 EVERY = sorted(FOLDER.glob("*.toml"))

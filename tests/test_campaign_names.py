@@ -12,12 +12,10 @@ from campaign_results import cell, runs, write
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from logs.svg import Drawing
-from uavctl.campaign import plots
-from uavctl.campaign.plots import Looks
-from uavctl.campaign.results import read_results
-from uavctl.campaign.statistics import summarise
-from uavctl.campaign.verdict import grouped, verdicts
+from logs.report.svg import Drawing
+from uavctl.lab.campaign import plots
+from uavctl.lab.campaign.plots import Looks
+from uavctl.lab.campaign.results import grouped, read_results, summarise, verdicts
 
 LINKS = (
     "30 %",

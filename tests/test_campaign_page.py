@@ -12,16 +12,20 @@ import numpy as np
 import pytest
 from campaign_results import cell, runs, write
 
-from uavctl.campaign.intervals import Difference
-from uavctl.campaign.legend import legend
-from uavctl.campaign.page import write_report
-from uavctl.campaign.plots import Looks
-from uavctl.campaign.results import read_results
-from uavctl.campaign.statistics import summarise
-from uavctl.campaign.story import story
-from uavctl.campaign.verdict import Verdict, brief, grouped, in_words, verdicts, word_of
-from uavctl.campaign.view import View
 from uavctl.errors import UavctlError
+from uavctl.lab.campaign.intervals import PairedDifference
+from uavctl.lab.campaign.page import CampaignView, story, write_report
+from uavctl.lab.campaign.plots import Looks, legend
+from uavctl.lab.campaign.results import (
+    CampaignVerdict,
+    brief,
+    grouped,
+    in_words,
+    read_results,
+    summarise,
+    verdicts,
+    word_of,
+)
 
 N = 60
 NOISE = np.random.default_rng(3).normal(0.0, 1.0, N)
@@ -54,7 +58,7 @@ def text_of(path: Path) -> str:
     return re.sub(r"\s+", " ", " ".join(parser.text))
 
 
-def judged(tmp_path: Path, baseline: list[dict[str, Any]], smpc: list[dict[str, Any]] | None = None) -> Verdict:
+def judged(tmp_path: Path, baseline: list[dict[str, Any]], smpc: list[dict[str, Any]] | None = None) -> CampaignVerdict:
     rows = [*(smpc or runs(0, SMPC.tolist())), *baseline]
     results = read_results(write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "theirs")], rows))
     (found,) = verdicts(results, grouped(summarise(tmp_path)))
@@ -100,7 +104,7 @@ def test_a_rate_above_the_allowance_is_never_told_as_within_it(tmp_path: Path) -
     one = found.comparisons[0]
     rate, interval = one.baseline.input_violation_rate, one.baseline.input_violation_ci
     assert rate is not None and interval is not None and interval[0] <= 0.1 < rate
-    safer = replace(one, inputs=Difference(mean=-rate, low=-rate, high=-rate, runs=3))
+    safer = replace(one, inputs=PairedDifference(mean=-rate, low=-rate, high=-rate, runs=3))
     (sentence,) = in_words(replace(found, comparisons=(safer,)))
     assert sentence.endswith(
         "inputs in 28 % of steps (SMPC 0 %). That is more than the 10 % allowed for inputs, which may still be chance "
@@ -128,7 +132,7 @@ def test_a_rate_at_the_allowance_is_within_it(tmp_path: Path) -> None:
 def test_the_promise_is_told_by_what_was_measured(hits: list[int], said: str, tmp_path: Path) -> None:
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
     folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
-    assert said in " ".join(story(View.of(read_results(folder))))
+    assert said in " ".join(story(CampaignView.of(read_results(folder))))
 
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:

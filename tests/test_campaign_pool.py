@@ -12,16 +12,15 @@ import pytest
 from campaign_rig import cells, controller
 from patience import LIMIT_S, until
 
-from uavctl.campaign import pool
-from uavctl.campaign.pool import ONE_THREAD, processes
-from uavctl.campaign.run import fly_tasks
-from uavctl.campaign.spec import CHUNK
-from uavctl.campaign.tasks import Columns, Work, tasks_of
 from uavctl.errors import UsageError
+from uavctl.lab.campaign import pool
+from uavctl.lab.campaign.pool import ONE_THREAD, fly_tasks, processes
+from uavctl.lab.campaign.spec import CHUNK
+from uavctl.lab.campaign.tasks import Columns, Work, tasks_of
 
 ORPHAN = """
 import os, sys
-from uavctl.campaign.pool import processes
+from uavctl.lab.campaign.pool import processes
 if __name__ == "__main__":
     with processes(1) as crew:
         print(crew._pool.submit(os.getpid).result(), flush=True)

@@ -12,25 +12,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from uavctl.build import build_estimator, build_plant, build_problem
-from uavctl.campaign.again import again
-from uavctl.campaign.cells import Cell, document
-from uavctl.campaign.chance import draw, draw_noise
-from uavctl.campaign.controllers import sight_of
-from uavctl.campaign.intervals import worst_step
-from uavctl.campaign.links import known, newest_of
-from uavctl.campaign.positions import PositionFilter
-from uavctl.campaign.setting import met
-from uavctl.campaign.tasks import Columns, flown, fly_task, tasks_of
+from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
-from uavctl.data import PositionSample
 from uavctl.errors import UsageError
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
+from uavctl.lab.campaign.controllers import met, sight_of
+from uavctl.lab.campaign.intervals import worst_step
+from uavctl.lab.campaign.rerun import again
+from uavctl.lab.campaign.tasks import Cell, Columns, document, flown, fly_task, tasks_of
+from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
+from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
-from uavctl.smpc.baselines.problem import unseen
 from uavctl.smpc.batch import Counts, News, predict, predicted_cov
-from uavctl.smpc.innovation import innovations
+from uavctl.smpc.estimate import innovations
+from uavctl.smpc.nominal import unseen
 
 Array = NDArray[np.float64]
 S = 1_000_000_000

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from campaign_rig import HEAD, controller, read, table
 
-from uavctl.campaign.cells import document
-from uavctl.campaign.compose import campaign_of
-from uavctl.campaign.read import read_campaign
 from uavctl.config import load_config
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
+from uavctl.lab.campaign.spec import campaign_of, read_campaign
+from uavctl.lab.campaign.tasks import document
 
 LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
 

@@ -11,23 +11,20 @@ import pyarrow.parquet as pq
 import pytest
 from loopback_rig import Memory, make_loop
 
-from logs.replay import recorded_library
-from sim.world import World
-from uavctl.build import build_design, build_plant
-from uavctl.campaign.again import Again
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
-from uavctl.campaign.refly import Reflight, agreement, delays_ns, flight_config, reflight
-from uavctl.campaign.world import Scene, fly
+from logs.recording.replay import recorded_library
+from sim.simulation import World
+from uavctl.build.controller import build_design, build_plant
+from uavctl.build.library import library_for
 from uavctl.cli.app import run
-from uavctl.cli.refly_cmd import refly
+from uavctl.cli.campaign import refly_of as refly
 from uavctl.config import load_config
 from uavctl.config.link import LinkConfig
-from uavctl.data import Decision, Truth
 from uavctl.errors import UsageError
-from uavctl.library_store import library_for
-from uavctl.smpc.batch_smpc import BatchSmpc, OneByOne
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.lab.campaign.rerun import Reflight, Rerun, agreement, delays_ns, flight_config, reflight
+from uavctl.lab.campaign.world import Scene, draw, fly, newest
+from uavctl.records import Decision, Truth
+from uavctl.smpc.batch import BatchSmpc, OneByOne
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver
 
 STEPS = 50
 BASE = load_config("paper")
@@ -37,7 +34,7 @@ LATE = LinkConfig(loss=0.1, delay_s=0.5, jitter_s=1.6)
 BURSTS = LinkConfig(model="gilbert-elliott", loss=0.1, burst_enter=0.1, burst_leave=0.05, burst_loss=1.0)
 
 
-def flown(link: LinkConfig, number: int, *changes: str) -> Again:
+def flown(link: LinkConfig, number: int, *changes: str) -> Rerun:
     """One run of preset `paper`, flown by the loop in memory; `changes` are of the plant that flies."""
     true = load_config("paper", list(changes))
     plant, believed = build_plant(true), build_plant(BASE)
@@ -53,7 +50,7 @@ def flown(link: LinkConfig, number: int, *changes: str) -> Again:
         OneByOne(solver, DESIGN.target, (DESIGN.horizon, 2)), believed, DESIGN.horizon, len(DESIGN.late), 0.5
     )
     found = fly(scene, controller, known, w)
-    return Again(BASE, true.plant, start, known[0], w[0], found, "test", 5)
+    return Rerun(BASE, true.plant, start, known[0], w[0], found, "test", 5)
 
 
 def lockstep(flight: Reflight) -> Memory:

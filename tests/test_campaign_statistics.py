@@ -11,7 +11,8 @@ from campaign_results import STEPS, cell, runs, write
 from scipy.optimize import brentq
 from scipy.stats import binom
 
-from uavctl.campaign.intervals import (
+from uavctl.errors import UavctlError, UsageError
+from uavctl.lab.campaign.intervals import (
     BOOTSTRAP_UP_TO,
     bootstrap_mean,
     clopper_pearson,
@@ -20,9 +21,7 @@ from uavctl.campaign.intervals import (
     step_rate,
     worst_step,
 )
-from uavctl.campaign.results import read_results
-from uavctl.campaign.statistics import difference, summarise
-from uavctl.errors import UavctlError, UsageError
+from uavctl.lab.campaign.results import difference, read_results, summarise
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(1, 10), (3, 7), (50, 200), (199, 200), (2, 200_000)])

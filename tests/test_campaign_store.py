@@ -9,13 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 from campaign_rig import cells, controller, read, table
 
-from uavctl.campaign.again import again
-from uavctl.campaign.cells import cells_of, document
-from uavctl.campaign.spec import CHUNK
-from uavctl.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.campaign.tasks import Task, fly_task, tasks_of
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UavctlError, UsageError
+from uavctl.lab.campaign.rerun import again
+from uavctl.lab.campaign.spec import CHUNK
+from uavctl.lab.campaign.store import SCHEMA, Store, first_difference, table_of
+from uavctl.lab.campaign.tasks import Task, cells_of, document, fly_task, tasks_of
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
 DOCUMENT = {"name": "one", "runs": 3, "cells": [{"index": 0}]}

@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, table
 
-from uavctl.campaign import controllers, spec
-from uavctl.campaign.controllers import build
-from uavctl.campaign.run import fly_tasks
-from uavctl.campaign.setting import met
-from uavctl.campaign.tasks import Columns, Task, Work, fly_task, tasks_of
-from uavctl.campaign.world import fly
-from uavctl.smpc.batch import News
-from uavctl.smpc.batch_smpc import BatchSmpc
+from uavctl.lab.campaign import controllers, spec
+from uavctl.lab.campaign.controllers import build, met
+from uavctl.lab.campaign.pool import fly_tasks
+from uavctl.lab.campaign.tasks import Columns, Task, Work, fly_task, tasks_of
+from uavctl.lab.campaign.world import fly
+from uavctl.smpc.batch import BatchSmpc, News
 
 FIGURES = ("cost", "settled_cost", "mean_square_input", "largest_gap")
 # B of preset paper a million times stronger: whatever is asked for drives the state out of all numbers.

@@ -11,17 +11,25 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from uavctl.campaign import trial_cells
-from uavctl.campaign.store import Store, table_of
-from uavctl.campaign.trial_cells import CHUNK, SCHEMA, TrialTask, places_of, seed_of, trial_document, trial_tasks
-from uavctl.campaign.trial_page import trial_html
-from uavctl.campaign.trial_read import is_trial, read_trial
-from uavctl.campaign.trial_results import summarise_trial
 from uavctl.cli.app import run
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import ConfigError
-from uavctl.trial.case import TrialCell
-from uavctl.trial.fly import TrialFlight, fly
+from uavctl.lab.campaign import trials as trial_cells
+from uavctl.lab.campaign.page import trial_html
+from uavctl.lab.campaign.store import Store, table_of
+from uavctl.lab.campaign.trials import (
+    CHUNK,
+    SCHEMA,
+    TrialTask,
+    is_trial,
+    places_of,
+    read_trial,
+    seed_of,
+    summarise_trial,
+    trial_document,
+    trial_tasks,
+)
+from uavctl.lab.trial import TrialCell, TrialFlight, fly
 
 RUNS = CHUNK + 1  # two tasks a cell
 HEAD = f"""

@@ -10,14 +10,13 @@ import pytest
 from campaign_results import cell, runs, write
 from numpy.typing import NDArray
 
-from uavctl.build import build_conditioned, build_design
-from uavctl.build_mission import build_rests
-from uavctl.campaign.page import report_html
-from uavctl.campaign.results import read_results
-from uavctl.campaign.statistics import summarise
-from uavctl.campaign.ways import ways
+from uavctl.build.controller import build_conditioned, build_design
+from uavctl.build.mission import build_rests
 from uavctl.config import load_config
-from uavctl.trial.room import usable_seen
+from uavctl.lab.campaign.page import report_html
+from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.tasks import ways
+from uavctl.lab.trial import usable_seen
 
 CONFIG = load_config("room-hahn-stursberg")  # target (1.5, 1, -1.2), walls at +-3, +-2.5, -2.5 and 0
 DT_S = CONFIG.plant.dt_s

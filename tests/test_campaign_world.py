@@ -7,14 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from sim.channel import Channel
-from uavctl.build import build_design, build_plant
-from uavctl.build_late import build_delayed_link
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
-from uavctl.campaign.world import Scene, fly
+from uavctl.build.controller import build_design, build_plant
+from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
-from uavctl.smpc.batch import News, predict
-from uavctl.smpc.batch_smpc import BatchSmpc, Decisions
+from uavctl.lab.campaign.world import Scene, draw, fly, newest
+from uavctl.smpc.batch import BatchSmpc, Decisions, News, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 

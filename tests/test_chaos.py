@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from chaos import runs, soak_core
 
-from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, ControlMode, Vec3
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, ControlMode, Vec3
 
 
 @pytest.mark.fault(3)

@@ -11,9 +11,8 @@ from check_rig import Checked, Hand, S, look, twisted
 from mavlink_rig import packets, read
 
 from uavctl.check.axes import axis_items, compared
-from uavctl.check.item import State
+from uavctl.check.findings import Heard, ItemState, Sample
 from uavctl.check.preflight import Preflight
-from uavctl.check.seen import Sample, Seen
 from uavctl.config import load_config
 from uavctl.loop import make_links
 from uavctl.mavlink.messages import Heartbeat
@@ -46,7 +45,7 @@ def around(at_s: float) -> tuple[float, float, float] | None:
 
 
 def moving(*wrong: str, autopilot: str, matrix: list[list[float]] | None = None, more: tuple[str, ...] = ()) -> Checked:
-    setup = [f"sim.autopilot={autopilot}", ALOFT, *more]
+    setup = [f"sim.autopilot.autopilot={autopilot}", ALOFT, *more]
     return look(setup, wrong, seconds=6.5, airborne=True, setpoints=around, twist=twisted(matrix or scaled(1.0)))
 
 
@@ -54,23 +53,23 @@ def moving(*wrong: str, autopilot: str, matrix: list[list[float]] | None = None,
 def test_a_right_set_up_is_good_once_it_has_moved(autopilot: str) -> None:
     found = moving(autopilot=autopilot)
     assert found.bad == []
-    assert found["axes"].state is State.GOOD and "moved" in found["axes"].value
+    assert found["axes"].state is ItemState.GOOD and "moved" in found["axes"].value
 
 
 @BOTH
 @pytest.mark.parametrize("setup", ["frame.convention=enu", "frame.yaw_deg=40", "frame.origin_m=[1.0,-2.0,0.5]"])
 def test_a_right_set_up_with_a_frame_of_its_own_is_good(autopilot: str, setup: str) -> None:
     found = moving(autopilot=autopilot, more=(setup,))
-    assert found.bad == [] and found["axes"].state is State.GOOD
+    assert found.bad == [] and found["axes"].state is ItemState.GOOD
 
 
 @BOTH
 @pytest.mark.parametrize("place", [ORIGIN, AWAY])
 def test_a_right_set_up_at_rest_is_not_refused_and_what_cannot_be_seen_is_told(autopilot: str, place: str) -> None:
-    found = look([f"sim.autopilot={autopilot}", place])
+    found = look([f"sim.autopilot.autopilot={autopilot}", place])
     assert found.bad == []
     axes = found["axes"]
-    assert axes.state is State.UNDETERMINED and "up is taken for down" in axes.value and axes.hint
+    assert axes.state is ItemState.UNDETERMINED and "up is taken for down" in axes.value and axes.hint
     assert ("ENU" in axes.value) == (place is ORIGIN)
 
 
@@ -86,7 +85,7 @@ def test_a_right_set_up_at_rest_is_not_refused_and_what_cannot_be_seen_is_told(a
 )
 def test_a_wrong_frame_is_named_when_it_moves(autopilot: str, wrong: str, told: str) -> None:
     axes = moving(wrong, autopilot=autopilot)["axes"]
-    assert axes.state is State.BAD and told in axes.value and axes.hint
+    assert axes.state is ItemState.BAD and told in axes.value and axes.hint
 
 
 @pytest.mark.fault(15)
@@ -94,7 +93,7 @@ def test_a_wrong_frame_is_named_when_it_moves(autopilot: str, wrong: str, told: 
 @pytest.mark.parametrize("angle_deg", [30, -15])
 def test_a_frame_that_is_turned_a_little_is_measured_when_it_moves(autopilot: str, angle_deg: int) -> None:
     axes = moving(f"frame.yaw_deg={angle_deg}", autopilot=autopilot)["axes"]
-    assert axes.state is State.BAD
+    assert axes.state is ItemState.BAD
     told = re.search(r"turned by (-?\d+) deg about the vertical", axes.value)
     assert told is not None and abs(int(told[1]) - angle_deg) <= 2
 
@@ -117,7 +116,7 @@ def test_a_frame_that_is_turned_a_little_is_measured_when_it_moves(autopilot: st
 )
 def test_a_wrong_unit_or_a_mirror_is_named_when_it_moves(autopilot: str, matrix: list[list[float]], told: str) -> None:
     found = moving(autopilot=autopilot, matrix=matrix, more=("estimator.max_position_m=1e5",))
-    assert found["axes"].state is State.BAD and told in found["axes"].value
+    assert found["axes"].state is ItemState.BAD and told in found["axes"].value
 
 
 @pytest.mark.fault(15)
@@ -126,8 +125,8 @@ def test_a_wrong_unit_or_a_mirror_is_named_when_it_moves(autopilot: str, matrix:
     "wrong", ["frame.convention=enu", "frame.yaw_deg=90", "frame.yaw_deg=180", "frame.yaw_deg=-30"]
 )
 def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: str) -> None:
-    found = look([f"sim.autopilot={autopilot}", AWAY], [wrong])
-    assert found["axes"].state is State.BAD
+    found = look([f"sim.autopilot.autopilot={autopilot}", AWAY], [wrong])
+    assert found["axes"].state is ItemState.BAD
 
 
 @pytest.mark.fault(15)
@@ -135,44 +134,48 @@ def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: s
 @pytest.mark.parametrize("matrix", [scaled(1000.0), scaled(100.0), scaled(0.01), *MIRRORED.values(), Y_UP, FLU])
 def test_a_wrong_unit_or_a_mirror_is_caught_at_rest_off_the_origin(autopilot: str, matrix: list[list[float]]) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot={autopilot}", AWAY, more], twist=twisted(matrix))
-    assert found["axes"].state is State.BAD
+    found = look([f"sim.autopilot.autopilot={autopilot}", AWAY, more], twist=twisted(matrix))
+    assert found["axes"].state is ItemState.BAD
 
 
 @pytest.mark.fault(15)
 @BOTH
 def test_at_rest_on_the_origin_the_noise_tells_the_unit(autopilot: str) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot={autopilot}", ORIGIN, more], twist=twisted(scaled(1000.0)))
-    assert found["position noise"].state is State.BAD and "millimetres" in found["position noise"].hint
+    found = look([f"sim.autopilot.autopilot={autopilot}", ORIGIN, more], twist=twisted(scaled(1000.0)))
+    assert found["position noise"].state is ItemState.BAD and "millimetres" in found["position noise"].hint
 
 
 @pytest.mark.fault(15)
 @BOTH
 @pytest.mark.parametrize(
-    ("right", "wrong"),
-    [("frame.yaw_deg=30", "frame.yaw_deg=0"), ("frame.convention=enu", "frame.convention=ned")],
+    ("right", "wrong"), [("frame.yaw_deg=30", "frame.yaw_deg=0"), ("frame.convention=enu", "frame.convention=ned")]
 )
 @pytest.mark.parametrize("message", ["vision", "mocap", "odometry"])
 def test_at_rest_on_the_origin_the_attitude_tells_a_turned_frame(
     autopilot: str, right: str, wrong: str, message: str
 ) -> None:
-    setup = [f"sim.autopilot={autopilot}", ORIGIN, right, f"sim.camera.message={message}"]
-    assert look(setup)["heading"].state is State.GOOD
+    setup = [f"sim.autopilot.autopilot={autopilot}", ORIGIN, right, f"sim.camera.message={message}"]
+    assert look(setup)["heading"].state is ItemState.GOOD
     declared = message == "odometry" and "enu" in right  # it says so itself, and is believed
-    assert (look(setup, [wrong])["heading"].state is State.BAD) == (not declared)
+    assert (look(setup, [wrong])["heading"].state is ItemState.BAD) == (not declared)
 
 
 def test_cameras_that_see_another_body_are_caught() -> None:
-    setup = ["sim.autopilot=px4", ALOFT, "sim.camera.swapped=[[0.0,99.0]]", "sim.camera.other_body_m=[0.0,0.0,-1.0]"]
+    setup = [
+        "sim.autopilot.autopilot=px4",
+        ALOFT,
+        "sim.camera.swapped=[[0.0,99.0]]",
+        "sim.camera.other_body_m=[0.0,0.0,-1.0]",
+    ]
     found = look(setup, seconds=6.5, airborne=True, setpoints=around)
-    assert found["axes"].state is State.BAD and "m for the cameras" in found["axes"].value
+    assert found["axes"].state is ItemState.BAD and "m for the cameras" in found["axes"].value
 
 
 def test_a_vehicle_that_counts_from_elsewhere_is_told_apart_by_its_movement() -> None:
     hand = Hand("check.same_origin=false", own=True)
     hand.follow()
-    assert hand.done()["axes"].state is State.GOOD
+    assert hand.done()["axes"].state is ItemState.GOOD
     hand = Hand("check.same_origin=false", own=True)
     hand.matrix = DOWN
     hand.follow()
@@ -182,10 +185,10 @@ def test_a_vehicle_that_counts_from_elsewhere_is_told_apart_by_its_movement() ->
 @pytest.mark.fault(15)
 @pytest.mark.parametrize(
     ("wrong", "want"),
-    [((), State.GOOD), (("frame.convention=enu",), State.BAD), (("frame.yaw_deg=-45",), State.BAD)],
+    [((), ItemState.GOOD), (("frame.convention=enu",), ItemState.BAD), (("frame.yaw_deg=-45",), ItemState.BAD)],
 )
 def test_a_level_attitude_is_meant_if_the_vehicle_takes_its_heading_from_it(
-    wrong: tuple[str, ...], want: State
+    wrong: tuple[str, ...], want: ItemState
 ) -> None:
     """At rest on the origin: a source that is level to the north to the last bit, as simulators are."""
     for fuses in (False, True):
@@ -196,7 +199,7 @@ def test_a_level_attitude_is_meant_if_the_vehicle_takes_its_heading_from_it(
             hand.rest(1.2)
             hand.tell(hand.vehicle.send("param_value", b"EKF2_EV_CTRL", as_float, 6, 1, 0))
         hand.rest(3.0)
-        assert hand.done()["heading"].state is (want if fuses else State.UNDETERMINED)
+        assert hand.done()["heading"].state is (want if fuses else ItemState.UNDETERMINED)
 
 
 # --- without a position of its own, a hand moves it -----------------------------------------------------------------
@@ -207,8 +210,8 @@ def test_three_movements_along_the_body_show_every_axis(heading_deg: float) -> N
     hand = Hand(heading_rad=math.radians(heading_deg), move=True)
     hand.follow()
     found = hand.done()
-    assert found["axes"].state is State.GOOD and found["movements"].state is State.GOOD
-    assert found["own position"].state is State.UNDETERMINED
+    assert found["axes"].state is ItemState.GOOD and found["movements"].state is ItemState.GOOD
+    assert found["own position"].state is ItemState.UNDETERMINED
     assert found.bad == []
 
 
@@ -231,14 +234,14 @@ def test_movements_name_a_wrong_set_up(matrix: list[list[float]], told: str) -> 
     hand.matrix = matrix
     hand.follow()
     found = hand.done()
-    assert found["axes"].state is State.BAD and told in found["axes"].value
+    assert found["axes"].state is ItemState.BAD and told in found["axes"].value
 
 
 def test_prompts_that_are_not_followed_fail_the_guided_check() -> None:
     hand = Hand(move=True)
     hand.rest(2.0)
     hand.carry(0.0, 0.0, -0.5)
-    assert hand.done()["movements"].state is State.BAD
+    assert hand.done()["movements"].state is ItemState.BAD
     hand.rest(70.0)  # two prompts run out
     found = hand.done()
     assert "missing: nose, right" in found["movements"].value
@@ -249,13 +252,13 @@ def test_nobody_is_asked_to_touch_an_armed_vehicle() -> None:
     hand.rest(1.2, armed=True)
     hand.rest(4.0, armed=True)
     assert hand.flight.prompt == ""
-    assert hand.done()["armed"].state is State.NOTE
+    assert hand.done()["armed"].state is ItemState.NOTE
 
 
 def test_positions_of_the_vehicle_itself_need_no_frame() -> None:
     setup = ['source.messages=["LOCAL_POSITION_NED"]', "daemon.mocap=udpin://0.0.0.0:14540"]
     found = look(setup)
-    assert found["axes"].state is State.GOOD and found.bad == []
+    assert found["axes"].state is ItemState.GOOD and found.bad == []
 
 
 # --- recorded: ArduCopter on its built-in simulated cameras, moving ---------------------------------------------------
@@ -277,24 +280,24 @@ def recorded(*wrong: str) -> Checked:
 
 def test_a_recorded_flight_is_a_right_example() -> None:
     found = recorded()
-    assert "axes" in found.items and found["axes"].state is not State.BAD
+    assert "axes" in found.items and found["axes"].state is not ItemState.BAD
     assert "moved" in found["axes"].value
-    assert found["own position"].state is State.GOOD
+    assert found["own position"].state is ItemState.GOOD
     assert found["position rate"].ok and found["position loss"].ok and found["position in the room"].ok
 
 
 @pytest.mark.fault(15)
 @pytest.mark.parametrize("wrong", ["frame.convention=enu", "frame.yaw_deg=90", "frame.yaw_deg=180", "frame.yaw_deg=25"])
 def test_the_recorded_flight_in_a_wrong_frame_is_caught(wrong: str) -> None:
-    assert recorded(wrong)["axes"].state is State.BAD
+    assert recorded(wrong)["axes"].state is ItemState.BAD
 
 
-def seen_with(autopilot: int, flags: int) -> Seen:
+def seen_with(autopilot: int, flags: int) -> Heard:
     """A vehicle at rest whose estimator tells these flags, with positions of its own beside the cameras'."""
     beat = Heartbeat(
         system=1, component=1, vehicle_type=2, autopilot=autopilot, base_mode=0, custom_mode=0, system_status=3
     )
-    seen = Seen(0, heartbeat=beat, estimator=flags)
+    seen = Heard(0, heartbeat=beat, estimator=flags)
     for k in range(20):
         at_ns = k * S // 10
         seen.own.append((at_ns, (1.0, 2.0, -0.1)))
@@ -317,7 +320,7 @@ def test_a_resting_px4_has_a_position_of_its_own(autopilot: int, flags: int, the
     seen = seen_with(autopilot, flags)
     assert compared(seen) is there
     own = axis_items(seen, load_config("room-hahn-stursberg"), [])[0]
-    assert own.name == "own position" and (own.state is State.GOOD) is there
+    assert own.name == "own position" and (own.state is ItemState.GOOD) is there
 
 
 @pytest.mark.parametrize("seconds", [0.9, 1.9])
@@ -337,11 +340,11 @@ def test_a_recorded_px4_at_rest_over_a_lossy_link_has_a_position_and_its_origin_
         flight.receive("vehicle", data, at_ns)
     assert flags == [0x1EF, 0xEF][: len(flags)] and len(flags) == (1 if seconds < 1.0 else 2)
     own = Checked(flight, at_ns)["own position"]
-    assert own.state is State.GOOD
+    assert own.state is ItemState.GOOD
 
 
 def test_another_origin_is_found_beside_a_resting_px4() -> None:
     seen = seen_with(12, 0x1EF)
     seen.own = [(at_ns, (1.0, 0.0, -0.1)) for at_ns, _ in seen.own]
     axes = axis_items(seen, load_config("room-hahn-stursberg"), [])[1]
-    assert axes.name == "axes" and axes.state is State.BAD
+    assert axes.name == "axes" and axes.state is ItemState.BAD

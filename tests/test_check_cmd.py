@@ -16,15 +16,13 @@ import pytest
 from loopback_rig import Memory
 from patience import LIMIT_S
 
-from sim.peers import Peers
-from uavctl.check.item import State, item
+from sim.simulation import Peers
+from uavctl.check.findings import ItemState, item
 from uavctl.cli.app import run
-from uavctl.cli.before_arming import record_items
-from uavctl.cli.check_cmd import disk_items
+from uavctl.cli.check import disk_items, record_items, run_preflight
 from uavctl.config import load_config
-from uavctl.data import Checked, Event
-from uavctl.preflight import run_preflight
-from uavctl.transport import Connection
+from uavctl.io.base import Connection
+from uavctl.records import Checked, Event
 
 # What is rightly found amiss where the machine stood still for a while; how it is judged is in test_check_items.
 OF_TIME = frozenset(
@@ -136,13 +134,13 @@ def test_a_time_that_is_none_is_refused(seconds: str) -> None:
 @pytest.mark.fault(29)
 def test_no_room_and_no_folder_are_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = disk_items(tmp_path / "a" / "b", 1)
-    assert [one.state for one in good] == [State.GOOD, State.GOOD]
+    assert [one.state for one in good] == [ItemState.GOOD, ItemState.GOOD]
     assert not (tmp_path / "a").exists()  # nothing is made
-    assert disk_items(tmp_path, 2**62)[1].state is State.BAD
+    assert disk_items(tmp_path, 2**62)[1].state is ItemState.BAD
     (tmp_path / "file").write_text("")
-    assert disk_items(tmp_path / "file" / "flights", 1)[0].state is State.BAD
+    assert disk_items(tmp_path / "file" / "flights", 1)[0].state is ItemState.BAD
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
-    assert disk_items(tmp_path, 1)[0].state is State.BAD
+    assert disk_items(tmp_path, 1)[0].state is ItemState.BAD
 
 
 # --- the runner, in virtual time ----------------------------------------------------------------
@@ -202,7 +200,7 @@ class Bench:
                 self.arrived[link].append((data, at_ns))
         return [name for name, waiting in self.arrived.items() if waiting]
 
-    def run(self, seconds: float, **more: Any) -> dict[str, State]:
+    def run(self, seconds: float, **more: Any) -> dict[str, ItemState]:
         items = run_preflight(self.config, self.wires, seconds, wait_for=self.wait, now=lambda: self.now_ns, **more)
         return {one.name: one.state for one in items}
 
@@ -211,16 +209,16 @@ def test_the_runner_is_bounded_and_answers_the_vehicle() -> None:
     bench = Bench()
     found = bench.run(4.0)
     assert bench.now_ns == pytest.approx(4.2e9, abs=2e8)
-    assert State.BAD not in found.values() and bench.wires["vehicle"].answered > 3
+    assert ItemState.BAD not in found.values() and bench.wires["vehicle"].answered > 3
 
 
 def test_it_waits_for_an_estimator_that_is_starting_but_not_for_ever() -> None:
-    bench = Bench("sim.autopilot=ardupilot", "check.wait_s=3.0")
+    bench = Bench("sim.autopilot.autopilot=ardupilot", "check.wait_s=3.0")
     for name, value in {"GPS1_TYPE": 0, "EK3_SRC1_POSXY": 6, "VISO_TYPE": 1}.items():
         bench.peers.autopilot.parameters.set(name, value)
     found = bench.run(2.0)
     assert bench.now_ns == pytest.approx(5.2e9, abs=2e8)
-    assert found["own position"] is State.UNDETERMINED
+    assert found["own position"] is ItemState.UNDETERMINED
 
 
 def test_a_stop_and_a_closed_connection_end_it() -> None:
@@ -237,14 +235,14 @@ def test_a_stop_and_a_closed_connection_end_it() -> None:
 def test_prompts_are_told_once_each_and_the_guided_check_ends_too() -> None:
     bench, told = Bench("check.wait_s=0.0"), list[str]()
     found = bench.run(2.0, move=True, prompt=told.append)
-    assert found["movements"] is State.BAD  # nobody moved it
+    assert found["movements"] is ItemState.BAD  # nobody moved it
     assert told[0].startswith("lift the body") and len(told) <= 6
     assert bench.now_ns < 125e9
 
 
 def test_what_was_found_goes_into_the_recording() -> None:
     memory = Memory()
-    items = [item(each, each, "value", "want", "hint") for each in State]
+    items = [item(each, each, "value", "want", "hint") for each in ItemState]
     record_items(memory, items, 7)
-    assert [(one.at_ns, one.name, one.state) for one in memory.of(Checked)] == [(7, each, each) for each in State]
+    assert [(one.at_ns, one.name, one.state) for one in memory.of(Checked)] == [(7, each, each) for each in ItemState]
     assert not memory.of(Event)  # a replay compares events, and knows nothing of a check

@@ -11,28 +11,28 @@ from hypothesis import strategies as st
 from mavlink_rig import MS, Peer
 from sim_rig import decode
 
-from sim.peers import Peers
-from uavctl.check.item import State, item, refusals
-from uavctl.check.parameters import wanted
+from sim.simulation import Peers
+from uavctl.check.findings import ItemState, item, refusals
 from uavctl.check.preflight import Preflight
+from uavctl.check.vehicle import wanted
 from uavctl.config import load_config
-from uavctl.config.preflight import CheckConfig
+from uavctl.config.connections import CheckConfig
+from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
-from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def state(found: Checked, name: str) -> State:
+def state(found: Checked, name: str) -> ItemState:
     return found[name].state
 
 
 def test_every_item_has_a_want_and_every_one_that_is_not_good_says_what_to_do() -> None:
-    for found in (look(), look(["sim.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
+    for found in (look(), look(["sim.autopilot.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
         for one in found.items.values():
             assert one.name and one.value and one.want
-            assert bool(one.hint) == (one.state is not State.GOOD)
-            assert one.ok == (one.state is not State.BAD)
+            assert bool(one.hint) == (one.state is not ItemState.GOOD)
+            assert one.ok == (one.state is not ItemState.BAD)
 
 
 # --- positions -------------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def test_on_a_shared_link_the_vehicle_s_own_estimate_is_offered(shared: bool) ->
     for at_ns in (MS, 2 * MS):
         flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ns // MS), at_ns)
     one = next(one for one in flight.items(3 * MS) if one.name == "positions")
-    assert one.state is State.BAD and ("LOCAL_POSITION_NED" in one.hint) == shared
+    assert one.state is ItemState.BAD and ("LOCAL_POSITION_NED" in one.hint) == shared
 
 
 def test_positions_that_are_refused_are_told_by_reason() -> None:
@@ -74,17 +74,17 @@ def test_more_loss_than_the_design_counts_on_fails_and_chance_does_not() -> None
     assert not look(["link.loss=0.5", "sim.camera.rate_hz=5.0"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
     # Four positions a step: the design's one of them is there far more often.
     assert look(["link.loss=0.3"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
-    assert state(look(wrong=["link.model=gilbert-elliott"]), "position loss") is State.NOTE
+    assert state(look(wrong=["link.model=gilbert-elliott"]), "position loss") is ItemState.NOTE
 
 
 def test_an_age_beyond_the_design_is_told_and_one_beyond_a_step_fails() -> None:
     slow = look(["link.jitter_s=0.12"], ["link.jitter_s=0.02", "link.delay_s=0.0"])
-    assert state(slow, "position age") is State.NOTE
+    assert state(slow, "position age") is ItemState.NOTE
     late = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02"])
-    assert state(late, "position age") is State.BAD
+    assert state(late, "position age") is ItemState.BAD
     # Plans of the other scheme count with every age up to the horizon.
     planned = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02", "smpc.scheme=age-conditioned"])
-    assert state(planned, "position age") is State.NOTE
+    assert state(planned, "position age") is ItemState.NOTE
 
 
 def test_a_gap_as_long_as_the_horizon_fails() -> None:
@@ -102,7 +102,7 @@ def test_noise_beyond_the_filter_s_belief_fails() -> None:
 @pytest.mark.fault(14)
 def test_a_frozen_pose_is_told() -> None:
     found = look(["sim.camera.frozen=[[1.0,99.0]]"])
-    assert state(found, "position stuck") is State.UNDETERMINED and "Move the body" in found["position stuck"].hint
+    assert state(found, "position stuck") is ItemState.UNDETERMINED and "Move the body" in found["position stuck"].hint
 
 
 @pytest.mark.fault(15)
@@ -123,8 +123,8 @@ def test_a_vehicle_outside_the_room_is_told_why(scale: tuple[float, float, float
 
 def test_clocks_that_are_answered_show_round_trip_and_drift() -> None:
     found = look(seconds=8.0)
-    assert state(found, "vehicle clock") is State.GOOD and "drift +0 ppm" in found["vehicle clock"].value
-    assert state(found, "source clock") is State.NOTE  # the simulated cameras answer nothing
+    assert state(found, "vehicle clock") is ItemState.GOOD and "drift +0 ppm" in found["vehicle clock"].value
+    assert state(found, "source clock") is ItemState.NOTE  # the simulated cameras answer nothing
 
 
 class Answering(Hand):
@@ -158,7 +158,7 @@ def test_clock_trouble_is_told(delay_ms: int, drift: float, told: str) -> None:
         hand.answer()
     clock = hand.done()["vehicle clock"]
     assert told in clock.value
-    assert clock.state is (State.GOOD if told == "0 rejected" else State.NOTE)
+    assert clock.state is (ItemState.GOOD if told == "0 rejected" else ItemState.NOTE)
 
 
 def test_the_relay_cannot_do_without_the_vehicle_s_clock() -> None:
@@ -208,26 +208,28 @@ def test_a_second_vehicle_on_the_link_fails() -> None:
 
 
 def test_the_battery_is_judged_only_if_a_limit_is_given() -> None:
-    assert state(look(), "battery") is State.GOOD
-    assert state(look(wrong=["check.battery_v=14.0"]), "battery") is State.BAD
+    assert state(look(), "battery") is ItemState.GOOD
+    assert state(look(wrong=["check.battery_v=14.0"]), "battery") is ItemState.BAD
 
 
 def test_armed_and_in_the_air_are_told() -> None:
     found = look(airborne=True)
-    assert (state(found, "armed"), state(found, "landed")) == (State.NOTE, State.NOTE)
+    assert (state(found, "armed"), state(found, "landed")) == (ItemState.NOTE, ItemState.NOTE)
 
 
 @pytest.mark.parametrize(
     ("periods_ms", "told", "wanted_state"),
     [
-        ([], "not told", State.NOTE),
-        ([100], "10 Hz", State.GOOD),
-        ([300, 300, 300], "3.33 Hz", State.GOOD),
-        ([400, 400, 100], "2.5 Hz", State.NOTE),
-        ([100, 100, 900], "10 Hz", State.GOOD),  # a few that are lost
+        ([], "not told", ItemState.NOTE),
+        ([100], "10 Hz", ItemState.GOOD),
+        ([300, 300, 300], "3.33 Hz", ItemState.GOOD),
+        ([400, 400, 100], "2.5 Hz", ItemState.NOTE),
+        ([100, 100, 900], "10 Hz", ItemState.GOOD),  # a few that are lost
     ],
 )
-def test_the_rate_of_the_vehicles_own_velocity_is_told(periods_ms: list[int], told: str, wanted_state: State) -> None:
+def test_the_rate_of_the_vehicles_own_velocity_is_told(
+    periods_ms: list[int], told: str, wanted_state: ItemState
+) -> None:
     flight, vehicle, at_ms = Preflight(load_config("room-hahn-stursberg"), make_links, 0), Peer(1, 1), 1000
     flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ms), at_ms * MS)
     for period_ms in periods_ms:
@@ -243,14 +245,14 @@ def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
     flight = Preflight(config, make_links, 0, take_off_m=1.0)
     flight.receive("vehicle", Peer(1, 1).heartbeat(base_mode=129 if armed else 1), 1)
     one = next(one for one in flight.items(1) if one.name == "armed")
-    assert one.state is (State.BAD if armed else State.GOOD)
+    assert one.state is (ItemState.BAD if armed else ItemState.GOOD)
     assert ("without --arm" in one.hint) == armed
 
 
 @BOTH
 def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
     """Every message to the vehicle is one of these, and every command asks for a message."""
-    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "relay.enabled=true"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot.autopilot={autopilot}", "relay.enabled=true"])
     peers, flight = Peers(config, 0, airborne=False), Preflight(config, make_links, 0)
     kinds, commands = set(), set()
     for tick in range(300):
@@ -305,16 +307,16 @@ def told_by_motive(*place: float) -> Preflight:
 
 def test_a_body_of_motive_s_out_of_the_room_is_a_matter_of_its_up_axis_not_of_units() -> None:
     place = {one.name: one for one in told_by_motive(0.1, 0.2, 1.2).items(3 * S)}["position in the room"]
-    assert place.state is State.BAD and "?up=z" in place.hint and "frame.convention" not in place.hint
+    assert place.state is ItemState.BAD and "?up=z" in place.hint and "frame.convention" not in place.hint
     place = {one.name: one for one in told_by_motive(50.0, 20.0, -90.0).items(3 * S)}["position in the room"]
-    assert place.state is State.BAD and "metres" not in place.hint
+    assert place.state is ItemState.BAD and "metres" not in place.hint
 
 
 # --- what forbids arming ---------------------------------------------------------------------------------------------
 
 
 def test_only_bad_items_forbid_arming_and_accepted_ones_do_not() -> None:
-    items = [item(f"one {each}", each, "x", "y", "z") for each in State]
+    items = [item(f"one {each}", each, "x", "y", "z") for each in ItemState]
     assert [one.name for one in refusals(items, CheckConfig())] == ["one bad"]
     assert refusals(items, CheckConfig(accept=("one bad",))) == ()
 
@@ -323,9 +325,9 @@ def test_the_heading_of_a_turned_body_is_a_mean_of_directions() -> None:
     """Angles near 180 degrees must not average to 0."""
     hand = Hand(heading_rad=math.pi)
     hand.rest(3.0)
-    assert state(hand.done(), "heading") is State.UNDETERMINED  # the hand's cameras tell no attitude
+    assert state(hand.done(), "heading") is ItemState.UNDETERMINED  # the hand's cameras tell no attitude
     found = look(["frame.yaw_deg=10.0"], ["frame.yaw_deg=-170.0"])
-    assert state(found, "heading") is State.BAD and "180" in found["heading"].value
+    assert state(found, "heading") is ItemState.BAD and "180" in found["heading"].value
 
 
 @BOTH
@@ -335,11 +337,11 @@ def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilo
             assert peers.autopilot.parameters.set(name, value), name
 
     more = ["relay.enabled=true", "frame.yaw_deg=20", "sim.camera.rate_hz=30.0", "sim.plant=quadrotor"]
-    found = look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
+    found = look([f"sim.autopilot.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
     assert not found.bad
-    assert state(found, "relay") is State.GOOD and state(found, "own position") is State.GOOD
+    assert state(found, "relay") is ItemState.GOOD and state(found, "own position") is ItemState.GOOD
     # What the vehicle believes because we told it shows nothing of our axes.
-    assert state(found, "axes") is State.UNDETERMINED and "ENU" in found["axes"].value
+    assert state(found, "axes") is ItemState.UNDETERMINED and "ENU" in found["axes"].value
 
 
 @pytest.mark.fault(12)

@@ -9,13 +9,13 @@ import pytest
 from check_rig import Checked, Hand, look
 from mavlink_rig import packets, read
 
-from sim.peers import Peers
-from uavctl.check.item import State
-from uavctl.check.parameters import RULES
+from sim.simulation import Peers
+from uavctl.check.findings import ItemState
 from uavctl.check.preflight import Preflight
+from uavctl.check.vehicle import RULES
 from uavctl.config import load_config
+from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
-from uavctl.trial.own_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
@@ -25,7 +25,7 @@ def with_parameters(autopilot: str, *more: str, **values: float) -> Checked:
         for name, value in values.items():
             assert peers.autopilot.parameters.set(name, value), name
 
-    return look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
+    return look([f"sim.autopilot.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
 
 
 @BOTH
@@ -34,37 +34,37 @@ def test_parameters_that_were_seen_to_fly_indoors_are_good(autopilot: str) -> No
     found = with_parameters(autopilot, **EXTERNAL_ONLY[autopilot], **flown[autopilot])
     names = [name for name in found.items if name.isupper()]
     assert len(names) >= 6
-    assert {name: found[name].state for name in names} == dict.fromkeys(names, State.GOOD)
+    assert {name: found[name].state for name in names} == dict.fromkeys(names, ItemState.GOOD)
 
 
 @pytest.mark.parametrize(
     ("autopilot", "values", "name", "want"),
     [
-        ("ardupilot", {"GUID_TIMEOUT": 3.0}, "GUID_TIMEOUT", State.NOTE),
-        ("ardupilot", {"GUID_TIMEOUT": 0.1}, "GUID_TIMEOUT", State.BAD),
-        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "EK3_SRC1_POSXY", State.BAD),
-        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "VISO_TYPE", State.BAD),
-        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 1}, "EK3_SRC1_YAW", State.NOTE),
-        ("ardupilot", {"EK3_SRC1_POSXY": 3}, "EK3_SRC1_POSXY", State.NOTE),
-        ("ardupilot", {"EK3_SRC1_YAW": 6}, "COMPASS_USE", State.NOTE),
-        ("ardupilot", {"FS_EKF_ACTION": 0}, "FS_EKF_ACTION", State.NOTE),
-        ("px4", {"COM_OBL_RC_ACT": 0}, "COM_OBL_RC_ACT", State.BAD),  # there is no radio (COM_RC_IN_MODE 4)
-        ("px4", {"COM_OBL_RC_ACT": 4}, "COM_OBL_RC_ACT", State.GOOD),
-        ("px4", {"COM_OF_LOSS_T": 5.0}, "COM_OF_LOSS_T", State.NOTE),
-        ("px4", {"EKF2_EV_CTRL": 11}, "EKF2_GPS_CTRL", State.NOTE),
-        ("px4", {"EKF2_EV_CTRL": 11, "EKF2_HGT_REF": 1}, "EKF2_HGT_REF", State.NOTE),
-        ("px4", {"EKF2_EV_CTRL": 0}, "EKF2_EV_CTRL", State.NOTE),
+        ("ardupilot", {"GUID_TIMEOUT": 3.0}, "GUID_TIMEOUT", ItemState.NOTE),
+        ("ardupilot", {"GUID_TIMEOUT": 0.1}, "GUID_TIMEOUT", ItemState.BAD),
+        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "EK3_SRC1_POSXY", ItemState.BAD),
+        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "VISO_TYPE", ItemState.BAD),
+        ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 1}, "EK3_SRC1_YAW", ItemState.NOTE),
+        ("ardupilot", {"EK3_SRC1_POSXY": 3}, "EK3_SRC1_POSXY", ItemState.NOTE),
+        ("ardupilot", {"EK3_SRC1_YAW": 6}, "COMPASS_USE", ItemState.NOTE),
+        ("ardupilot", {"FS_EKF_ACTION": 0}, "FS_EKF_ACTION", ItemState.NOTE),
+        ("px4", {"COM_OBL_RC_ACT": 0}, "COM_OBL_RC_ACT", ItemState.BAD),  # there is no radio (COM_RC_IN_MODE 4)
+        ("px4", {"COM_OBL_RC_ACT": 4}, "COM_OBL_RC_ACT", ItemState.GOOD),
+        ("px4", {"COM_OF_LOSS_T": 5.0}, "COM_OF_LOSS_T", ItemState.NOTE),
+        ("px4", {"EKF2_EV_CTRL": 11}, "EKF2_GPS_CTRL", ItemState.NOTE),
+        ("px4", {"EKF2_EV_CTRL": 11, "EKF2_HGT_REF": 1}, "EKF2_HGT_REF", ItemState.NOTE),
+        ("px4", {"EKF2_EV_CTRL": 0}, "EKF2_EV_CTRL", ItemState.NOTE),
     ],
 )
 def test_parameters_that_lead_astray_are_found(
-    autopilot: str, values: dict[str, float], name: str, want: State
+    autopilot: str, values: dict[str, float], name: str, want: ItemState
 ) -> None:
     assert with_parameters(autopilot, **values)[name].state is want
 
 
 @pytest.mark.parametrize(("autopilot", "name"), [("px4", "EKF2_EV_CTRL"), ("ardupilot", "EK3_SRC1_POSXY")])
 def test_a_relay_to_a_vehicle_that_does_not_listen_fails(autopilot: str, name: str) -> None:
-    assert with_parameters(autopilot, "relay.enabled=true")[name].state is State.BAD
+    assert with_parameters(autopilot, "relay.enabled=true")[name].state is ItemState.BAD
 
 
 @pytest.mark.parametrize("name", ["FS_EKF_ACTION", "FS_EKF_THRESH"])
@@ -72,8 +72,8 @@ def test_nothing_but_its_estimator_s_failsafe_ends_a_flight_whose_relay_has_stop
     """Recorded: GUIDED for 8.1 s after the last position, however long GUID_TIMEOUT is."""
     config = load_config("room-hahn-stursberg", ["relay.enabled=true"])
     rule = next(one for one in RULES[3] if one.name == name)
-    assert rule.judge(0.0, {name: 0.0}.get, config).state is State.BAD
-    assert rule.judge(1.0, {name: 1.0}.get, config).state is State.GOOD
+    assert rule.judge(0.0, {name: 0.0}.get, config).state is ItemState.BAD
+    assert rule.judge(1.0, {name: 1.0}.get, config).state is ItemState.GOOD
 
 
 def test_the_recorded_vehicle_stays_guided_for_8_s_after_its_last_position() -> None:
@@ -94,15 +94,15 @@ def test_the_recorded_vehicle_stays_guided_for_8_s_after_its_last_position() -> 
 @pytest.mark.parametrize(
     ("altitude_m", "take_off_m", "want"),
     [
-        (2.4, None, State.GOOD),
-        (2.6, None, State.NOTE),  # above the room
-        (1.2, 1.2, State.GOOD),
-        (1.2, 1.3, State.NOTE),  # the climb ends below what is planned
-        (2.6, 1.2, State.NOTE),
+        (2.4, None, ItemState.GOOD),
+        (2.6, None, ItemState.NOTE),  # above the room
+        (1.2, 1.2, ItemState.GOOD),
+        (1.2, 1.3, ItemState.NOTE),  # the climb ends below what is planned
+        (2.6, 1.2, ItemState.NOTE),
     ],
 )
 def test_px4_s_own_climb_is_to_end_in_the_room_and_not_before_ours(
-    altitude_m: float, take_off_m: float | None, want: State
+    altitude_m: float, take_off_m: float | None, want: ItemState
 ) -> None:
     hand = Hand()
     hand.flight = Preflight(hand.config, make_links, 0, take_off_m=take_off_m)
@@ -117,7 +117,7 @@ def test_parameters_that_are_never_told_do_not_forbid_a_flight() -> None:
     hand = Hand()
     hand.rest(7.0)
     found = hand.done()
-    assert found["COM_OBL_RC_ACT"].state is State.UNDETERMINED and not found.bad
+    assert found["COM_OBL_RC_ACT"].state is ItemState.UNDETERMINED and not found.bad
 
 
 def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
@@ -159,7 +159,7 @@ def test_a_value_is_good_just_when_it_is_what_the_words_want(autopilot: int, rel
             for value in (0.0, 0.1, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 11.0, 15.0, 16.0, 48.0):
                 values = told | {rule.name: value}
                 verdict = rule.judge(value, values.get, config)
-                good = verdict.state is State.GOOD
+                good = verdict.state is ItemState.GOOD
                 assert good == is_wanted(verdict.want, value, values), (rule.name, value, told, verdict)
                 judged += 1
                 kinds.add((rule.name, good))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mavlink_rig import DATA, MS, SECOND, packets, read
 
-from uavctl.mavlink.clocksync import ClockSource, ClockSync, Refusal, RoundTrips, SlidingMinimum
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, SlidingMinimum, StampRefusal
 
 OFFSET = 1_000_000 * SECOND  # our clock is that far ahead of the source's
 PERIOD = 40 * MS
@@ -27,7 +27,7 @@ class Source:
         self.clock, self.offset_ns = clock, offset_ns
         self.true_ns = 2_000_000 * SECOND  # in our clock
 
-    def sample(self, delay_ns: int, error_ns: int = 0, **more: int) -> int | Refusal:
+    def sample(self, delay_ns: int, error_ns: int = 0, **more: int) -> int | StampRefusal:
         """One sample; its time of capture as mapped, relative to the truth, or the refusal."""
         self.true_ns += PERIOD
         stamp_ns = self.true_ns - self.offset_ns + error_ns
@@ -104,8 +104,8 @@ def test_a_drifting_clock_is_followed() -> None:
 def test_a_stamp_from_the_future_is_refused() -> None:
     source = Source(make())
     source.settle(30 * MS)
-    assert source.sample(30 * MS, error_ns=21 * MS) is Refusal.FUTURE
-    assert source.sample(30 * MS, error_ns=3600 * SECOND) is Refusal.FUTURE
+    assert source.sample(30 * MS, error_ns=21 * MS) is StampRefusal.FUTURE
+    assert source.sample(30 * MS, error_ns=3600 * SECOND) is StampRefusal.FUTURE
     assert source.sample(30 * MS) == 30 * MS  # and changes nothing
 
 
@@ -119,7 +119,7 @@ def test_first_samples_may_lower_the_minimum_by_more_than_the_tolerance() -> Non
 def test_a_duplicate_is_refused() -> None:
     clock = make()
     assert clock.captured_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
-    assert clock.captured_ns(5 * SECOND, 6 * SECOND + MS) is Refusal.DUPLICATE
+    assert clock.captured_ns(5 * SECOND, 6 * SECOND + MS) is StampRefusal.DUPLICATE
 
 
 @pytest.mark.parametrize("leap_ns", [-2 * SECOND, -1_500_000 * SECOND, 2 * SECOND, 4_000_000 * SECOND, 500 * MS])
@@ -128,7 +128,7 @@ def test_a_leaping_clock_is_believed_after_five_in_a_row(leap_ns: int) -> None:
     source.settle(30 * MS)
     source.offset_ns -= leap_ns
     got = [source.sample(30 * MS) for _ in range(8)]
-    assert all(isinstance(one, Refusal) for one in got[:4])
+    assert all(isinstance(one, StampRefusal) for one in got[:4])
     assert got[4:] == [30 * MS] * 4
     assert source.clock.resyncs == 1
 
@@ -137,7 +137,7 @@ def test_single_leaps_are_never_believed() -> None:
     source = Source(make())
     source.settle(30 * MS)
     for n in range(100):
-        assert isinstance(source.sample(30 * MS, error_ns=(n + 2) * SECOND), Refusal)
+        assert isinstance(source.sample(30 * MS, error_ns=(n + 2) * SECOND), StampRefusal)
         assert source.sample(30 * MS) == 30 * MS
     assert source.clock.resyncs == 0
 
@@ -148,7 +148,7 @@ def test_garbage_stamps_that_agree_on_nothing_are_never_believed() -> None:
     numbers = random.Random(1)
     for _ in range(200):
         got = source.sample(30 * MS, error_ns=numbers.choice((-1, 1)) * numbers.randrange(2, 10**6) * SECOND)
-        assert isinstance(got, Refusal)
+        assert isinstance(got, StampRefusal)
     assert source.sample(30 * MS) == 30 * MS
 
 

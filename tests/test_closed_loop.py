@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from loopback_rig import flight, lockstep, make_loop
 
-from logs.flight_data import FlightData
-from logs.replay import replay
-from logs.summary import FlightSummary, summarise
-from uavctl.build import build_design
+from logs.recording.flight import FlightData
+from logs.recording.replay import replay
+from logs.recording.summary import FlightSummary, summarise
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
-from uavctl.smpc.conic import ConicSolver
+from uavctl.records import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 
 
 @cache

@@ -9,11 +9,21 @@ import pytest
 from mavlink_rig import NO_COVARIANCE, Peer, packets, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Setpoint, SetpointSource, Vec3
 from uavctl.frames import Convention
-from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
-from uavctl.mavlink.encoder import Encoder, UnsendableError
-from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Landed, Message, Origin, Position, Text, TimeSync
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.messages import (
+    Ack,
+    Attitude,
+    Battery,
+    GlobalOrigin,
+    Heartbeat,
+    Landed,
+    Message,
+    Position,
+    Text,
+    TimeSync,
+)
+from uavctl.records import Setpoint, SetpointSource, Vec3
 
 CAMERA = Peer(17, 18)
 GOOD = CAMERA.vision(1000)
@@ -149,7 +159,7 @@ VEHICLE = Peer(1, 1)
             VEHICLE.send("command_ack", 21, 4, 0, 0, 245, 25),
             Ack(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
         ),
-        (VEHICLE.send("gps_global_origin", 1, 2, 3), Origin(system=1, component=1)),
+        (VEHICLE.send("gps_global_origin", 1, 2, 3), GlobalOrigin(system=1, component=1)),
         (
             VEHICLE.send("attitude", 1, 0.5, 0.25, -1.0, 0, 0, 0),
             Attitude(system=1, component=1, angles_rad=(0.5, 0.25, -1.0), stamp_us=1000),

@@ -12,12 +12,12 @@ import pytest
 from design_rig import spec
 from numpy.typing import NDArray
 
-from uavctl.build import start_state
+from uavctl.build.controller import start_state
 from uavctl.cli.app import run
-from uavctl.compare import compare_gains, seeded_states
 from uavctl.config import load
-from uavctl.smpc.design import make_design
-from uavctl.smpc.feasibility import check_schedule, optimal_cost
+from uavctl.lab.compare_designs import compare_gains, seeded_states
+from uavctl.smpc.hahn_stursberg.design import make_design
+from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

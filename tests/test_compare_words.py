@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from logs.compare_figures import Figure
-from logs.compare_words import difference, for_people, label, measured
+from logs.report.compare import Figure, difference, for_people, label, measured
 
 
 def figure(key: str) -> Figure:

@@ -13,15 +13,15 @@ from conditioned_slow import first_side, met, plan_slowly
 from numpy.typing import NDArray
 from scipy.stats import binomtest, norm
 
-from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc.age_risk import SELDOM, age_risk, equal_risk
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook, Path
-from uavctl.smpc.baselines import PacketisedPredictive, Problem
-from uavctl.smpc.batch_smpc import BatchSmpc
-from uavctl.smpc.conditioned import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
+from uavctl.smpc.baselines import ControlProblem, PacketisedPredictive
+from uavctl.smpc.batch import BatchSmpc
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
+from uavctl.smpc.conditioned.risk import SELDOM, age_risk, equal_risk
 from uavctl.smpc.link import bernoulli, gilbert_elliott
-from uavctl.smpc.lqg_bound import lqr
 
 Array = NDArray[np.float64]
 LOSS, ALLOWED = 0.3, 0.05
@@ -32,7 +32,7 @@ KINDS = ["plain", "covariance", "fence", "path", "sent"]
 
 
 def in_cvxpy(
-    given: Problem, x: Array, answer: Answer, outlook: Outlook, slew_mps3: float = np.inf
+    given: ControlProblem, x: Array, answer: Answer, outlook: Preview, slew_mps3: float = np.inf
 ) -> tuple[float, Array]:
     """Least cost and inputs (H, n_u) with the back-offs, the reference and the limits of an answer."""
     plant, steps, reference = given.plant, given.horizon, answer.reference
@@ -69,7 +69,7 @@ def in_cvxpy(
     return float(asked.value), np.asarray(inputs.value)
 
 
-def somewhere(given: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
+def somewhere(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
     """A state within wide limits, and a target that may be beyond them."""
     low, high = (np.where(np.isfinite(side), side, 0.0) for side in given.state_set.bounds)
     x = rng.uniform(low, high)
@@ -78,17 +78,17 @@ def somewhere(given: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
     return x, given.plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
 
 
-def outlook_of(kind: str, given: Problem, rng: np.random.Generator) -> Outlook:
+def outlook_of(kind: str, given: ControlProblem, rng: np.random.Generator) -> Preview:
     steps, n_x, n_u = given.horizon, given.plant.n_x, given.plant.n_u
     if kind == "covariance":
         root = rng.normal(size=(n_x, n_x)) * 0.1
-        return Outlook(cov=root @ root.T, late=2)
+        return Preview(cov=root @ root.T, late=2)
     if kind == "fence":
-        return Outlook(limits=given.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, given.state_set.b.size)))
+        return Preview(limits=given.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, given.state_set.b.size)))
     if kind == "path":
-        return Outlook(path=Path(rng.normal(size=(steps, n_x)), 0.3 * rng.normal(size=(steps, n_u))))
+        return Preview(path=Path(rng.normal(size=(steps, n_x)), 0.3 * rng.normal(size=(steps, n_u))))
     if kind == "sent":  # some of it beyond the limits of what is planned
-        return Outlook(sent=1.4 * rng.uniform(*given.input_set.bounds))
+        return Preview(sent=1.4 * rng.uniform(*given.input_set.bounds))
     return NOMINAL
 
 
@@ -119,7 +119,7 @@ def test_the_answer_is_the_optimum_of_the_same_problem(name: str, kind: str, sle
     assert compared > 3
 
 
-def near(given: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
+def near(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
     """A state and a target as most of a flight's are: near to one another, where few rows bind or none."""
     x, target = somewhere(given, rng)
     return target + rng.uniform(0.0, 0.3) * (x - target), target
@@ -129,7 +129,7 @@ def near(given: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
 @pytest.mark.parametrize("where", [near, somewhere])
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_no_short_cut_changes_the_answer(
-    name: str, where: Callable[[Problem, np.random.Generator], tuple[Array, Array]], kind: str
+    name: str, where: Callable[[ControlProblem, np.random.Generator], tuple[Array, Array]], kind: str
 ) -> None:
     """Against every row in one program for the whole plant, solved anew in every round."""
     given, rng = problem(name), np.random.default_rng(6)
@@ -150,7 +150,7 @@ def test_no_short_cut_changes_the_answer(
     assert compared > 8
 
 
-def spent(given: Problem, answer: Answer, cov: Array) -> Array:
+def spent(given: ControlProblem, answer: Answer, cov: Array) -> Array:
     """Risk (H,) that the rows of each stage take together, from the definition of the open-loop covariance."""
     plant, risk = given.plant, []
     for state in answer.states[1:]:
@@ -168,7 +168,7 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
     for seq in range(60):
         x, target = somewhere(given, rng)
         cov = np.diag(rng.uniform(0.0, 0.01, given.plant.n_x))
-        answer = solver.solve(seq, x, target, Outlook(cov=cov))
+        answer = solver.solve(seq, x, target, Preview(cov=cov))
         assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
@@ -314,10 +314,7 @@ def test_the_reference_is_as_near_to_a_wall_as_it_may_rest() -> None:
 def test_numbers_that_are_none_get_no_plan() -> None:
     given = problem("paper")
     solver = ConditionedSolver(given, LINK, ALLOWED)
-    for x, outlook in (
-        (PAPER_START * np.nan, NOMINAL),
-        (PAPER_START, Outlook(cov=np.full((4, 4), np.nan))),
-    ):
+    for x, outlook in ((PAPER_START * np.nan, NOMINAL), (PAPER_START, Preview(cov=np.full((4, 4), np.nan)))):
         answer = solver.solve(4, x, given.target, outlook)
         assert (answer.seq, answer.status) == (4, SolveStatus.FAILED)
 
@@ -335,7 +332,7 @@ def test_the_same_question_gives_the_same_bits_whatever_was_asked_before() -> No
 # The promise, against chance: the worst step of many runs
 
 
-def pilot(given: Problem, loss: float) -> BatchSmpc:
+def pilot(given: ControlProblem, loss: float) -> BatchSmpc:
     solver = ConditionedSolver(given, bernoulli(np.array([1.0 - loss])), ALLOWED)
     return BatchSmpc(ConditionedDecider(solver, given.target), given.plant, given.horizon, given.horizon, 0.5)
 

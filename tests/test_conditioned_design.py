@@ -11,15 +11,15 @@ import pytest
 from loopback_rig import lockstep
 from msgspec.structs import replace
 
-from logs.design_view import design_view
-from logs.reader import header, read
-from logs.recorder import SyncRecorder
-from uavctl.build import build_conditioned, design_of, record_of, resting
+from logs.recording.design_view import design_view
+from logs.recording.reader import header, read
+from logs.recording.recorder import SyncRecorder
+from uavctl.build.controller import build_conditioned, design_of, record_of, resting
 from uavctl.cli.app import run as main
 from uavctl.config import dump_config, load_config
 from uavctl.config.types import ScheduleConfig, SmpcConfig
-from uavctl.data import ControlMode, Decision, Header, Plan, SolveStatus, Truth
-from uavctl.smpc.conditioned import METHOD
+from uavctl.records import ControlMode, Decision, Header, Plan, SolveStatus, Truth
+from uavctl.smpc.conditioned.planner import METHOD
 
 SCHEME = "smpc.scheme=age-conditioned"
 FLOWN = ("loopback", "--config", "room-hahn-stursberg", "--set", SCHEME)
@@ -34,8 +34,8 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("nothing of scheme `age-conditioned` asks for this")
 
     for name in ("make_design", "check_schedule", "with_late", "build_rests", "design_record"):
-        monkeypatch.setattr(f"uavctl.build.{name}", refuse)
-    monkeypatch.setattr("uavctl.smpc.design.assembled", refuse)
+        monkeypatch.setattr(f"uavctl.build.controller.{name}", refuse)
+    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.design.assembled", refuse)
 
 
 def quick(folder: Path) -> str:

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from loopback_rig import Memory, lockstep, make_loop
 
-from logs.replay import replay
-from uavctl.build import build_conditioned, build_design, resting
-from uavctl.campaign.cells import cells_of, told
-from uavctl.campaign.controllers import build
-from uavctl.campaign.read import read_campaign
-from uavctl.campaign.setting import met
-from uavctl.campaign.world import fly
+from logs.recording.replay import replay
+from uavctl.build.controller import build_conditioned, build_design, resting
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Decision, Plan, Setpoint, SolveStatus, Truth
-from uavctl.smpc.conditioned import METHOD
+from uavctl.lab.campaign.controllers import build, met
+from uavctl.lab.campaign.spec import read_campaign
+from uavctl.lab.campaign.tasks import cells_of, told
+from uavctl.lab.campaign.world import fly
+from uavctl.records import ControlMode, Decision, Plan, Setpoint, SolveStatus, Truth
+from uavctl.smpc.conditioned.planner import METHOD
 
 SCHEME = "smpc.scheme=age-conditioned"
 FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uavctl.build import build_spec
+from uavctl.build.controller import build_spec
 from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
-from uavctl.config.index import key_lines
+from uavctl.config.document import key_lines
 from uavctl.config.mission import FenceConfig
 from uavctl.config.reference import render
 from uavctl.errors import ConfigError, DesignError

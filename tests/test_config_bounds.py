@@ -11,15 +11,22 @@ import msgspec
 import pytest
 from config_mutants import CONFIG, Case, Mutants, bases, ranges
 
-from uavctl.campaign.read import read_campaign
 from uavctl.cli.app import run
 from uavctl.config import Config, dump_config, load, load_config, parse
-from uavctl.config.bounds import DEEPEST, LONGEST_LIST, MOST_BYTES, MOST_VALUES, excess
-from uavctl.config.data_file import DataFileError, read_text
+from uavctl.config.document import (
+    DEEPEST,
+    LONGEST_LIST,
+    LONGEST_MOTION,
+    MOST_BYTES,
+    MOST_VALUES,
+    DataFileError,
+    excess,
+    read_text,
+)
 from uavctl.config.link import LONGEST_TRACE
 from uavctl.config.mission import TrajectoryConfig
-from uavctl.config.section import LONGEST_MOTION
 from uavctl.errors import ConfigError
+from uavctl.lab.campaign.spec import read_campaign
 
 PAPER = dump_config(load_config("paper"))
 SEED, CONFIGS, LINES = 7, 120, 80

@@ -22,17 +22,15 @@ from optimisation_cases import (
     room,
 )
 
-from uavctl.data import SolveStatus
-from uavctl.smpc import conic
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.assemble import inside
-from uavctl.smpc.components import decompose
-from uavctl.smpc.cones import ConicProgram
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import Horizon
-from uavctl.smpc.printed import PrintedProblem, PrintedSolver
-from uavctl.smpc.program import Program
+from uavctl.smpc.hahn_stursberg import exact as conic
+from uavctl.smpc.hahn_stursberg.cones import ConicProgram
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, inside
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose
+from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
+from uavctl.smpc.hahn_stursberg.program import Program
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -283,8 +281,7 @@ def test_every_status_of_the_solver_has_a_meaning_and_only_solved_is_optimal() -
 
 
 @pytest.mark.parametrize(
-    ("solver_says", "status"),
-    [("AlmostSolved", SolveStatus.INACCURATE), ("NumericalError", SolveStatus.FAILED)],
+    ("solver_says", "status"), [("AlmostSolved", SolveStatus.INACCURATE), ("NumericalError", SolveStatus.FAILED)]
 )
 def test_other_endings_are_passed_on(
     paper_design: Design, monkeypatch: pytest.MonkeyPatch, solver_says: str, status: SolveStatus

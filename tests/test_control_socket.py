@@ -16,11 +16,19 @@ import pytest
 
 from uavctl.clock import Due
 from uavctl.config import load_config
-from uavctl.control_messages import MAX_LINE, Request, control_folder, daemon_name, socket_path
-from uavctl.control_socket import MAX_CLIENTS, ControlServer, listening
-from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity
+from uavctl.daemon.control_socket import (
+    MAX_CLIENTS,
+    MAX_LINE,
+    ControlRequest,
+    ControlServer,
+    control_folder,
+    daemon_name,
+    listening,
+    socket_path,
+)
+from uavctl.daemon.health import Health, RecorderHealth
 from uavctl.errors import UsageError, VehicleTakenError
-from uavctl.health import Health, RecorderHealth
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity
 
 SECOND = 1_000_000_000
 CONFIG = load_config("room")
@@ -271,7 +279,7 @@ def test_the_kernel_says_who_asks(rig: Rig, monkeypatch: pytest.MonkeyPatch, uid
         # the daemon's user is another one, the client is root: only where the tests run as root
         monkeypatch.setattr(os, "geteuid", lambda: own if own else 12345)
     elif uid == "other":
-        monkeypatch.setattr("uavctl.control_socket._CREDENTIALS", Stranger())
+        monkeypatch.setattr("uavctl.daemon.control_socket._CREDENTIALS", Stranger())
     rig.ticks()
     assert bool(heard(client)) is served
 
@@ -327,7 +335,7 @@ def test_a_socket_of_another_user_in_the_way_is_told_in_a_line(folder: Path, mon
         del probe
         raise PermissionError(13, "Permission denied", address)
 
-    monkeypatch.setattr("uavctl.control_socket.socket.socket.connect", connect)
+    monkeypatch.setattr("uavctl.daemon.control_socket.socket.socket.connect", connect)
     with pytest.raises(UsageError, match=f"run: sudo rm {folder}/one.sock$"), listening(folder, "one"):
         pytest.fail("bound over another one's socket")
     assert (folder / "one.sock").is_socket()
@@ -341,4 +349,4 @@ def test_names_and_folders() -> None:
     assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
     with tempfile.TemporaryDirectory(prefix="uavctl-") as own:
         assert control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
-    assert Request(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"
+    assert ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"

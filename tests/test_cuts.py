@@ -13,7 +13,7 @@ from report_rig import unpaged
 
 from uavctl.cli.app import run
 from uavctl.cli.prepare import Prepared
-from uavctl.cli.recorded import recorded_flyer
+from uavctl.cli.replay import recorded_flyer
 from uavctl.config import Config
 
 SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log.segment_bytes=100000")
@@ -36,7 +36,7 @@ def _designed_once(cuts: Cuts) -> Iterator[None]:
         return recorded_flyer(cuts.files[0], config)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uavctl.cli.replaying.recorded_flyer", lambda _, config: flyer(config))
+        patch.setattr("uavctl.cli.replay.recorded_flyer", lambda _, config: flyer(config))
         yield
 
 

@@ -12,14 +12,14 @@ from mavlink_rig import OFFBOARD, Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
-from logs.replay import replay
-from sim.peers import Peers
+from logs.recording.replay import replay
+from sim.simulation import Peers
 from uavctl.clock import Ticker
 from uavctl.config import load_config
-from uavctl.daemon import fly
-from uavctl.data import ControlMode, Datagram, Decision, Event, LinkStats, Outgoing, Refused, Timing
+from uavctl.daemon.daemon import fly
 from uavctl.errors import UavctlError
-from uavctl.transport import Connection
+from uavctl.io.base import Connection
+from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Outgoing, Refused, Timing
 
 TICK_NS, DT_NS, SECOND = 50_000_000, 200_000_000, 1_000_000_000
 

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from uavctl.errors import DesignError
-from uavctl.smpc import design as design_module
-from uavctl.smpc.design import Design, make_design
-from uavctl.smpc.design_record import design_record
+from uavctl.smpc.hahn_stursberg import design as design_module
+from uavctl.smpc.hahn_stursberg.design import Design, design_record, kappa, make_design
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.risk import kappa
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

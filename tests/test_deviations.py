@@ -9,13 +9,12 @@ import pytest
 from baseline_rig import problem
 from numpy.typing import NDArray
 
-from uavctl.build import build_conditioned, build_controller, build_estimator, build_problem
+from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settled_cov
-from uavctl.smpc.baselines.problem import parts
-from uavctl.smpc.bias import with_bias
-from uavctl.smpc.deviations import Deviations
-from uavctl.smpc.innovation import innovations
+from uavctl.smpc.conditioned.backoffs import Deviations
+from uavctl.smpc.estimate import innovations, with_bias
+from uavctl.smpc.nominal import parts
 
 Array = NDArray[np.float64]
 DRIFT = 0.3

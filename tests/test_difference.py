@@ -12,22 +12,13 @@ import pytest
 from loopback_rig import Memory, lockstep, make_loop
 from report_rig import unpaged
 
-from logs.difference import Places, leaves
-from logs.reader import finished, records, segment_files
-from logs.replay import MAKERS, ReplayResult, replay
-from uavctl.build import build_plant
+from logs.recording.reader import finished, records, segment_files
+from logs.recording.replay import MAKERS, FieldNames, ReplayResult, leaves, replay
+from uavctl.build.controller import build_plant
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.data import (
-    Decision,
-    Event,
-    LinkStats,
-    Setpoint,
-    SetpointSource,
-    StepInput,
-    Vec3,
-)
 from uavctl.flight.limits import LimitsParameters, gate
+from uavctl.records import Decision, Event, LinkStats, Setpoint, SetpointSource, StepInput, Vec3
 
 TICK = 57  # in which the rule of a test changes
 
@@ -150,7 +141,7 @@ def test_counts_in_another_order_are_the_same_counts() -> None:
 
 
 def test_fields_have_names_and_units() -> None:
-    places = Places(build_plant(load_config("room-hahn-stursberg")))
+    places = FieldNames(build_plant(load_config("room-hahn-stursberg")))
     told = {
         ("/uavctl/estimate", "mean[0]"): ("north position", "m"),
         ("/uavctl/plan", "states[3][4]"): ("east velocity in stage 3", "m/s"),

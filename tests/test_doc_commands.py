@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.build import build_design
+from uavctl.build.controller import build_design
 from uavctl.cli.common import Common
 
 ROOT = Path(__file__).parent.parent

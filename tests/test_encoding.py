@@ -12,10 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from logs.encoding import EncodingError, alike, decode, encode
-from logs.topics import TOPICS, Topic
-from uavctl.data import Datagram, Estimate, Event, Plan, Record, Setpoint, SetpointSource, Severity, SolveStatus, Truth
+from logs.recording.topics import TOPICS, EncodingError, Topic, alike, decode, encode
 from uavctl.errors import RecordingError
+from uavctl.records import (
+    Datagram,
+    Estimate,
+    Event,
+    Plan,
+    Record,
+    Setpoint,
+    SetpointSource,
+    Severity,
+    SolveStatus,
+    Truth,
+)
 
 
 def values(kind: object) -> st.SearchStrategy[object]:

@@ -13,19 +13,19 @@ import pytest
 from endings_rig import PRESET, TAKE_OFF, Endings, Sync, Told, flown, interrupt, is_a, words_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs import report
-from logs.flight_data import FlightData
-from logs.reader import read
-from logs.summary import summarise
-from sim.personality import FAILED, PERSONALITIES, Role
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+from logs.recording.summary import summarise
+from logs.report import flight_page as report
+from sim.autopilot.profile import FAILED, PERSONALITIES, Role
 from uavctl import loop as control
 from uavctl.cli import flying
 from uavctl.cli.app import run
-from uavctl.data import Command, Order
-from uavctl.ending import Cause, FlightCourse, make_ending
-from uavctl.lock import sole_daemon
+from uavctl.daemon.lock import sole_daemon
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.mode import State
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.outcome import Cause, FlightCourse, make_ending
+from uavctl.records import Command, Order
 
 Type = Callable[..., Told]
 NO_COMMANDS = is_a("COMMAND_LONG")
@@ -82,18 +82,18 @@ def test_the_mission_is_over(tmp_path: Path, typed: Type) -> None:
 
 
 def test_the_operator_orders_the_landing(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, order(Order.LAND), after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, order(Order.LAND), after_s=2.0)
     typed(rig, Cause.ORDERED, *TAKE_OFF, good=True)
 
 
 def test_the_operator_ends_it(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, interrupt, after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=2.0)
     told = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
 def test_the_operator_hands_over_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(State.ENGAGED, interrupt, after_s=3.0)
+    rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(HandoverState.ENGAGED, interrupt, after_s=3.0)
     told = typed(rig, Cause.OPERATOR, good=True)
     assert "in the air, in mode OFFBOARD" in told.ending["sentence"]
 
@@ -104,21 +104,21 @@ def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode: str) -> None:
-    rig = Endings(tmp_path, f"sim.autopilot={autopilot}").at(State.ENGAGED, stick(mode), after_s=2.0)
-    rig.at(State.RELEASED, interrupt, after_s=3.0)
+    rig = Endings(tmp_path, f"sim.autopilot.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=3.0)
     told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
     assert f"in the air, in mode {mode}" in told.ending["sentence"]
 
 
 def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, airborne=True).at(State.ENGAGED, stick("POSCTL"), after_s=2.0)
-    rig.at(State.RELEASED, stick("AUTO.LAND"), after_s=1.0)
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0)
+    rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=1.0)
     typed(rig, Cause.PILOT_LANDED, good=True)
 
 
 def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
-    rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
+    rig = Endings(tmp_path, "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]", "sim.autopilot.autopilot.clears=true")
     told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
     assert "had acted and ended" in told.ending["sentence"]
 
@@ -127,22 +127,22 @@ def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_pat
 
 
 def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.CLIMBING, stick("POSCTL"), after_s=0.6)
-    rig.at(State.RELEASED, interrupt, after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.CLIMBING, stick("POSCTL"), after_s=0.6)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
     told = typed(rig, Cause.PILOT, *TAKE_OFF)
     assert "before the controller was in charge" in told.ending["sentence"]
 
 
 def test_the_operator_ends_it_in_the_climb(tmp_path: Path, typed: Type) -> None:
-    typed(Endings(tmp_path).at(State.CLIMBING, interrupt, after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
+    typed(Endings(tmp_path).at(HandoverState.CLIMBING, interrupt, after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
 
 
 def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Type) -> None:
-    typed(Endings(tmp_path).at(State.CLIMBING, order(Order.LAND), after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
+    typed(Endings(tmp_path).at(HandoverState.CLIMBING, order(Order.LAND), after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
 
 
 def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
-    poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
+    poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.vehicle.quadrotor.charge=0.1")
     told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
     assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
 
@@ -155,7 +155,7 @@ def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None
 
 
 def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
+    rig = Endings(tmp_path, "sim.autopilot.autopilot=ardupilot", "hand_over.climb_s=4.0")
     monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
     told = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
     assert "FAILED" in told.ending["sentence"]
@@ -168,7 +168,7 @@ def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
 
 def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.engage_s=3.0")
-    rig.at(State.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
+    rig.at(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
     told = typed(rig, Cause.NOT_GRANTED, *TAKE_OFF)
     assert "landed and disarmed" in told.ending["sentence"]
 
@@ -242,13 +242,13 @@ def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, 
 
 
 def test_landing_fails(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, "hand_over.land_s=6.0").at(State.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
+    rig = Endings(tmp_path, "hand_over.land_s=6.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
     assert "in the air" in told.ending["sentence"]
 
 
 def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, lambda one: one.peers.autopilot.pilot._disarm(), after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._disarm(), after_s=2.0)
     typed(rig, Cause.DISARMED, *TAKE_OFF)
 
 
@@ -259,20 +259,20 @@ def test_the_envelope_lets_it_go(tmp_path: Path, typed: Type) -> None:
 
 
 def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, fail(Role.LAND), after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, fail(Role.LAND), after_s=2.0)
     typed(rig, Cause.FAILSAFE_LANDED, *TAKE_OFF)
 
 
 def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.climb_s=8.0")
-    rig.at(State.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
+    rig.at(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
     told = typed(rig, Cause.FAILSAFE, *TAKE_OFF)
     assert "has not ended in 8 s" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, airborne=True).at(State.ENGAGED, fail(Role.HOLD), after_s=2.0)
-    rig.at(State.RELEASED, interrupt, after_s=2.0)
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
     told = typed(rig, Cause.FAILSAFE)
     assert "in the air" in told.ending["sentence"]
 
@@ -284,7 +284,11 @@ def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
             data = bytes(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0).pack(mav))
             rig.lines["vehicle"].arrived.append((data, rig.now_ns))
 
-    rig = Endings(tmp_path).at(State.ENGAGED, young, after_s=2.0).at(State.RELEASED, interrupt, after_s=2.0)
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, young, after_s=2.0)
+        .at(HandoverState.RELEASED, interrupt, after_s=2.0)
+    )
     typed(rig, Cause.RESTARTED, *TAKE_OFF)
 
 
@@ -293,8 +297,8 @@ def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str,
     def silence(rig: Endings) -> None:
         rig.told = lambda data: False
 
-    rig = Endings(tmp_path, "hand_over.land_s=6.0", airborne=not words).at(State.ENGAGED, silence, after_s=2.0)
-    rig.at(State.ENGAGED, interrupt, after_s=12.0)
+    rig = Endings(tmp_path, "hand_over.land_s=6.0", airborne=not words).at(HandoverState.ENGAGED, silence, after_s=2.0)
+    rig.at(HandoverState.ENGAGED, interrupt, after_s=12.0)
     told = typed(rig, Cause.SILENT, *words)
     assert "not heard for" in told.ending["sentence"]
 
@@ -303,7 +307,7 @@ def test_the_connection_is_closed(tmp_path: Path, typed: Type) -> None:
     def close(rig: Endings) -> None:
         rig.lines["vehicle"].closed = True
 
-    typed(Endings(tmp_path).at(State.ENGAGED, close, after_s=2.0), Cause.CONNECTION, *TAKE_OFF)
+    typed(Endings(tmp_path).at(HandoverState.ENGAGED, close, after_s=2.0), Cause.CONNECTION, *TAKE_OFF)
 
 
 @pytest.mark.fault(64)
@@ -315,7 +319,7 @@ def test_the_controller_fails_and_the_relay_goes_on(
         raise ArithmeticError("the core is broken")
 
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
-    rig.at(State.ENGAGED, lambda _: monkeypatch.setattr(control, "step", broken), after_s=2.0)
+    rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "step", broken), after_s=2.0)
     told = typed(rig, Cause.CONTROL, *TAKE_OFF)
     assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
     assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console
@@ -325,9 +329,13 @@ def test_the_controller_fails_and_the_relay_goes_on(
 
 def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
-    rig.at(State.ENGAGED, Endings.ask_status, after_s=1.0).at(State.ENGAGED, stick("POSCTL"), after_s=2.0)
-    rig.at(State.RELEASED, interrupt, after_s=1.0).at(State.RELEASED, Endings.ask_status, after_s=3.0)
-    rig.at(State.RELEASED, stick("AUTO.LAND"), after_s=5.0).at(State.RELEASED, Endings.ask_status, after_s=6.0)
+    rig.at(HandoverState.ENGAGED, Endings.ask_status, after_s=1.0).at(
+        HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0
+    )
+    rig.at(HandoverState.RELEASED, interrupt, after_s=1.0).at(HandoverState.RELEASED, Endings.ask_status, after_s=3.0)
+    rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=5.0).at(
+        HandoverState.RELEASED, Endings.ask_status, after_s=6.0
+    )
     told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
     flying, alone, landing = rig.statuses
     assert (flying["ending"], flying["relay"]["alone"]) == ("", False)
@@ -335,23 +343,31 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     for one, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
         assert one["relay"]["alone"] and one["relay"]["sent_hz"] > 0.0 and one["relay"]["last_s"] < 3.0
         assert one["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in one["ending"]
-        assert one["who_flies"] == State.RELEASED
+        assert one["who_flies"] == HandoverState.RELEASED
     assert told.relay is not None and told.relay.alone
 
 
 def test_the_operator_is_answered_with_the_end_that_is_under_way(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, interrupt, after_s=2.0).at(State.LANDING, Endings.ask_status, after_s=0.5)
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
+        .at(HandoverState.LANDING, Endings.ask_status, after_s=0.5)
+    )
     typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
     (status,) = rig.statuses
     assert status["ending"].lower().startswith(Cause.OPERATOR) and "in the air" in status["ending"]
-    assert status["who_flies"] in (State.LANDING, State.SETTLING) and status["relay"] is None
+    assert status["who_flies"] in (HandoverState.LANDING, HandoverState.SETTLING) and status["relay"] is None
 
 
 # Ends that leave less behind
 
 
 def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = Endings(tmp_path).at(State.ENGAGED, interrupt, after_s=2.0).at(State.ENGAGED, interrupt, after_s=0.1)
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
+        .at(HandoverState.ENGAGED, interrupt, after_s=0.1)
+    )
     told = flown(rig, capsys, *TAKE_OFF)
     (recorded,) = told.recorded
     assert (recorded.cause, recorded.exit_code) == (Cause.SIGNALLED, 130)
@@ -369,7 +385,7 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
     def fill(_: Endings) -> None:
         monkeypatch.setattr(Sync, "full", True)
 
-    rig = Endings(tmp_path).at(State.ENGAGED, fill, after_s=2.0)
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, fill, after_s=2.0)
     told = flown(rig, capsys, *TAKE_OFF, "--duration", "12")
     ending = told.ending
     assert ending["cause"] == Cause.TIME and not ending["as_ordered"] and told.code == ending["exit_code"] == 1
@@ -386,8 +402,8 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
 ) -> None:
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
     monkeypatch.setattr(flying, "LANDING_S", 1.0)
-    rig = Endings(tmp_path, airborne=True).at(State.ENGAGED, deafen("COMMAND_LONG"))
-    told = typed(rig.at(State.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
+    told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
     assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
 
 
@@ -436,6 +452,6 @@ def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> 
 
 
 def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
-    typed(Endings(tmp_path).at(State.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
+    typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
     with sole_daemon("udpin://127.0.0.1:1") as tenure:
         assert not tenure.leaves

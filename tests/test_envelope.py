@@ -8,24 +8,12 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from envelope_rig import (
-    AT_NS,
-    PARAMETERS,
-    TICK_NS,
-    Array,
-    just_less,
-    just_more,
-    look,
-    motion,
-    seen,
-    vec3,
-)
+from envelope_rig import AT_NS, PARAMETERS, TICK_NS, Array, just_less, just_more, look, motion, seen, vec3
 from flight_rig import MS, START_NS, drag_lag_generator, sample
 from msgspec import structs
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from uavctl.data import Vec3, VehicleMotion
 from uavctl.flight.envelope import (
     BRAKING,
     NOT_WATCHING,
@@ -41,6 +29,7 @@ from uavctl.flight.envelope import (
     watch,
 )
 from uavctl.flight.limits import ZERO
+from uavctl.records import Vec3, VehicleMotion
 
 # The limits
 

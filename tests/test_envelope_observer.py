@@ -31,7 +31,6 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.linalg import expm
 
-from uavctl.data import Vec3, VehicleMotion
 from uavctl.flight.envelope import (
     BRAKING,
     BREACHES,
@@ -48,6 +47,7 @@ from uavctl.flight.envelope import (
     watch,
 )
 from uavctl.flight.limits import ZERO
+from uavctl.records import Vec3, VehicleMotion
 
 # The observer
 

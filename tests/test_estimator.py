@@ -23,11 +23,10 @@ from msgspec.structs import replace as changed
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
-from uavctl.data import Estimate, PositionSample
 from uavctl.flight.estimator import (
     DUPLICATE,
     TOO_OLD,
-    History,
+    FilterHistory,
     absorb,
     begin,
     belief_at,
@@ -35,15 +34,25 @@ from uavctl.flight.estimator import (
     set_input,
     without,
 )
-from uavctl.flight.kalman import CONTRADICTED, Belief, Kalman, contradicted, felt, make_kalman, predicted, updated
-from uavctl.flight.propagation import make_propagation
+from uavctl.flight.kalman import (
+    CONTRADICTED,
+    Belief,
+    Kalman,
+    contradicted,
+    felt,
+    make_kalman,
+    make_propagation,
+    predicted,
+    updated,
+)
+from uavctl.records import Estimate, PositionSample
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]
 S = 1_000_000_000
 
 
-def make(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, **changes: float) -> tuple[Kalman, History]:
+def make(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, **changes: float) -> tuple[Kalman, FilterHistory]:
     kalman = make_kalman(small_plant(axes, wind_std), estimator_parameters(**changes), DT_NS)
     return kalman, begin(kalman, START_NS, START_NS)
 
@@ -432,7 +441,7 @@ def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
     assert history.captured_ns == at_ns - 3 * MS
 
 
-def told(history: History) -> list[str]:
+def told(history: FilterHistory) -> list[str]:
     """All that is known, to the last bit."""
     return [repr((history.origin_ns, history.horizon_ns, history.anchor))] + [repr(one) for one in history.entries]
 

@@ -10,19 +10,16 @@ from library_rig import PRESETS, bounds, case, closed_loop, equilibrium, near, u
 from numpy.typing import NDArray
 from test_library import small
 
-from uavctl.build import build_plant
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
-from uavctl.campaign.world import Flown, Scene, fly
+from uavctl.build.controller import build_plant
 from uavctl.config import load_config
-from uavctl.data import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
-from uavctl.smpc.batch_smpc import BatchSmpc, Decider, Decisions, OneByOne, Tally
-from uavctl.smpc.design import Design
-from uavctl.smpc.explicit import ExplicitDecider
-from uavctl.smpc.library import make_library
-from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.plan_map import FROZEN
+from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
+from uavctl.smpc.batch import BatchSmpc, Decider, Decisions, OneByOne, Tally
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
+from uavctl.smpc.hahn_stursberg.frozen import FROZEN
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver, make_library
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -83,7 +80,7 @@ class Unasked:
     def __init__(self) -> None:
         self.count = 0
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         self.count += 1
         return Answer.failed(seq, SolveStatus.FAILED, FROZEN)
 
@@ -115,10 +112,7 @@ def test_a_target_far_away_is_answered_alike(seed: int) -> None:
     one, rng = case("room-hahn-stursberg"), np.random.default_rng(seed)
     target = equilibrium(one.design, rng)
     shape = (one.design.horizon, one.design.plant.n_u)
-    fast, slow = (
-        ExplicitDecider(one.design, one.library, one.solver, target),
-        OneByOne(one.solver, target, shape),
-    )
+    fast, slow = (ExplicitDecider(one.design, one.library, one.solver, target), OneByOne(one.solver, target, shape))
     rest = [equilibrium(one.design, rng) for _ in range(40)]
     away = np.array([0.7 * state + 0.3 * target for state in rest])
     agree(fast.decide(away, 0), slow.decide(away, 0))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from uavctl.smpc.explicit_regions import Critical, Parametric, critical_regions
+from uavctl.smpc.hahn_stursberg.explicit import Critical, Parametric, critical_regions
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
 Array = NDArray[np.float64]

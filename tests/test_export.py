@@ -20,20 +20,18 @@ import view_rig
 from recording_fakes import record_flight
 from test_flat import tabulate
 
-from logs.chunks import Message
-from logs.disk import DiskFile
-from logs.export import TableFormat, export_tables, file_stem
-from logs.export_tlog import export_tlog
-from logs.onlookers import Onlookers
-from logs.reader import good_messages, read, segment_files
-from logs.recorder import SyncRecorder
-from logs.segment import Entry, Segment
-from logs.topics import Definition
-from logs.views import Views
+from logs.recording.disk import DiskFile
+from logs.recording.export import TableFormat, export_tables, file_stem
+from logs.recording.reader import RecordedMessage, good_messages, read, segment_files
+from logs.recording.recorder import DerivedTopics, SyncRecorder
+from logs.recording.segment import QueuedMessage, Segment
+from logs.recording.tlog import export_tlog
+from logs.recording.topics import Definition
+from logs.recording.views import Views
 from uavctl.cli.app import run
-from uavctl.config.log import LogConfig
-from uavctl.data import Event, LinkStats, Record, Setpoint, SetpointSource, Severity, Timing
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError
+from uavctl.records import Event, LinkStats, Record, Setpoint, SetpointSource, Severity, Timing
 
 ODD: list[tuple[str, int, Record]] = [
     (
@@ -161,10 +159,10 @@ def with_unknown(path: Path) -> None:
     number = 0
     for message in good_messages(path.with_name("known.mcap")):
         number += 1
-        segment.add(Entry(message.definition, number, message.at_ns, message.data))
+        segment.add(QueuedMessage(message.definition, number, message.at_ns, message.data))
     for _ in range(2):
         number += 1
-        segment.add(Entry(Definition("/uavctl/novel", "json"), number, 2_000_000_000, b'{"a":1}'))
+        segment.add(QueuedMessage(Definition("/uavctl/novel", "json"), number, 2_000_000_000, b'{"a":1}'))
     segment.finish()
 
 
@@ -303,14 +301,14 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     path = tmp_path / "flight.mcap"
     segment_bytes = 10**9 if files == 1 else view_rig.record(path).stat().st_size * 2 // 5
     path.unlink(missing_ok=True)
-    recorder = SyncRecorder(path, LogConfig(segment_bytes=segment_bytes), onlookers=Onlookers(Views()))
+    recorder = SyncRecorder(path, LogConfig(segment_bytes=segment_bytes), onlookers=DerivedTopics(Views()))
     for entry in view_rig.flown().entries:
         recorder.put(*entry)
     assert recorder.close().ok and len(segment_files(path)) == files
     whole = sum(1 for _ in good_messages(path))
     seen: list[tuple[str, int | None, int]] = []
 
-    def watch(messages: Iterable[Message], total: int | None, what: str) -> Iterator[Message]:
+    def watch(messages: Iterable[RecordedMessage], total: int | None, what: str) -> Iterator[RecordedMessage]:
         count = 0
         for message in messages:
             count += 1

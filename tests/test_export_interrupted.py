@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.chunks import Message
-from logs.export import TableFormat, Watch, export_tables
-from logs.export_tlog import export_tlog
-from logs.made_folders import all_or_none
-from logs.reader import good_messages
+from logs.recording.export import TableFormat, Watch, export_tables
+from logs.recording.outputs import all_or_none
+from logs.recording.reader import RecordedMessage, good_messages
+from logs.recording.tlog import export_tlog
 from uavctl.errors import RecordingError
 
 Export = Callable[[Path, Path, Watch], object]
@@ -37,7 +36,7 @@ def flight(tmp_path: Path) -> Path:
 def stopping(error: type[BaseException]) -> Watch:
     """Stops the writing half way: Ctrl-C, or a value that is refused."""
 
-    def watch(messages: Iterable[Message], _total: int | None, what: str) -> Iterator[Message]:
+    def watch(messages: Iterable[RecordedMessage], _total: int | None, what: str) -> Iterator[RecordedMessage]:
         for place, message in enumerate(messages):
             if what == "writing" and place == 20:
                 raise error

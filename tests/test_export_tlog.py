@@ -16,12 +16,11 @@ import view_rig
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recording_fakes import HEADER, record_flight
 
-from logs.export_tlog import export_tlog
-from logs.recorder import SyncRecorder
-from logs.tlog import read_tlog
+from logs.recording.recorder import SyncRecorder
+from logs.recording.tlog import export_tlog, read_tlog
 from uavctl.cli.app import run
-from uavctl.data import Datagram, Header, raw_topic
 from uavctl.errors import RecordingError, UsageError
+from uavctl.records import Datagram, Header, raw_topic
 
 STARTED_US = 1_767_323_045_000_000  # 2026-01-02T03:04:05Z
 
@@ -85,9 +84,7 @@ def test_times_are_utc_by_the_header(tmp_path: Path) -> None:
     header = msgspec.structs.replace(HEADER, started_ns=7_000_000_000)
     flight = tmp_path / "flight.mcap"
     write(
-        flight,
-        [(at_ns, "vehicle", True, packet(1)) for at_ns in (7_000_000_000, 7_000_001_999, 8_500_000_000)],
-        header,
+        flight, [(at_ns, "vehicle", True, packet(1)) for at_ns in (7_000_000_000, 7_000_001_999, 8_500_000_000)], header
     )
     export_tlog(flight, tmp_path / "a.tlog")
     assert [one.at_ns // 1000 - STARTED_US for one in read_tlog(tmp_path / "a.tlog")] == [0, 1, 1_500_000]

@@ -7,11 +7,10 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
-from uavctl.data import ControlMode, Vec3
 from uavctl.flight.fallback import (
     Biases,
-    End,
     Fallback,
+    FallbackEnd,
     FallbackParameters,
     acceleration,
     advance,
@@ -22,6 +21,7 @@ from uavctl.flight.fallback import (
     request,
 )
 from uavctl.flight.limits import ZERO
+from uavctl.records import ControlMode, Vec3
 
 S = 1_000_000_000
 PARAMETERS = FallbackParameters(
@@ -30,7 +30,13 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, BARRED, LET_GO, STOP, TO_LAND = End.RECOVER, End.BARRED, End.LET_GO, End.STOP, End.LAND
+RECOVER, BARRED, LET_GO, STOP, TO_LAND = (
+    FallbackEnd.RECOVER,
+    FallbackEnd.BARRED,
+    FallbackEnd.LET_GO,
+    FallbackEnd.STOP,
+    FallbackEnd.LAND,
+)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +79,7 @@ RECOVER, BARRED, LET_GO, STOP, TO_LAND = End.RECOVER, End.BARRED, End.LET_GO, En
 )
 def test_transitions(
     mode: ControlMode,
-    end: End,
+    end: FallbackEnd,
     after_ns: int,
     speed_mps: float,
     parameters: FallbackParameters,
@@ -97,7 +103,7 @@ def test_transitions(
         (RECOVER, S, (0.0, 0.0, 0.0), HOLD),
     ],
 )
-def test_a_hand_over_waits_for_its_zero(end: End, after_ns: int, sent_mps2: Vec3, wanted: ControlMode) -> None:
+def test_a_hand_over_waits_for_its_zero(end: FallbackEnd, after_ns: int, sent_mps2: Vec3, wanted: ControlMode) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, end=end)
     assert advance(before, 5 * S + after_ns, 0.0, sent_mps2, PARAMETERS).mode is wanted
 
@@ -150,12 +156,12 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
         (Fallback(STOPPED, 4), STOP, Fallback(STOPPED, 4)),
     ],
 )
-def test_an_end_that_is_asked_for(before: Fallback | None, end: End, after: Fallback) -> None:
+def test_an_end_that_is_asked_for(before: Fallback | None, end: FallbackEnd, after: Fallback) -> None:
     assert request(before, end, 9) == after
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, end).final for end in End] == [False, True, True, True, True]
+    assert [Fallback(HOLD, 0, end).final for end in FallbackEnd] == [False, True, True, True, True]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:
@@ -226,7 +232,7 @@ def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew()
     ],
 )
 def test_what_drifts_by_its_own_word_is_braked_again(
-    end: End, measured: bool, speed_mps: float, wanted: ControlMode
+    end: FallbackEnd, measured: bool, speed_mps: float, wanted: ControlMode
 ) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, end=end, held_ns=4 * S)
     after = advance(

@@ -33,8 +33,8 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, PositionSample, StepInput
 from uavctl.flight.estimator import LATEST_STAMP_NS
+from uavctl.records import ControlMode, PositionSample, StepInput
 
 TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)

@@ -13,19 +13,17 @@ import pytest
 from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.build import build_estimator
+from uavctl.build.controller import build_estimator
 from uavctl.config import load_config
-from uavctl.config.peers import SourceConfig
-from uavctl.data import Event, PositionSample, Setpoint, SetpointSource, Severity
-from uavctl.flight.samples import refusal
+from uavctl.config.connections import SourceConfig
+from uavctl.flight.gating import refusal
 from uavctl.mavlink import codec
-from uavctl.mavlink.codec import decode
-from uavctl.mavlink.encoder import Encoder
-from uavctl.mavlink.hand_over import HandOver
-from uavctl.mavlink.link import Item, Link
-from uavctl.mavlink.mode import Sending, State
-from uavctl.mavlink.request import Ask
-from uavctl.mavlink.sight import View
+from uavctl.mavlink.codec import Encoder, decode
+from uavctl.mavlink.connection import Item, MavlinkConnection
+from uavctl.mavlink.handover import HandOver
+from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import Event, PositionSample, Setpoint, SetpointSource, Severity
 
 NOW = 50_000 * SECOND
 CAMERA = Peer(17, 18)
@@ -39,7 +37,7 @@ def flip(data: bytes, bit: int) -> bytes:
 class Source:
     """Cameras with their own clock, 25 a second."""
 
-    def __init__(self, link: Link, epoch_us: int = 10**9) -> None:
+    def __init__(self, link: MavlinkConnection, epoch_us: int = 10**9) -> None:
         self.link, self.us, self.at_ns = link, epoch_us, NOW
 
     def send(self, count: int = 1, delay_ns: int = 30 * MS) -> list[PositionSample]:
@@ -120,7 +118,7 @@ def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
         told += events(items)
     assert [(event.code, event.severity) for event in told] == [("second-vehicle", Severity.ERROR)] * 2
     assert link.stats(NOW).bad == {"second-vehicle": 10}
-    assert read(link.ask(Ask.LAND, 0.0))[0].target_system == 1
+    assert read(link.ask(RequestKind.LAND, 0.0))[0].target_system == 1
     assert len(statuses(link.receive(ours.heartbeat(), NOW))) == 1
 
 
@@ -144,7 +142,7 @@ def test_row_17_the_wall_clock_is_never_asked(monkeypatch: pytest.MonkeyPatch) -
     link = make_link()
     Source(link).send()
     for name in ("time", "time_ns", "monotonic", "monotonic_ns"):
-        monkeypatch.setattr(f"uavctl.mavlink.link.{name}", refuse, raising=False)
+        monkeypatch.setattr(f"uavctl.mavlink.connection.{name}", refuse, raising=False)
     with monkeypatch.context() as patched:
         patched.setattr(time, "time_ns", refuse)
         patched.setattr(time, "monotonic_ns", refuse)
@@ -184,7 +182,7 @@ def test_row_18_our_own_boot_clock_wraps() -> None:
         assert struct.unpack_from("<I", data, 10)[0] == want
 
 
-def reply(link: Link, at_ns: int, offset_ns: int, round_trip_ns: int = 2 * MS) -> bool:
+def reply(link: MavlinkConnection, at_ns: int, offset_ns: int, round_trip_ns: int = 2 * MS) -> bool:
     """Answer the request of `at_ns` if there is one, as a peer whose clock is `offset_ns` behind ours."""
     for data in link.due(at_ns):
         raw = mavlink.MAVLink(None).decode(bytearray(data))
@@ -195,7 +193,7 @@ def reply(link: Link, at_ns: int, offset_ns: int, round_trip_ns: int = 2 * MS) -
     return False
 
 
-def offset_after(link: Link, at_ns: int, offset_ns: int) -> int | None:
+def offset_after(link: MavlinkConnection, at_ns: int, offset_ns: int) -> int | None:
     """The offset that a sample of `at_ns` is mapped with."""
     link.receive(CAMERA.vision((at_ns - offset_ns) // 1000), at_ns + 50 * MS)
     return link.stats(NOW).clock_offset_ns
@@ -227,7 +225,7 @@ def test_row_19_deviating_answers_are_dropped_until_five_agree() -> None:
     assert link.stats(NOW).bad == {"timesync": 4}  # the fifth in a row is believed
 
 
-def told_while(link: Link, seconds: int, slow: Callable[[int], bool]) -> list[Event]:
+def told_while(link: MavlinkConnection, seconds: int, slow: Callable[[int], bool]) -> list[Event]:
     """Events of a link whose peer answers each request in 2 ms, or in 40 ms where it is `slow` then [s]."""
     found: list[Item] = []
     for n in range(seconds):
@@ -295,7 +293,7 @@ def test_row_20_the_restart_is_told_once() -> None:
 def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     link, vehicle, hand_over = make_link(), Peer(1, 1), HandOver()
     (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW))
-    assert hand_over.update(View(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
+    assert hand_over.update(HandoverView(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
     for n in range(3):
         link.receive(vehicle.local_position(60_000 + n * 100), NOW)
     later = NOW + 5 * SECOND
@@ -303,8 +301,8 @@ def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     items = link.receive(vehicle.local_position(800), later)
     assert [event.code for event in events(items)] == ["vehicle-reboot"]
     (booted,) = statuses(items)
-    assert hand_over.update(View(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
-    assert hand_over.state is State.RELEASED  # though it says that it is armed, in OFFBOARD
+    assert hand_over.update(HandoverView(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
+    assert hand_over.state is HandoverState.RELEASED  # though it says that it is armed, in OFFBOARD
     items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND)
     assert not events(items)  # told once, and a heartbeat's status alone tells nothing
 
@@ -365,7 +363,7 @@ def mutate(data: bytes, numbers: random.Random) -> bytes:
     return sealed(bytes(frame), crc_extra)
 
 
-def fuzz(link: Link, count: int, seed: int) -> Counter[str]:
+def fuzz(link: MavlinkConnection, count: int, seed: int) -> Counter[str]:
     """Give mutated messages to a link and check what comes out; counts by kind."""
     numbers = random.Random(seed)
     kinds: Counter[str] = Counter()

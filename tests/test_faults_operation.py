@@ -6,9 +6,9 @@ import pytest
 from loopback_rig import Memory, make_loop
 from sim_rig import decode
 
-from sim.peers import Peers
+from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Event, Setpoint, Truth
+from uavctl.records import ControlMode, Datagram, Event, Setpoint, Truth
 
 TICK_NS = 50_000_000
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
@@ -68,7 +68,7 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
 
 @pytest.mark.fault(8)
 def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
-    flight = Flight('sim.autopilot="ardupilot"')
+    flight = Flight('sim.autopilot.autopilot="ardupilot"')
     flight.run(1.5)
     assert flight.speed_mps > 0.3
     flight.run(8.0, uplink=False)  # the last acceleration for GUID_TIMEOUT = 3 s, then the brakes

@@ -26,7 +26,7 @@ from flight_rig import (
     with_faults,
 )
 
-from uavctl.data import ControlMode, Severity, SolveStatus
+from uavctl.records import ControlMode, Severity, SolveStatus
 from uavctl.smpc.answer import Answer
 
 TRACK = ControlMode.TRACK

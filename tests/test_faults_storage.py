@@ -14,19 +14,18 @@ from loopback_rig import Memory, header, make_loop
 from mcap.reader import make_reader
 from recording_fakes import Clock, Disk, Item, flight, own, record_flight
 
-from logs.chunks import Damage, Message, scan
-from logs.disk import DiskFile, OutputFile
-from logs.info import info
-from logs.reader import read, records, segment_files
-from logs.recorder import Recorder, SyncRecorder
-from logs.recover import recover
-from logs.topics import RecorderNote
-from sim.world import World
-from uavctl.build import build_design
+from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.info import info
+from logs.recording.reader import Damage, RecordedMessage, read, records, scan, segment_files
+from logs.recording.recorder import Recorder, SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.topics import RecorderNote
+from sim.simulation import World
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
-from uavctl.config.log import LogConfig
-from uavctl.data import Event, Record, Severity
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
+from uavctl.records import Event, Record, Severity
 
 COUNT = 60
 TOOL = Path(__file__).parent.parent / "tools" / "storage.py"
@@ -51,7 +50,7 @@ class FullFrom:
 def assert_segments_begin_once(path: Path) -> None:
     """Each file has one header, and one note of why it was begun, however often that was tried."""
     for file in segment_files(path):
-        found = [item for item in scan(file) if isinstance(item, Message)]
+        found = [item for item in scan(file) if isinstance(item, RecordedMessage)]
         assert [item.definition.topic for item in found].count("/uavctl/header") == 1
         assert found[0].definition.topic == "/uavctl/header"
         assert sum(b"after a failed write" in item.data for item in found) == (file != path)
@@ -273,7 +272,7 @@ def test_32_a_flipped_byte_anywhere_is_never_a_wrong_value(tmp_path: Path, finis
 def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 60)
-    whole = [item for item in scan(path) if isinstance(item, Message)]
+    whole = [item for item in scan(path) if isinstance(item, RecordedMessage)]
     data = path.read_bytes()
     offsets = sorted({item.offset for item in whole})
     assert len(offsets) > 8
@@ -281,7 +280,7 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
         for position in (offset, offset + 3, offset + 8, offset + 33, offset + 60):
             path.write_bytes(flipped(data, position, 4))
             found = list(scan(path))
-            assert [item for item in found if isinstance(item, Message)] == [
+            assert [item for item in found if isinstance(item, RecordedMessage)] == [
                 item for item in whole if item.offset != offset
             ]
             assert [(item.offset, item.torn) for item in found if isinstance(item, Damage)] == [(offset, False)]

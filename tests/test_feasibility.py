@@ -10,14 +10,11 @@ import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, START, TAU_3, paper, paper_plant, paper_spec, room
 
 from uavctl.errors import DesignError
-from uavctl.smpc import feasibility
-from uavctl.smpc.components import decompose
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, make_design
-from uavctl.smpc.feasibility import check_schedule, optimal_cost
-from uavctl.smpc.horizon import Horizon
+from uavctl.smpc.hahn_stursberg import exact as feasibility
+from uavctl.smpc.hahn_stursberg.design import Design, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule, optimal_cost
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, terminal_bound
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.reduction import terminal_bound
 from uavctl.smpc.sets import Polytope
 
 GOOD_LINK = bernoulli(np.array([0.8]))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.bench.decisions import questions
-from uavctl.build import build_controller
+from uavctl.build.controller import build_controller
 from uavctl.config import load_config
+from uavctl.lab.bench.decisions import questions
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conditioned import ConditionedSolver
-from uavctl.smpc.first_rows import FirstRows
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.qp import FirstRows
 
 
 def asked(name: str) -> list[Answer]:

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_encoding import values
 
-from logs.flat import Cell, Kind, Tables
-from logs.topics import TOPICS, Topic, record_type
-from uavctl.data import (
+from logs.recording.export import Cell, ColumnKind, Tables
+from logs.recording.topics import TOPICS, Topic, record_type
+from uavctl.records import (
     Command,
     Estimate,
     Order,
@@ -28,7 +28,13 @@ from uavctl.data import (
     VehicleStatus,
 )
 
-HELD = {Kind.INTEGER: int, Kind.FLOAT: float, Kind.BOOLEAN: bool, Kind.TEXT: str, Kind.BYTES: bytes}
+HELD = {
+    ColumnKind.INTEGER: int,
+    ColumnKind.FLOAT: float,
+    ColumnKind.BOOLEAN: bool,
+    ColumnKind.TEXT: str,
+    ColumnKind.BYTES: bytes,
+}
 
 
 def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:

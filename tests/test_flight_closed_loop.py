@@ -6,10 +6,10 @@ import numpy as np
 from flight_rig import MS, START_NS, run, sample, vehicle
 from numpy.typing import NDArray
 
-from uavctl.build import build_controller
+from uavctl.build.controller import build_controller
 from uavctl.config import load_config
-from uavctl.data import ControlMode, SolveStatus, StepInput
 from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.records import ControlMode, SolveStatus, StepInput
 
 
 def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], NDArray[np.float64]]:

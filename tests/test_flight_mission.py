@@ -14,17 +14,16 @@ from loopback_rig import Memory, flight, lockstep, make_loop
 from numpy.typing import NDArray
 from report_rig import unwritten
 
-from logs.moving_limits import box_at
-from logs.replay import replay
-from logs.report import report_html
-from logs.summary import position_error_m, rows, summarise
-from logs.words import story
-from uavctl.build import build_design
+from logs.recording.replay import replay
+from logs.recording.summary import box_at, position_error_m, rows, summarise
+from logs.report.flight_page import report_html
+from logs.report.summary_text import story
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
-from uavctl.data import ControlMode, Decision, Event, GaveWay, Plan, Truth
 from uavctl.flight.mission import Waypoint
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+from uavctl.records import ControlMode, Decision, Event, GaveWay, Plan, Truth
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
 Array = NDArray[np.float64]
 
@@ -261,9 +260,9 @@ def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_oth
 class ListeningSolver(StubSolver):
     """Keeps what it was told of the time ahead."""
 
-    told: list[Outlook] = field(default_factory=list)
+    told: list[Preview] = field(default_factory=list)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         self.told.append(outlook)
         return super().solve(seq, x, target, outlook)
 

@@ -19,15 +19,14 @@ import pytest
 from loopback_rig import make_loop
 from operation_rig import ended
 
-from logs.reader import read, records
-from logs.replay import replay
+from logs.recording.reader import read, records
+from logs.recording.replay import replay
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.control_messages import daemon_name
-from uavctl.control_socket import listening
-from uavctl.data import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
-from uavctl.lock import lock_paths, sole_daemon
+from uavctl.daemon.control_socket import daemon_name, listening
+from uavctl.daemon.lock import lock_paths, sole_daemon
+from uavctl.records import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
 
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 SOURCE = Path(__file__).parent / "foreign_source.py"
@@ -106,7 +105,7 @@ def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target
 def test_a_second_daemon_is_refused_before_it_makes_anything(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, control: str
 ) -> None:
-    monkeypatch.delattr("uavctl.cli.fly_cmd.design_of")
+    monkeypatch.delattr("uavctl.cli.fly.design_of")
     url = f"udpin://127.0.0.1:{free_port()}"
     words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
     with sole_daemon(url):

@@ -11,16 +11,15 @@ from foreign_rig import DATA, TLOGS, by_tlog, flown, rows_of, write
 from loopback_rig import lockstep, make_loop
 from mcap.writer import CompressionType
 
-from logs.foreign import ForeignMcap, is_foreign, read_mcap
-from logs.recorder import SyncRecorder
-from logs.replay_tlog import ForeignReplay, replay_tlog
-from logs.tlog import TlogPacket, frame_length, read_tlog
+from logs.recording.foreign import ForeignMcap, is_foreign, read_mcap
+from logs.recording.recorder import SyncRecorder
+from logs.recording.tlog import ForeignReplay, TlogPacket, frame_length, read_tlog, replay_tlog
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.config.log import LogConfig
-from uavctl.data import Datagram, raw_topic
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import VEHICLE
+from uavctl.records import Datagram, raw_topic
 
 
 @pytest.mark.parametrize("encoding", ["mavlink", "", "x-mavlink", "application/octet-stream"])

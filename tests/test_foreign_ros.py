@@ -14,9 +14,8 @@ from mcap_ros1.writer import Writer as Ros1Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.foreign import read_mcap
-from logs.foreign_ros import ROS1, ROS2, UnreadableError, unwrapper
-from logs.tlog import TlogPacket, read_tlog
+from logs.recording.foreign import ROS1, ROS2, UnreadableError, read_mcap, unwrapper
+from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 
 # The fields of mavros_msgs/Mavlink, in its order, with constants and comments of its kind.

@@ -10,10 +10,9 @@ import pytest
 from foreign_rig import DATA, TLOGS, Row, by_tlog, flown, rows_of, write
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.foreign import read_mcap
-from logs.foreign_stream import cut
-from logs.tlog import TlogPacket, read_tlog
-from uavctl.cli.replaying import foreign_packets
+from logs.recording.foreign import cut, read_mcap
+from logs.recording.tlog import TlogPacket, read_tlog
+from uavctl.cli.replay import foreign_packets
 from uavctl.errors import RecordingError, UsageError
 
 S = 1_000_000_000

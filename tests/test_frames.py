@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from uavctl.data import Vec3
 from uavctl.frames import Convention, Frame, axes_turn, from_axes, rotate
+from uavctl.records import Vec3
 
 CONVENTIONS: tuple[Convention, ...] = ("ned", "enu", "flu")
 metres = st.floats(-1e3, 1e3)

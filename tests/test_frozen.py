@@ -9,7 +9,7 @@ import pytest
 from library_rig import PRESETS, Asked, all_kinds, case, mean_optimum, near
 from numpy.typing import NDArray
 
-from uavctl.data import SolveStatus
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
 
 Array = NDArray[np.float64]

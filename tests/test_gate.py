@@ -8,7 +8,7 @@ from signing_rig import KEY, OTHER_KEY, STAMP, SignedPeer, make_gate, seal, unkn
 
 from uavctl.mavlink.codec import StreamDecoder
 from uavctl.mavlink.framing import MAX_FAILED
-from uavctl.mavlink.signing import NEWEST_STAMP, Refusal, Signing
+from uavctl.mavlink.signing import NEWEST_STAMP, SignatureRefusal, Signing
 
 UNKNOWN = unknown()
 
@@ -72,9 +72,9 @@ def test_a_hostile_datagram_costs_a_bounded_number_of_hashes(monkeypatch: pytest
     gate = make_gate()
     hashes: list[bytes] = []
 
-    def verify(signing: Signing, frame: bytes, at_ns: int) -> Refusal:
+    def verify(signing: Signing, frame: bytes, at_ns: int) -> SignatureRefusal:
         hashes.append(frame)
-        return Refusal.FORGED
+        return SignatureRefusal.FORGED
 
     monkeypatch.setattr(Signing, "verify", verify)
     gate.admit(bytes((0xFD, 0, 1)) * 1300, 0)

@@ -12,16 +12,15 @@ from plant_cases import NAMED, SHAPES, case, kept, sampled, spec_of
 from plant_oracle import margins, reduced_cost
 from scipy.linalg import block_diag
 
-from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
-from uavctl.smpc.components import decompose, whole
-from uavctl.smpc.conic import ConicSolver, PartSolver
-from uavctl.smpc.design import make_design
-from uavctl.smpc.equilibria import equilibria
-from uavctl.smpc.horizon import horizon_of
+from uavctl.smpc.hahn_stursberg.design import make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
+from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.printed import PrintedProblem, PrintedSolver
+from uavctl.smpc.sets import equilibria
 
 Array = NDArray[np.float64]
 

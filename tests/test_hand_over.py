@@ -6,15 +6,14 @@ import pytest
 from hand_over_rig import ACCEPTED, DENIED, ENGAGE, FLY, NEUTRAL, NOTHING, NOW, TAKE_OFF, TICK_NS, Rig
 from msgspec.structs import replace
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, Order, Severity
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.request import Ask
-from uavctl.mavlink.sight import HEARTBEAT_TIMEOUT_NS
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover_guards import HEARTBEAT_TIMEOUT_NS, HandoverState
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Order, Severity
 
 
-@pytest.mark.parametrize("state", [s for s in State if s not in (State.DONE, State.FAILED)])
-def test_the_rig_gets_everywhere(state: State) -> None:
+@pytest.mark.parametrize("state", [s for s in HandoverState if s not in (HandoverState.DONE, HandoverState.FAILED)])
+def test_the_rig_gets_everywhere(state: HandoverState) -> None:
     assert Rig().to(state).state is state
 
 
@@ -39,10 +38,10 @@ def test_no_neutral_stream_before_the_controller_is_ready() -> None:
 
 @pytest.mark.fault(25)
 @pytest.mark.parametrize(
-    ("mode", "armed", "after"), [("POSCTL", True, State.RELEASED), ("OFFBOARD", False, State.DONE)]
+    ("mode", "armed", "after"), [("POSCTL", True, HandoverState.RELEASED), ("OFFBOARD", False, HandoverState.DONE)]
 )
-def test_the_pilot_takes_over_for_good(mode: str, armed: bool, after: State) -> None:
-    rig = Rig().to(State.ENGAGED)
+def test_the_pilot_takes_over_for_good(mode: str, armed: bool, after: HandoverState) -> None:
+    rig = Rig().to(HandoverState.ENGAGED)
     rig.be(mode=mode, armed=armed)
     assert rig.tick().sending is NOTHING and rig.is_in(after)
     assert mode in rig.codes("hand-over")[-1]
@@ -54,7 +53,7 @@ def test_the_pilot_takes_over_for_good(mode: str, armed: bool, after: State) -> 
 
 @pytest.mark.fault(27)
 def test_silence_while_engaged_is_told_once_and_the_controller_s_braking_is_sent() -> None:
-    rig = Rig().to(State.ENGAGED)
+    rig = Rig().to(HandoverState.ENGAGED)
     rig.mute = True
     for _ in range(HEARTBEAT_TIMEOUT_NS // TICK_NS):
         assert rig.tick().sending is FLY
@@ -69,10 +68,10 @@ def test_silence_while_engaged_is_told_once_and_the_controller_s_braking_is_sent
 
 
 def test_landing_is_asked_for_in_silence_too() -> None:
-    rig = Rig().to(State.ENGAGED)
+    rig = Rig().to(HandoverState.ENGAGED)
     rig.mute = True
     rig.run(10.0)
-    assert rig.tick(land=True).ask is Ask.LAND
+    assert rig.tick(land=True).ask is RequestKind.LAND
 
 
 def test_what_the_controller_may_fly() -> None:
@@ -81,7 +80,7 @@ def test_what_the_controller_may_fly() -> None:
     assert flown(NOW, None) is None
     assert rig.vehicle is not None and flown(NOW, rig.vehicle) == rig.vehicle
     assert flown(NOW + HEARTBEAT_TIMEOUT_NS + 1, rig.vehicle) is None
-    rig.to(State.RELEASED)
+    rig.to(HandoverState.RELEASED)
     rig.be(mode="OFFBOARD")
     seen = flown(rig.view.at_ns, rig.vehicle)
     assert seen is not None and not seen.external and "released" in seen.mode
@@ -94,26 +93,26 @@ def test_px4_goes_by_its_own_climb_and_offboard() -> None:
     rig = Rig("px4")
     told = rig.tick()
     told = rig.tick(commands=(TAKE_OFF,))
-    assert (rig.state, told.ask, told.sending) == (State.MODE, Ask.TAKE_OFF_MODE, NEUTRAL)
+    assert (rig.state, told.ask, told.sending) == (HandoverState.MODE, RequestKind.TAKE_OFF_MODE, NEUTRAL)
     rig.answer(ACCEPTED)
-    assert rig.is_in(State.MODE)  # the heartbeat has to show it
+    assert rig.is_in(HandoverState.MODE)  # the heartbeat has to show it
     rig.be(mode="AUTO.TAKEOFF")
-    assert rig.tick().ask is Ask.ARM
+    assert rig.tick().ask is RequestKind.ARM
     rig.answer(ACCEPTED)
-    assert rig.is_in(State.CLIMBING)  # arming starts the climb; the heartbeat may be a second behind
+    assert rig.is_in(HandoverState.CLIMBING)  # arming starts the climb; the heartbeat may be a second behind
     rig.tick(up_m=0.5)
     rig.be(armed=True)
-    assert rig.tick(up_m=1.0, up_mps=1.0).ask is None and rig.is_in(State.CLIMBING)
+    assert rig.tick(up_m=1.0, up_mps=1.0).ask is None and rig.is_in(HandoverState.CLIMBING)
     told = rig.tick(up_m=1.4, up_mps=1.0)  # 0.5 s ahead: 1.9 of 2 m
-    assert (rig.state, told.ask, told.sending) == (State.ENGAGING, Ask.EXTERNAL_MODE, NEUTRAL)
+    assert (rig.state, told.ask, told.sending) == (HandoverState.ENGAGING, RequestKind.EXTERNAL_MODE, NEUTRAL)
     told = rig.answer(ACCEPTED)
-    assert (rig.state, told.sending) == (State.ENGAGED, FLY)
+    assert (rig.state, told.sending) == (HandoverState.ENGAGED, FLY)
     seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)  # which still says AUTO.TAKEOFF
     assert seen is not None and seen.external and seen.armed
     rig.be(mode="OFFBOARD")
     rig.run(3.0)
-    assert rig.is_in(State.ENGAGED) and not rig.hand_over.failure
-    assert [ask for _, ask in rig.asked] == [Ask.TAKE_OFF_MODE, Ask.ARM, Ask.EXTERNAL_MODE]
+    assert rig.is_in(HandoverState.ENGAGED) and not rig.hand_over.failure
+    assert [ask for _, ask in rig.asked] == [RequestKind.TAKE_OFF_MODE, RequestKind.ARM, RequestKind.EXTERNAL_MODE]
 
 
 def test_ardupilot_climbs_in_guided_and_gets_no_setpoint_before_it_is_up() -> None:
@@ -124,34 +123,34 @@ def test_ardupilot_climbs_in_guided_and_gets_no_setpoint_before_it_is_up() -> No
     sent.append(rig.tick().sending)
     rig.be(armed=True)
     told = rig.tick()
-    assert told.ask is Ask.TAKE_OFF and rig.is_in(State.CLIMBING)
+    assert told.ask is RequestKind.TAKE_OFF and rig.is_in(HandoverState.CLIMBING)
     sent += [told.sending, rig.answer(ACCEPTED).sending]
     sent += [rig.tick(up_m=0.01 * n, up_mps=1.0).sending for n in range(180)]
-    assert rig.is_in(State.CLIMBING) and set(sent) == {NOTHING}
+    assert rig.is_in(HandoverState.CLIMBING) and set(sent) == {NOTHING}
     seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
     assert seen is not None and not seen.external  # though it is in GUIDED
     rig.tick(up_m=1.81)
-    assert rig.tick().sending is FLY and rig.is_in(State.ENGAGED)
-    assert [ask for _, ask in rig.asked] == [Ask.TAKE_OFF_MODE, Ask.ARM, Ask.TAKE_OFF]
+    assert rig.tick().sending is FLY and rig.is_in(HandoverState.ENGAGED)
+    assert [ask for _, ask in rig.asked] == [RequestKind.TAKE_OFF_MODE, RequestKind.ARM, RequestKind.TAKE_OFF]
 
 
 @pytest.mark.fault(34)
 def test_after_our_own_flight_landing_ends_disarmed() -> None:
-    rig = Rig("px4").to(State.ENGAGING)
+    rig = Rig("px4").to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
-    assert rig.tick(land=True).ask is Ask.LAND
+    assert rig.tick(land=True).ask is RequestKind.LAND
     rig.view = replace(rig.view, land=False)
     rig.be(mode="AUTO.LAND")
     rig.run(10.0)
-    assert rig.is_in(State.SETTLING) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.SETTLING) and rig.hand_over.busy
     rig.be(armed=False, mode="OFFBOARD", landed=True)  # as recorded: PX4 shows the mode of before after disarming
     rig.tick()
-    assert rig.is_in(State.DONE) and rig.hand_over.finished and not rig.hand_over.failure
+    assert rig.is_in(HandoverState.DONE) and rig.hand_over.finished and not rig.hand_over.failure
 
 
 def test_a_vehicle_that_stays_armed_on_the_ground_is_disarmed() -> None:
-    rig = Rig("px4").to(State.ENGAGING)
+    rig = Rig("px4").to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
     rig.tick(land=True)
@@ -160,39 +159,41 @@ def test_a_vehicle_that_stays_armed_on_the_ground_is_disarmed() -> None:
     rig.run(1.0)
     rig.be(landed=True)
     rig.run(4.9)
-    assert rig.asked_last(Ask.LAND)
+    assert rig.asked_last(RequestKind.LAND)
     rig.run(0.3)
-    assert rig.asked_last(Ask.DISARM)
+    assert rig.asked_last(RequestKind.DISARM)
     rig.be(armed=False)
     rig.tick()
-    assert rig.is_in(State.DONE)
+    assert rig.is_in(HandoverState.DONE)
 
 
 def test_a_vehicle_that_never_lands_is_told_of() -> None:
-    rig = Rig("px4", HandOverConfig(land_s=20.0)).to(State.ENGAGING)
+    rig = Rig("px4", HandOverConfig(land_s=20.0)).to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
     rig.tick(land=True)
     rig.view = replace(rig.view, land=False)
     rig.be(mode="AUTO.LAND")
     rig.run(21.0)
-    assert rig.is_in(State.FAILED) and "took too long" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "took too long" in rig.hand_over.failure
 
 
 def test_px4_that_stops_below_the_height_is_flown_from_there_and_one_that_never_rose_is_not() -> None:
-    rig = Rig("px4").to(State.CLIMBING)
+    rig = Rig("px4").to(HandoverState.CLIMBING)
     rig.be(mode="AUTO.LOITER")
     rig.tick(up_m=0.4)
-    assert rig.is_in(State.CLIMBING)
+    assert rig.is_in(HandoverState.CLIMBING)
     rig.tick(up_m=1.0)
-    assert rig.is_in(State.ENGAGING)
+    assert rig.is_in(HandoverState.ENGAGING)
 
 
 # Orders
 
 
-@pytest.mark.parametrize("state", [State.MODE, State.ENGAGED, State.RELEASED, State.LANDING])
-def test_take_off_is_ordered_once_and_on_the_ground(state: State) -> None:
+@pytest.mark.parametrize(
+    "state", [HandoverState.MODE, HandoverState.ENGAGED, HandoverState.RELEASED, HandoverState.LANDING]
+)
+def test_take_off_is_ordered_once_and_on_the_ground(state: HandoverState) -> None:
     rig = Rig().to(state)
     told = rig.tick(commands=(TAKE_OFF,))
     assert [event.code for event in told.events if event.code.startswith("order")] == [ORDER_REFUSED]
@@ -205,10 +206,10 @@ def test_an_order_before_the_vehicle_is_heard_waits_for_it() -> None:
     told = rig.tick(commands=(TAKE_OFF,))
     assert [event.code for event in told.events] == [ORDER_ACCEPTED]
     rig.run(5.0)
-    assert rig.is_in(State.WAITING)
+    assert rig.is_in(HandoverState.WAITING)
     rig.vehicle = vehicle
     rig.run(0.2)
-    assert rig.is_in(State.MODE)
+    assert rig.is_in(HandoverState.MODE)
 
 
 @pytest.mark.fault(26)
@@ -221,10 +222,10 @@ def test_an_order_before_the_vehicle_is_heard_waits_for_it() -> None:
     ],
 )
 def test_a_vehicle_that_must_not_be_armed_ends_it_at_once(fields: dict[str, object], autopilot: str, why: str) -> None:
-    rig = Rig(autopilot).to(State.READY)
+    rig = Rig(autopilot).to(HandoverState.READY)
     rig.be(**fields)
     rig.tick(commands=(TAKE_OFF,))
-    assert rig.is_in(State.FAILED) and why in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and why in rig.hand_over.failure
     assert not rig.asked and rig.codes("refused") == [rig.hand_over.failure]
 
 
@@ -236,51 +237,51 @@ def test_readiness_is_waited_for_with_a_bound(vehicle: bool, unfit: str, why: st
     rig.vehicle = rig.vehicle if vehicle else None
     rig.tick(commands=(TAKE_OFF,), unfit=unfit)
     rig.run(4.8)
-    assert rig.is_in(State.WAITING, State.READY)
+    assert rig.is_in(HandoverState.WAITING, HandoverState.READY)
     rig.run(0.5)
-    assert rig.is_in(State.FAILED) and why in rig.hand_over.failure and not rig.asked
+    assert rig.is_in(HandoverState.FAILED) and why in rig.hand_over.failure and not rig.asked
 
 
 def test_a_silent_vehicle_is_waited_for_with_a_bound() -> None:
-    rig = Rig(config=HandOverConfig(ground_s=5.0)).to(State.READY)
+    rig = Rig(config=HandOverConfig(ground_s=5.0)).to(HandoverState.READY)
     rig.mute = True
     rig.run(4.0)
     rig.tick(commands=(TAKE_OFF,))
     rig.run(5.1)
-    assert rig.is_in(State.FAILED) and "silent" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "silent" in rig.hand_over.failure
 
 
 def test_positions_that_grow_old_hold_arming_back() -> None:
-    rig = Rig(config=HandOverConfig(ground_s=5.0)).to(State.MODE)
+    rig = Rig(config=HandOverConfig(ground_s=5.0)).to(HandoverState.MODE)
     rig.view = replace(rig.view, unfit="the newest position is 1.2 s old")
     rig.be(mode="AUTO.TAKEOFF")
     rig.run(4.9)
-    assert rig.is_in(State.ARMING) and Ask.ARM not in [ask for _, ask in rig.asked]
+    assert rig.is_in(HandoverState.ARMING) and RequestKind.ARM not in [ask for _, ask in rig.asked]
     rig.run(0.3)
-    assert rig.is_in(State.FAILED) and "1.2 s old" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "1.2 s old" in rig.hand_over.failure
 
 
 @pytest.mark.fault(16)
-@pytest.mark.parametrize("state", [State.MODE, State.ARMING])
-def test_a_second_vehicle_on_the_way_ends_it(state: State) -> None:
+@pytest.mark.parametrize("state", [HandoverState.MODE, HandoverState.ARMING])
+def test_a_second_vehicle_on_the_way_ends_it(state: HandoverState) -> None:
     rig = Rig().to(state)
     rig.be(alone=False)
     rig.tick()
-    assert rig.is_in(State.FAILED) and "another vehicle" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "another vehicle" in rig.hand_over.failure
 
 
 @pytest.mark.fault(25)
 def test_engaging_again_takes_an_order_and_a_vehicle_in_the_air() -> None:
-    rig = Rig().to(State.RELEASED)
+    rig = Rig().to(HandoverState.RELEASED)
     told = rig.tick(commands=(ENGAGE,))
-    assert (rig.state, told.ask, told.sending) == (State.RETURNING, Ask.EXTERNAL_MODE, NEUTRAL)
+    assert (rig.state, told.ask, told.sending) == (HandoverState.RETURNING, RequestKind.EXTERNAL_MODE, NEUTRAL)
     assert [event.code for event in told.events if event.code.startswith("order")] == [ORDER_ACCEPTED]
     rig.be(mode="OFFBOARD")
     assert rig.tick().sending is FLY
 
 
 def test_engaging_a_vehicle_that_is_back_by_itself_asks_for_nothing() -> None:
-    rig = Rig().to(State.RELEASED)
+    rig = Rig().to(HandoverState.RELEASED)
     rig.be(mode="OFFBOARD")
     rig.tick(commands=(ENGAGE,))
     assert rig.tick().sending is FLY and not rig.asked
@@ -289,15 +290,15 @@ def test_engaging_a_vehicle_that_is_back_by_itself_asks_for_nothing() -> None:
 @pytest.mark.parametrize(
     ("state", "fields", "view", "why"),
     [
-        (State.RELEASED, {"landed": True}, {}, "not in the air"),
-        (State.RELEASED, {}, {"unfit": "no position"}, "no position"),
-        (State.ENGAGED, {}, {}, "nothing to engage"),
-        (State.READY, {}, {}, "not in the air"),
-        (State.RELEASED, {"autopilot": "unknown"}, {}, "no vehicle"),
+        (HandoverState.RELEASED, {"landed": True}, {}, "not in the air"),
+        (HandoverState.RELEASED, {}, {"unfit": "no position"}, "no position"),
+        (HandoverState.ENGAGED, {}, {}, "nothing to engage"),
+        (HandoverState.READY, {}, {}, "not in the air"),
+        (HandoverState.RELEASED, {"autopilot": "unknown"}, {}, "no vehicle"),
     ],
 )
 def test_engaging_is_refused_with_the_reason(
-    state: State, fields: dict[str, object], view: dict[str, object], why: str
+    state: HandoverState, fields: dict[str, object], view: dict[str, object], why: str
 ) -> None:
     rig = Rig().to(state)
     rig.be(**fields)
@@ -308,21 +309,23 @@ def test_engaging_is_refused_with_the_reason(
 
 
 @pytest.mark.fault(25)
-@pytest.mark.parametrize(("mode", "armed", "after"), [("ALTCTL", True, State.RELEASED), ("POSCTL", False, State.DONE)])
-def test_the_pilot_may_break_off_the_return(mode: str, armed: bool, after: State) -> None:
-    rig = Rig().to(State.RETURNING)
+@pytest.mark.parametrize(
+    ("mode", "armed", "after"), [("ALTCTL", True, HandoverState.RELEASED), ("POSCTL", False, HandoverState.DONE)]
+)
+def test_the_pilot_may_break_off_the_return(mode: str, armed: bool, after: HandoverState) -> None:
+    rig = Rig().to(HandoverState.RETURNING)
     rig.be(mode=mode, armed=armed)
     rig.tick()
     assert rig.is_in(after) and not rig.hand_over.failure
 
 
 def test_a_return_that_is_refused_leaves_the_pilot_in_charge() -> None:
-    rig = Rig().to(State.RETURNING)
+    rig = Rig().to(HandoverState.RETURNING)
     rig.answer(DENIED, text="no way")
-    assert rig.is_in(State.RELEASED) and not rig.hand_over.failure and not rig.hand_over.finished
+    assert rig.is_in(HandoverState.RELEASED) and not rig.hand_over.failure and not rig.hand_over.finished
     assert "DENIED" in rig.codes("refused")[0] and "no way" in rig.codes("refused")[0]
 
 
 def test_other_orders_are_the_controller_s() -> None:
-    rig = Rig().to(State.ENGAGED)
+    rig = Rig().to(HandoverState.ENGAGED)
     assert rig.tick(commands=(Command(order=Order.HOLD),)).events == ()

@@ -6,12 +6,12 @@ import pytest
 from hand_over_rig import ACCEPTED, ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, TAKE_OFF, TICK_NS, Rig
 from msgspec.structs import replace
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.data import Severity
-from uavctl.mavlink.hand_over import HandOver
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover import HandOver
+from uavctl.mavlink.handover_guards import HandoverState
 from uavctl.mavlink.messages import Text
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.request import Ask
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 WORDS = Text(system=1, component=1, severity=2, text="Failsafe activated")
@@ -19,24 +19,24 @@ WORDS = Text(system=1, component=1, severity=2, text="Failsafe activated")
 
 def engaged(autopilot: str = "px4", config: HandOverConfig | None = None) -> Rig:
     """A flight that we began, engaged."""
-    rig = Rig(autopilot, config).to(State.ENGAGING)
+    rig = Rig(autopilot, config).to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED", landed=False)
-    rig.run(1.0, until=State.ENGAGED)
+    rig.run(1.0, until=HandoverState.ENGAGED)
     return rig
 
 
 @pytest.mark.fault(61)
-@pytest.mark.parametrize("state", [State.ARMING, State.CLIMBING, State.ENGAGING])
-def test_a_failsafe_that_ends_on_the_way_up_is_waited_for_and_the_climb_goes_on(state: State) -> None:
+@pytest.mark.parametrize("state", [HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING])
+def test_a_failsafe_that_ends_on_the_way_up_is_waited_for_and_the_climb_goes_on(state: HandoverState) -> None:
     rig = Rig().to(state)
     rig.be(armed=True)
     rig.tick(WORDS, up_m=0.0)
-    assert rig.fail().sending is NOTHING and rig.is_in(State.FAILSAFE)
+    assert rig.fail().sending is NOTHING and rig.is_in(HandoverState.FAILSAFE)
     rig.run(1.0)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
-    assert rig.tick().sending is NEUTRAL and rig.is_in(State.CLIMBING)
+    assert rig.tick().sending is NEUTRAL and rig.is_in(HandoverState.CLIMBING)
     rig.tick(up_m=1.9)
-    assert rig.is_in(State.ENGAGING)
+    assert rig.is_in(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD")
     assert rig.tick().sending is FLY
     told = [event for event in rig.events if event.code == "hand-over" and "failsafe" in event.text]
@@ -44,46 +44,50 @@ def test_a_failsafe_that_ends_on_the_way_up_is_waited_for_and_the_climb_goes_on(
 
 
 @pytest.mark.fault(25, 61)
-@pytest.mark.parametrize("state", [State.CLIMBING, State.ENGAGING])
+@pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
 @pytest.mark.parametrize(
     ("mode", "failsafe"), [("AUTO.LAND", False), ("AUTO.RTL", False), ("POSCTL", True), ("MANUAL", True)]
 )
 def test_without_its_word_or_in_a_mode_that_failsafes_do_not_choose_it_is_the_pilot(
-    state: State, mode: str, failsafe: bool
+    state: HandoverState, mode: str, failsafe: bool
 ) -> None:
     rig = Rig().to(state)
     rig.be(mode=mode, failsafe=failsafe)
-    assert rig.tick().sending is NOTHING and rig.is_in(State.RELEASED)
+    assert rig.tick().sending is NOTHING and rig.is_in(HandoverState.RELEASED)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
     rig.run(60.0)
-    assert rig.is_in(State.RELEASED)  # for good
+    assert rig.is_in(HandoverState.RELEASED)  # for good
 
 
 @pytest.mark.fault(61)
 def test_the_climb_has_one_time_however_often_a_failsafe_interrupts_it() -> None:
-    rig = Rig(config=HandOverConfig(climb_s=10.0)).to(State.CLIMBING)
+    rig = Rig(config=HandOverConfig(climb_s=10.0)).to(HandoverState.CLIMBING)
     for _ in range(20):
-        if rig.is_in(State.CLIMBING, State.FAILSAFE):
+        if rig.is_in(HandoverState.CLIMBING, HandoverState.FAILSAFE):
             rig.fail()
             rig.run(0.5)
             rig.be(mode="AUTO.TAKEOFF", failsafe=False)
             rig.run(0.5)
-    assert rig.is_in(State.LANDING) and rig.asked_last(Ask.LAND) and rig.hand_over.failure
-    begun_ns = next(at_ns for at_ns, ask in rig.asked if ask is Ask.LAND)
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND) and rig.hand_over.failure
+    begun_ns = next(at_ns for at_ns, ask in rig.asked if ask is RequestKind.LAND)
     assert begun_ns - rig.asked[1][0] <= 11 * SECOND
 
 
 @pytest.mark.fault(61)
 @BOTH
 def test_a_failsafe_that_lands_is_left_to_it_and_told_of(autopilot: str) -> None:
-    rig = Rig(autopilot).to(State.CLIMBING)
+    rig = Rig(autopilot).to(HandoverState.CLIMBING)
     rig.tick(WORDS)
     rig.fail()
     rig.run(30.0)
-    assert rig.is_in(State.FAILSAFE) and rig.hand_over.busy and Ask.LAND not in [ask for _, ask in rig.asked]
+    assert (
+        rig.is_in(HandoverState.FAILSAFE)
+        and rig.hand_over.busy
+        and RequestKind.LAND not in [ask for _, ask in rig.asked]
+    )
     rig.be(armed=False, failsafe=False)
     rig.tick()
-    assert rig.is_in(State.DONE) and "has landed it" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.DONE) and "has landed it" in rig.hand_over.failure
     assert "Failsafe activated" in rig.hand_over.failure
 
 
@@ -95,9 +99,9 @@ def test_a_failsafe_that_lands_is_left_to_it_and_told_of(autopilot: str) -> None
 def test_what_hovers_in_a_failsafe_is_landed_in_bounded_time(autopilot: str, mode: str, within_s: float) -> None:
     rig = engaged(autopilot)
     rig.fail(mode)
-    assert rig.is_in(State.FAILSAFE)
-    rig.run(within_s, until=State.LANDING)
-    assert rig.asked_last(Ask.LAND) and "has not ended" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILSAFE)
+    rig.run(within_s, until=HandoverState.LANDING)
+    assert rig.asked_last(RequestKind.LAND) and "has not ended" in rig.hand_over.failure
 
 
 @pytest.mark.fault(25, 61)
@@ -105,10 +109,10 @@ def test_a_pilot_who_takes_over_in_the_very_tick_in_which_time_is_up_is_not_land
     rig = engaged(config=HandOverConfig(climb_s=5.0))
     rig.fail("AUTO.LOITER")
     rig.run(4.95)
-    assert rig.is_in(State.FAILSAFE)
+    assert rig.is_in(HandoverState.FAILSAFE)
     rig.be(mode="POSCTL", failsafe=False)
     rig.run(1.0)
-    assert rig.is_in(State.RELEASED) and Ask.LAND not in [ask for _, ask in rig.asked]
+    assert rig.is_in(HandoverState.RELEASED) and RequestKind.LAND not in [ask for _, ask in rig.asked]
 
 
 @pytest.mark.fault(8, 61)
@@ -118,7 +122,7 @@ def test_an_engaged_flight_is_taken_up_again_by_order_only() -> None:
     rig.run(3.0)
     rig.be(mode="OFFBOARD", failsafe=False)
     rig.run(3.0)
-    assert rig.is_in(State.FAILSAFE)
+    assert rig.is_in(HandoverState.FAILSAFE)
     assert rig.tick(commands=(ENGAGE,)).sending is NEUTRAL
     assert rig.tick().sending is FLY
 
@@ -128,24 +132,27 @@ def test_offboard_that_is_not_given_after_a_failsafe_ends_in_a_landing() -> None
     rig = engaged()
     rig.fail("AUTO.LOITER")
     rig.tick(commands=(ENGAGE,))
-    assert rig.is_in(State.ENGAGING) and rig.asked_last(Ask.EXTERNAL_MODE)
-    rig.run(6.0, until=State.LANDING)
+    assert rig.is_in(HandoverState.ENGAGING) and rig.asked_last(RequestKind.EXTERNAL_MODE)
+    rig.run(6.0, until=HandoverState.LANDING)
 
 
 @pytest.mark.fault(61)
 def test_px4_that_takes_its_climb_up_after_landing_was_asked_for_is_asked_again() -> None:
-    rig = Rig().to(State.CLIMBING)
+    rig = Rig().to(HandoverState.CLIMBING)
     rig.fail()
     rig.tick(stop=True)
     rig.tick()
-    assert rig.is_in(State.LANDING)  # it lands, but not for us
-    rig.answer(ACCEPTED, Ask.LAND)
-    assert rig.is_in(State.SETTLING)
+    assert rig.is_in(HandoverState.LANDING)  # it lands, but not for us
+    rig.answer(ACCEPTED, RequestKind.LAND)
+    assert rig.is_in(HandoverState.SETTLING)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
-    rig.run(3.0, until=State.LANDING)
-    asked = [at_ns for at_ns, ask in rig.asked if ask is Ask.LAND]
+    rig.run(3.0, until=HandoverState.LANDING)
+    asked = [at_ns for at_ns, ask in rig.asked if ask is RequestKind.LAND]
     rig.run(20.0)
-    assert rig.is_in(State.LANDING) and len([ask for _, ask in rig.asked if ask is Ask.LAND]) > len(asked) + 10
+    assert (
+        rig.is_in(HandoverState.LANDING)
+        and len([ask for _, ask in rig.asked if ask is RequestKind.LAND]) > len(asked) + 10
+    )
 
 
 @pytest.mark.fault(61)
@@ -154,24 +161,24 @@ def test_ardupilot_stays_in_the_failsafe_s_mode_when_it_has_ended() -> None:
     rig.fail()
     rig.be(failsafe=False)
     rig.run(5.0)
-    assert rig.is_in(State.FAILSAFE)
+    assert rig.is_in(HandoverState.FAILSAFE)
     rig.be(mode="STABILIZE")
     rig.tick()
-    assert rig.is_in(State.RELEASED)
+    assert rig.is_in(HandoverState.RELEASED)
 
 
 @pytest.mark.fault(28)
 @BOTH
 def test_a_flight_that_the_pilot_began_is_the_pilot_s_in_a_failsafe_too(autopilot: str) -> None:
-    rig = Rig(autopilot).to(State.ENGAGED)
+    rig = Rig(autopilot).to(HandoverState.ENGAGED)
     rig.fail()
-    assert rig.is_in(State.RELEASED)
+    assert rig.is_in(HandoverState.RELEASED)
 
 
 # While it is in the air by our positions
 
 
-def over_a_relay(state: State) -> Rig:
+def over_a_relay(state: HandoverState) -> Rig:
     rig = Rig(config=HandOverConfig(climb_s=5.0, land_s=10.0))
     rig.hand_over = HandOver(HandOverConfig(climb_s=5.0, land_s=10.0), sees_it_down=True)
     rig.to(state)
@@ -182,9 +189,9 @@ def over_a_relay(state: State) -> Rig:
 
 @pytest.mark.fault(63)
 def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -> None:
-    rig = over_a_relay(State.CLIMBING)
+    rig = over_a_relay(HandoverState.CLIMBING)
     rig.tick(stop=True)
-    rig.run(12.0, until=State.FAILED)  # it does not land
+    rig.run(12.0, until=HandoverState.FAILED)  # it does not land
     assert not rig.hand_over.finished
     rig.run(30.0)
     assert not rig.hand_over.finished  # it would be blind, and nobody else has it
@@ -195,10 +202,10 @@ def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -
 
 @pytest.mark.fault(63)
 def test_a_pilot_who_flies_by_our_positions_keeps_them_until_the_ground() -> None:
-    rig = over_a_relay(State.CLIMBING)
+    rig = over_a_relay(HandoverState.CLIMBING)
     rig.be(mode="POSCTL")
     rig.tick()
-    assert rig.is_in(State.RELEASED) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.RELEASED) and rig.hand_over.busy
     rig.be(landed=True)
     rig.tick()
     assert not rig.hand_over.busy
@@ -208,15 +215,15 @@ def test_a_pilot_who_flies_by_our_positions_keeps_them_until_the_ground() -> Non
 def test_a_controller_that_ends_without_a_landing_leaves_nothing_of_ours_in_the_air() -> None:
     rig = engaged()
     rig.tick(stop=True, ready=False)
-    assert rig.is_in(State.LANDING) and rig.asked_last(Ask.LAND)
-    pilots = Rig().to(State.ENGAGED)
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    pilots = Rig().to(HandoverState.ENGAGED)
     pilots.tick(stop=True, ready=False)
-    assert pilots.is_in(State.ENGAGED)
+    assert pilots.is_in(HandoverState.ENGAGED)
 
 
 def test_orders_of_before_do_not_matter_in_a_failsafe() -> None:
-    rig = Rig().to(State.FAILSAFE)
+    rig = Rig().to(HandoverState.FAILSAFE)
     rig.tick(commands=(TAKE_OFF,))
-    assert rig.is_in(State.FAILSAFE) and rig.codes("order-refused")
+    assert rig.is_in(HandoverState.FAILSAFE) and rig.codes("order-refused")
     rig.view = replace(rig.view, at_ns=rig.view.at_ns + TICK_NS)
-    assert rig.is_in(State.FAILSAFE)
+    assert rig.is_in(HandoverState.FAILSAFE)

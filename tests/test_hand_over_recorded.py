@@ -11,16 +11,14 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import packets, read
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, HandOverConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Command, Event, Order, PositionSample, VehicleStatus
-from uavctl.mavlink.hand_over import HandOver
-from uavctl.mavlink.link import Link
+from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.handover import HandOver
+from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.mode import Sending, State
-from uavctl.mavlink.request import Ask
-from uavctl.mavlink.sight import View
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import Command, Event, Order, PositionSample, VehicleStatus
 
 CLIENT, TICK_NS = 255, 50_000_000
 SET_MODE = 176
@@ -30,11 +28,11 @@ SET_MODE = 176
 class Flown:
     """What the hand-over made of a flight; times are seconds since the autopilot's boot."""
 
-    states: list[tuple[State, float]] = field(default_factory=list)
-    asked: list[tuple[Ask, float]] = field(default_factory=list)
+    states: list[tuple[HandoverState, float]] = field(default_factory=list)
+    asked: list[tuple[RequestKind, float]] = field(default_factory=list)
     sent: list[tuple[Sending, float]] = field(default_factory=list)
 
-    def at(self, state: State, number: int = 0) -> float:
+    def at(self, state: HandoverState, number: int = 0) -> float:
         return [time_s for one, time_s in self.states if one is state][number]
 
 
@@ -46,7 +44,7 @@ def fly(
     client: int = CLIENT,
 ) -> Flown:
     """Run a recording; `orders` are the client's modes (DO_SET_MODE's parameters) that become orders, first to last."""
-    link = Link(
+    link = MavlinkConnection(
         "vehicle",
         roles=frozenset({"vehicle", "mocap"}),
         daemon=DaemonConfig(tick_s=0.05, system_id=client),
@@ -60,7 +58,7 @@ def fly(
     where: PositionSample | None = None
     heard: list[Ack | Text] = []
     wanted: list[str] = []
-    tick_ns, booted_ns, state = 0, 0, State.WAITING
+    tick_ns, booted_ns, state = 0, 0, HandoverState.WAITING
     for at_ns, data in packets(name):
         tick_ns = tick_ns or at_ns
         while tick_ns < at_ns:
@@ -72,7 +70,7 @@ def fly(
                 if one != "land"
             )
             told = hand_over.update(
-                View(
+                HandoverView(
                     at_ns=tick_ns,
                     vehicle=vehicle,
                     ready=where is not None,
@@ -132,7 +130,14 @@ def px4() -> Flown:
     return fly("hand-over-px4.tlog", 5.0, orders, HandOverConfig(engage_s=15.0))
 
 
-R, M, A, C, G, E = State.READY, State.MODE, State.ARMING, State.CLIMBING, State.ENGAGING, State.ENGAGED
+R, M, A, C, G, E = (
+    HandoverState.READY,
+    HandoverState.MODE,
+    HandoverState.ARMING,
+    HandoverState.CLIMBING,
+    HandoverState.ENGAGING,
+    HandoverState.ENGAGED,
+)
 
 
 def near(*times_s: float, within_s: float = 1.1) -> object:
@@ -141,12 +146,24 @@ def near(*times_s: float, within_s: float = 1.1) -> object:
 
 
 def test_arducopter_with_gps_flies_to_its_landing(gps: Flown) -> None:
-    assert [state for state, _ in gps.states] == [R, M, A, C, G, E, State.LANDING, State.SETTLING, State.DONE]
+    assert [state for state, _ in gps.states] == [
+        R,
+        M,
+        A,
+        C,
+        G,
+        E,
+        HandoverState.LANDING,
+        HandoverState.SETTLING,
+        HandoverState.DONE,
+    ]
     assert (gps.at(M), gps.at(A), gps.at(C)) == near(42.1, 42.1, 44.0)
     assert gps.at(E) == pytest.approx(51.4, abs=2.5)  # nine tenths of the height come a little before all of it
-    assert (gps.at(State.LANDING), gps.at(State.SETTLING), gps.at(State.DONE)) == near(108.5, 108.5, 126.0)
+    assert (gps.at(HandoverState.LANDING), gps.at(HandoverState.SETTLING), gps.at(HandoverState.DONE)) == near(
+        108.5, 108.5, 126.0
+    )
     first, time_s = gps.asked[0]
-    assert first is Ask.TAKE_OFF_MODE and time_s == pytest.approx(42.1, abs=0.3)
+    assert first is RequestKind.TAKE_OFF_MODE and time_s == pytest.approx(42.1, abs=0.3)
 
 
 def test_arducopter_gets_no_neutral_stream_between_the_order_and_the_height(gps: Flown) -> None:
@@ -158,29 +175,29 @@ def test_arducopter_gets_no_neutral_stream_between_the_order_and_the_height(gps:
 
 @pytest.mark.fault(25, 28)
 def test_arducopter_that_loses_its_cameras_is_let_go_when_its_failsafe_lands(vicon: Flown) -> None:
-    assert [state for state, _ in vicon.states] == [R, M, A, C, G, E, State.FAILSAFE, State.DONE]
+    assert [state for state, _ in vicon.states] == [R, M, A, C, G, E, HandoverState.FAILSAFE, HandoverState.DONE]
     assert (vicon.at(M), vicon.at(C)) == near(24.1, 26.0)
     assert vicon.at(E) == pytest.approx(31.4, abs=2.5)
-    assert (vicon.at(State.FAILSAFE), vicon.at(State.DONE)) == near(94.4, 104.9)
-    assert Ask.LAND not in [ask for ask, _ in vicon.asked]  # the vehicle's failsafe has precedence
+    assert (vicon.at(HandoverState.FAILSAFE), vicon.at(HandoverState.DONE)) == near(94.4, 104.9)
+    assert RequestKind.LAND not in [ask for ask, _ in vicon.asked]  # the vehicle's failsafe has precedence
 
 
 @pytest.mark.fault(8, 25)
 def test_px4_fails_over_when_setpoints_stop_and_comes_back_by_order_only(px4: Flown) -> None:
     states = [state for state, _ in px4.states]
-    back = [State.FAILSAFE, G, E]
-    assert states == [R, M, A, C, G, E, *back, State.LANDING, State.SETTLING, State.DONE]
+    back = [HandoverState.FAILSAFE, G, E]
+    assert states == [R, M, A, C, G, E, *back, HandoverState.LANDING, HandoverState.SETTLING, HandoverState.DONE]
     assert (px4.at(M), px4.at(A), px4.at(C)) == near(9.3, 10.3, 10.3)
     assert px4.at(G) == pytest.approx(18.0, abs=1.5)  # on its way to 5 m, which it reaches at 19.3 s
-    assert (px4.at(E), px4.at(State.FAILSAFE)) == near(27.2, 78.3, within_s=0.6)
+    assert (px4.at(E), px4.at(HandoverState.FAILSAFE)) == near(27.2, 78.3, within_s=0.6)
     # HEARTBEAT shows OFFBOARD again at 87.3 s, because the stream came back: not for us, until ordered to at 88.2 s.
     assert (px4.at(G, 1), px4.at(E, 1)) == near(88.2, 88.2, within_s=0.6)
     assert not [sending for sending, time_s in px4.sent if sending is not Sending.NOTHING and 78.5 < time_s < 87.8]
-    assert (px4.at(State.LANDING), px4.at(State.DONE)) == near(94.2, 112.9)
+    assert (px4.at(HandoverState.LANDING), px4.at(HandoverState.DONE)) == near(94.2, 112.9)
 
 
 def test_px4_that_refuses_offboard_is_asked_again(px4: Flown) -> None:
-    asked = [time_s for ask, time_s in px4.asked if ask is Ask.EXTERNAL_MODE and time_s < 28.0]
+    asked = [time_s for ask, time_s in px4.asked if ask is RequestKind.EXTERNAL_MODE and time_s < 28.0]
     assert asked[0] == px4.at(G) and 5 <= len(asked) <= 16
     assert min(b - a for a, b in pairwise(asked)) > 0.3
 
@@ -190,23 +207,23 @@ def test_px4_whose_failsafe_ends_in_the_climb_is_flown_after_all_and_the_pilot_s
     orders = {(4.0, 2.0, 0.0): "take off", (6.0, 0.0, 0.0): "engage"}
     # Its client had let go for good, so it never went into OFFBOARD by itself: that is waited for.
     flown = fly("px4-failsafe-in-climb.tlog", 1.2, orders, HandOverConfig(engage_s=60.0, tries=100), client=245)
-    taken_back = [State.FAILSAFE, C, G]
-    by_stick = [State.RELEASED, State.RETURNING, E, State.RELEASED]
+    taken_back = [HandoverState.FAILSAFE, C, G]
+    by_stick = [HandoverState.RELEASED, HandoverState.RETURNING, E, HandoverState.RELEASED]
     assert [state for state, _ in flown.states] == [R, M, A, C, *taken_back, *by_stick]
-    failed_s, back_s = flown.at(State.FAILSAFE), flown.at(C, 1)
+    failed_s, back_s = flown.at(HandoverState.FAILSAFE), flown.at(C, 1)
     assert back_s - failed_s == pytest.approx(1.0, abs=0.2)
     assert flown.at(G) - back_s < 8.0  # as soon as it has climbed
-    pilot_s = [flown.at(State.RELEASED, number) - failed_s for number in (0, 1)]
+    pilot_s = [flown.at(HandoverState.RELEASED, number) - failed_s for number in (0, 1)]
     assert pilot_s == pytest.approx([41.0, 56.0], abs=0.3)
     between = [sending for sending, time_s in flown.sent if failed_s <= time_s < back_s]
-    assert between == [Sending.NOTHING] and Ask.LAND not in [ask for ask, _ in flown.asked]
+    assert between == [Sending.NOTHING] and RequestKind.LAND not in [ask for ask, _ in flown.asked]
 
 
 @pytest.mark.fault(61)
 def test_px4_whose_failsafe_ends_and_which_does_not_give_offboard_is_landed() -> None:
     flown = fly("px4-failsafe-in-climb.tlog", 1.2, {(4.0, 2.0, 0.0): "take off"}, HandOverConfig(), client=245)
-    assert [state for state, _ in flown.states][:8] == [R, M, A, C, State.FAILSAFE, C, G, State.LANDING]
-    assert flown.at(State.LANDING) - flown.at(G) == pytest.approx(5.0, abs=0.1)
+    assert [state for state, _ in flown.states][:8] == [R, M, A, C, HandoverState.FAILSAFE, C, G, HandoverState.LANDING]
+    assert flown.at(HandoverState.LANDING) - flown.at(G) == pytest.approx(5.0, abs=0.1)
 
 
 @pytest.mark.fault(60)
@@ -214,4 +231,4 @@ def test_px4_whose_checks_come_and_go_is_asked_to_arm_again() -> None:
     orders = {(4.0, 2.0, 0.0): "take off"}
     flown = fly("px4-flickering-checks.tlog", 1.2, orders, HandOverConfig(retry_s=1.0), client=245)
     assert [state for state, _ in flown.states] == [R, M, A]
-    assert [ask for ask, _ in flown.asked] == [Ask.TAKE_OFF_MODE, Ask.ARM, Ask.ARM]
+    assert [ask for ask, _ in flown.asked] == [RequestKind.TAKE_OFF_MODE, RequestKind.ARM, RequestKind.ARM]

@@ -20,158 +20,157 @@ from hand_over_rig import (
     ack,
 )
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.data import ORDER_REFUSED, Command, Order
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover_guards import GRACE_NS, HandoverState
 from uavctl.mavlink.messages import Text
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.request import Ask
-from uavctl.mavlink.sight import GRACE_NS
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import ORDER_REFUSED, Command, Order
 
 # Refusals
 
 
 @pytest.mark.fault(26)
 def test_a_temporary_refusal_is_asked_again_in_bounds_then_told_with_the_vehicle_s_words() -> None:
-    rig = Rig("ardupilot", HandOverConfig(ground_s=30.0, tries=4)).to(State.ARMING)
+    rig = Rig("ardupilot", HandOverConfig(ground_s=30.0, tries=4)).to(HandoverState.ARMING)
     for _ in range(4):
         rig.run(2.0) if len(rig.asked) > 2 else None
-        rig.answer(FAILED, Ask.ARM, text="PreArm: VisOdom: not healthy")
+        rig.answer(FAILED, RequestKind.ARM, text="PreArm: VisOdom: not healthy")
         rig.run(2.0)
-    times = [at_ns for at_ns, ask in rig.asked if ask is Ask.ARM]
+    times = [at_ns for at_ns, ask in rig.asked if ask is RequestKind.ARM]
     assert len(times) == 4
     rig.run(5.0)
-    assert rig.is_in(State.FAILED)
+    assert rig.is_in(HandoverState.FAILED)
     assert rig.hand_over.failure.startswith(
         'arming: the vehicle answered FAILED, "PreArm: VisOdom: not healthy" (asked 4'
     )
-    assert rig.asked_last(Ask.DISARM)  # it may have been granted after all
+    assert rig.asked_last(RequestKind.DISARM)  # it may have been granted after all
 
 
 @pytest.mark.fault(26)
 @pytest.mark.parametrize(("result", "why"), [(DENIED, "DENIED"), (3, "UNSUPPORTED")], ids=["denied", "unsupported"])
 def test_a_final_refusal_is_not_asked_again(result: int, why: str) -> None:
-    rig = Rig().to(State.MODE)
+    rig = Rig().to(HandoverState.MODE)
     rig.answer(result)
-    assert rig.is_in(State.FAILED) and why in rig.hand_over.failure and len(rig.asked) == 1
+    assert rig.is_in(HandoverState.FAILED) and why in rig.hand_over.failure and len(rig.asked) == 1
 
 
 @pytest.mark.fault(26)
 def test_no_answer_is_told_as_that() -> None:
-    rig = Rig(config=HandOverConfig(tries=3, answer_s=1.0)).to(State.MODE)
+    rig = Rig(config=HandOverConfig(tries=3, answer_s=1.0)).to(HandoverState.MODE)
     rig.run(3.2)
-    assert rig.is_in(State.FAILED) and "did not answer" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "did not answer" in rig.hand_over.failure
     times = [at_ns for at_ns, _ in rig.asked]
     assert [b - a for a, b in pairwise(times)] == [SECOND, SECOND]
 
 
 def test_accepted_but_never_done_is_told_as_that() -> None:
-    rig = Rig(config=HandOverConfig(ground_s=10.0)).to(State.MODE)
+    rig = Rig(config=HandOverConfig(ground_s=10.0)).to(HandoverState.MODE)
     rig.answer(ACCEPTED)
     rig.run(2.9)
     assert len(rig.asked) == 1  # heartbeats come once a second: no hurry
     rig.run(8.0)
-    assert rig.is_in(State.FAILED) and "ACCEPTED, but does not do it" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "ACCEPTED, but does not do it" in rig.hand_over.failure
 
 
 def test_an_unknown_result_is_told_by_number() -> None:
-    rig = Rig(config=HandOverConfig(tries=1)).to(State.MODE)
+    rig = Rig(config=HandOverConfig(tries=1)).to(HandoverState.MODE)
     rig.answer(77)
     rig.run(3.0)
     assert "answered 77" in rig.hand_over.failure
 
 
 def test_in_progress_is_waited_for() -> None:
-    rig = Rig().to(State.MODE)
+    rig = Rig().to(HandoverState.MODE)
     for _ in range(5):
         rig.answer(IN_PROGRESS)
         rig.run(1.5)
-    assert len(rig.asked) == 1 and rig.is_in(State.MODE)
+    assert len(rig.asked) == 1 and rig.is_in(HandoverState.MODE)
 
 
 def test_answers_to_others_and_chatter_change_nothing() -> None:
-    rig = Rig().to(State.MODE)
-    rig.tick(ack(DENIED, Ask.LAND), Text(system=1, component=1, severity=6, text="chatter"))
-    assert rig.is_in(State.MODE)
-    rig = Rig().to(State.READY)
-    rig.tick(ack(DENIED, Ask.ARM), commands=(TAKE_OFF,))
-    assert rig.is_in(State.MODE)
+    rig = Rig().to(HandoverState.MODE)
+    rig.tick(ack(DENIED, RequestKind.LAND), Text(system=1, component=1, severity=6, text="chatter"))
+    assert rig.is_in(HandoverState.MODE)
+    rig = Rig().to(HandoverState.READY)
+    rig.tick(ack(DENIED, RequestKind.ARM), commands=(TAKE_OFF,))
+    assert rig.is_in(HandoverState.MODE)
 
 
 @pytest.mark.fault(26)
 def test_a_climb_that_does_not_come_ends_in_a_landing_and_a_failure() -> None:
-    rig = Rig("ardupilot", HandOverConfig(climb_s=5.0)).to(State.CLIMBING)
+    rig = Rig("ardupilot", HandOverConfig(climb_s=5.0)).to(HandoverState.CLIMBING)
     rig.answer(ACCEPTED)
     rig.run(5.2)
-    assert rig.is_in(State.LANDING) and rig.asked_last(Ask.LAND)
-    assert [ask for _, ask in rig.asked].count(Ask.TAKE_OFF) == 1  # asked again, it would begin again
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert [ask for _, ask in rig.asked].count(RequestKind.TAKE_OFF) == 1  # asked again, it would begin again
     rig.be(mode="LAND")
     rig.tick()
     rig.be(armed=False)
     rig.tick()
-    assert rig.is_in(State.DONE) and "take-off" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.DONE) and "take-off" in rig.hand_over.failure
 
 
 def test_height_counts_by_fresh_positions_only() -> None:
-    rig = Rig("px4").to(State.CLIMBING)
+    rig = Rig("px4").to(HandoverState.CLIMBING)
     rig.tick(up_m=3.0, unfit="the newest position is 2.0 s old")
-    assert rig.is_in(State.CLIMBING)
+    assert rig.is_in(HandoverState.CLIMBING)
     rig.tick(up_m=None, unfit="")
-    assert rig.is_in(State.CLIMBING)
+    assert rig.is_in(HandoverState.CLIMBING)
     rig.tick(up_m=3.0)
-    assert rig.is_in(State.ENGAGING)
+    assert rig.is_in(HandoverState.ENGAGING)
 
 
 @pytest.mark.fault(26)
 def test_offboard_that_is_refused_in_the_climb_ends_in_a_landing() -> None:
-    rig = Rig("px4").to(State.ENGAGING)
+    rig = Rig("px4").to(HandoverState.ENGAGING)
     for _ in range(20):
-        rig.answer(REJECTED, Ask.EXTERNAL_MODE)
+        rig.answer(REJECTED, RequestKind.EXTERNAL_MODE)
         rig.run(0.25)
     rig.tick()
-    assert rig.is_in(State.LANDING) and "TEMPORARILY_REJECTED" in rig.hand_over.failure
-    assert 5 <= [ask for _, ask in rig.asked].count(Ask.EXTERNAL_MODE) <= 11
+    assert rig.is_in(HandoverState.LANDING) and "TEMPORARILY_REJECTED" in rig.hand_over.failure
+    assert 5 <= [ask for _, ask in rig.asked].count(RequestKind.EXTERNAL_MODE) <= 11
 
 
 @pytest.mark.fault(26)
-@pytest.mark.parametrize("state", [State.CLIMBING, State.ENGAGING])
-def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: State) -> None:
-    rig = Rig("ardupilot" if state is State.CLIMBING else "px4").to(state)
+@pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
+def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: HandoverState) -> None:
+    rig = Rig("ardupilot" if state is HandoverState.CLIMBING else "px4").to(state)
     rig.be(armed=False)
     rig.tick()
-    assert rig.is_in(State.FAILED) and "disarmed itself" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "disarmed itself" in rig.hand_over.failure
 
 
 @pytest.mark.parametrize(
     ("state", "mode", "armed"),
     [
-        (State.MODE, "AUTO.LOITER", True),
-        (State.ARMING, "MANUAL", False),
-        (State.CLIMBING, "POSCTL", True),
-        (State.ENGAGING, "POSCTL", True),
-        (State.LANDING, "POSCTL", True),
-        (State.SETTLING, "POSCTL", True),
-        (State.FAILSAFE, "POSCTL", True),
-        (State.FAILSAFE, "ALTCTL", True),
+        (HandoverState.MODE, "AUTO.LOITER", True),
+        (HandoverState.ARMING, "MANUAL", False),
+        (HandoverState.CLIMBING, "POSCTL", True),
+        (HandoverState.ENGAGING, "POSCTL", True),
+        (HandoverState.LANDING, "POSCTL", True),
+        (HandoverState.SETTLING, "POSCTL", True),
+        (HandoverState.FAILSAFE, "POSCTL", True),
+        (HandoverState.FAILSAFE, "ALTCTL", True),
     ],
 )
 @pytest.mark.fault(25)
-def test_the_pilot_may_take_over_at_any_time(state: State, mode: str, armed: bool) -> None:
+def test_the_pilot_may_take_over_at_any_time(state: HandoverState, mode: str, armed: bool) -> None:
     rig = Rig("px4").to(state)
     rig.be(mode=mode, armed=armed)
     told = rig.tick()
-    assert (rig.state, told.sending, told.ask) == (State.RELEASED, NOTHING, None)
+    assert (rig.state, told.sending, told.ask) == (HandoverState.RELEASED, NOTHING, None)
 
 
 @pytest.mark.fault(25)
 def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> None:
-    rig = Rig("px4").to(State.ENGAGING)
+    rig = Rig("px4").to(HandoverState.ENGAGING)
     rig.answer(ACCEPTED)
     granted_ns = rig.view.at_ns
     while rig.view.at_ns < granted_ns + GRACE_NS:
         assert rig.vehicle is not None and not rig.hand_over.has_left(rig.vehicle)
         assert rig.tick().sending is FLY
     assert rig.tick().sending is NOTHING
-    assert rig.is_in(State.RELEASED) and rig.vehicle is not None and rig.hand_over.has_left(rig.vehicle)
+    assert rig.is_in(HandoverState.RELEASED) and rig.vehicle is not None and rig.hand_over.has_left(rig.vehicle)
 
 
 # Stopping
@@ -181,39 +180,41 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
 @pytest.mark.parametrize(
     ("state", "after", "ask"),
     [
-        (State.MODE, State.DONE, None),
-        (State.ARMING, State.LANDING, Ask.LAND),
-        (State.CLIMBING, State.LANDING, Ask.LAND),
-        (State.ENGAGING, State.LANDING, Ask.LAND),
-        (State.FAILSAFE, State.LANDING, Ask.LAND),
-        (State.RETURNING, State.RELEASED, None),
+        (HandoverState.MODE, HandoverState.DONE, None),
+        (HandoverState.ARMING, HandoverState.LANDING, RequestKind.LAND),
+        (HandoverState.CLIMBING, HandoverState.LANDING, RequestKind.LAND),
+        (HandoverState.ENGAGING, HandoverState.LANDING, RequestKind.LAND),
+        (HandoverState.FAILSAFE, HandoverState.LANDING, RequestKind.LAND),
+        (HandoverState.RETURNING, HandoverState.RELEASED, None),
     ],
 )
 @pytest.mark.parametrize("how", ["stop", "order"])
-def test_the_operator_stops_on_the_way(state: State, after: State, ask: Ask | None, how: str) -> None:
+def test_the_operator_stops_on_the_way(
+    state: HandoverState, after: HandoverState, ask: RequestKind | None, how: str
+) -> None:
     rig = Rig().to(state)
     told = rig.tick(stop=True) if how == "stop" else rig.tick(commands=(LAND,))
     assert (rig.state, told.ask, told.sending) == (after, ask, NOTHING)
 
 
 def test_an_arming_that_is_stopped_is_over_when_a_later_heartbeat_says_disarmed() -> None:
-    rig = Rig().to(State.ARMING)
+    rig = Rig().to(HandoverState.ARMING)
     rig.mute = True
     rig.tick(stop=True)
     rig.tick()
-    assert rig.is_in(State.LANDING)  # the heartbeat is from before
+    assert rig.is_in(HandoverState.LANDING)  # the heartbeat is from before
     rig.mute = False
     rig.tick()
-    assert rig.is_in(State.DONE)
+    assert rig.is_in(HandoverState.DONE)
 
 
 @pytest.mark.fault(34)
 def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
-    rig = Rig().to(State.LANDING)
+    rig = Rig().to(HandoverState.LANDING)
     rig.run(10.0)
-    times = [at_ns for at_ns, ask in rig.asked if ask is Ask.LAND]
+    times = [at_ns for at_ns, ask in rig.asked if ask is RequestKind.LAND]
     assert [b - a for a, b in pairwise(times)] == [SECOND] * 4
-    assert rig.is_in(State.FAILED) and "landing" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "landing" in rig.hand_over.failure
 
 
 # A vehicle that starts anew
@@ -223,17 +224,17 @@ def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
 @pytest.mark.parametrize(
     ("state", "after"),
     [
-        (State.READY, State.READY),
-        (State.MODE, State.FAILED),
-        (State.ARMING, State.FAILED),
-        (State.CLIMBING, State.FAILED),
-        (State.ENGAGING, State.FAILED),
-        (State.FAILSAFE, State.FAILED),
-        (State.RETURNING, State.RELEASED),
-        (State.ENGAGED, State.RELEASED),
+        (HandoverState.READY, HandoverState.READY),
+        (HandoverState.MODE, HandoverState.FAILED),
+        (HandoverState.ARMING, HandoverState.FAILED),
+        (HandoverState.CLIMBING, HandoverState.FAILED),
+        (HandoverState.ENGAGING, HandoverState.FAILED),
+        (HandoverState.FAILSAFE, HandoverState.FAILED),
+        (HandoverState.RETURNING, HandoverState.RELEASED),
+        (HandoverState.ENGAGED, HandoverState.RELEASED),
     ],
 )
-def test_a_reboot_disengages(state: State, after: State) -> None:
+def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None:
     rig = Rig().to(state)
     rig.be(boots=1)
     told = rig.tick()
@@ -248,11 +249,13 @@ def test_a_reboot_before_we_listened_is_none() -> None:
     rig = Rig()
     rig.be(boots=3)
     rig.tick()
-    assert rig.is_in(State.READY) and not rig.codes("refused")
+    assert rig.is_in(HandoverState.READY) and not rig.codes("refused")
 
 
-@pytest.mark.parametrize("state", [State.MODE, State.CLIMBING, State.ENGAGING, State.SETTLING])
-def test_silence_on_the_way_changes_nothing_until_time_is_up(state: State) -> None:
+@pytest.mark.parametrize(
+    "state", [HandoverState.MODE, HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.SETTLING]
+)
+def test_silence_on_the_way_changes_nothing_until_time_is_up(state: HandoverState) -> None:
     rig = Rig(config=HandOverConfig(ground_s=8.0, climb_s=8.0, engage_s=8.0, land_s=8.0)).to(state)
     rig.mute = True
     rig.run(5.0)
@@ -263,7 +266,7 @@ def test_silence_on_the_way_changes_nothing_until_time_is_up(state: State) -> No
 
 @pytest.mark.parametrize("height_m", [None, 0.0, -1.0, float("nan")])
 def test_a_climb_to_nowhere_is_refused(height_m: float | None) -> None:
-    rig = Rig().to(State.READY)
+    rig = Rig().to(HandoverState.READY)
     told = rig.tick(commands=(Command(order=Order.TAKE_OFF, height_m=height_m),))
     assert [event.code for event in told.events] == [ORDER_REFUSED] and rig.hand_over.height_m == 0.0
-    assert rig.is_in(State.READY) and not rig.hand_over.ours
+    assert rig.is_in(HandoverState.READY) and not rig.hand_over.ours

@@ -8,14 +8,13 @@ from hand_over_rig import TICK_NS as RIG_TICK_NS
 from loopback_rig import Memory, make_loop
 from msgspec.structs import replace
 
-from logs.replay import replay
-from sim.peers import Peers
+from logs.recording.replay import replay
+from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Setpoint
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.request import Ask
-from uavctl.mavlink.sight import CLOCK_NS
+from uavctl.mavlink.handover_guards import CLOCK_NS, HandoverState
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Setpoint
 
 TICK_NS = 50_000_000
 
@@ -25,7 +24,7 @@ def restarted(autopilot: str = "px4", **fields: object) -> Rig:
     rig = Rig(autopilot)
     vehicle, rig.vehicle = rig.vehicle, None
     told = rig.tick(commands=(STAND_BY,))
-    assert [event.code for event in told.events] == [ORDER_ACCEPTED] and rig.is_in(State.WAITING)
+    assert [event.code for event in told.events] == [ORDER_ACCEPTED] and rig.is_in(HandoverState.WAITING)
     rig.vehicle = vehicle
     rig.be(**fields)
     return rig
@@ -42,11 +41,13 @@ def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot:
     assert seen is not None and not seen.external  # not for the controller, either
     for _ in range(200):
         assert rig.tick().sending is NOTHING
-    assert rig.is_in(State.RELEASED) and not rig.asked
+    assert rig.is_in(HandoverState.RELEASED) and not rig.asked
     assert "uavctl ctl engage" in rig.codes("refused")[0] and len(rig.codes("refused")) == 1
     told = rig.tick(commands=(ENGAGE,))
     external = mode in ("OFFBOARD", "GUIDED")
-    assert told.sending is NEUTRAL and [ask for _, ask in rig.asked] == ([] if external else [Ask.EXTERNAL_MODE])
+    assert told.sending is NEUTRAL and [ask for _, ask in rig.asked] == (
+        [] if external else [RequestKind.EXTERNAL_MODE]
+    )
     rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
     assert rig.tick().sending is FLY
 
@@ -54,7 +55,7 @@ def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot:
 @pytest.mark.fault(31)
 def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other() -> None:
     rig = restarted(armed=False)
-    assert rig.tick().sending is NEUTRAL and rig.is_in(State.READY)
+    assert rig.tick().sending is NEUTRAL and rig.is_in(HandoverState.READY)
     rig.be(armed=True, landed=False, mode="OFFBOARD")  # the pilot took off, and switched
     assert rig.tick().sending is FLY
 
@@ -63,12 +64,12 @@ def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other(
 def test_an_ordered_take_off_does_not_follow_a_flight_that_was_left() -> None:
     rig = restarted(armed=True, landed=False, mode="OFFBOARD")
     rig.tick(commands=(TAKE_OFF,))
-    assert rig.is_in(State.FAILED) and "armed already" in rig.hand_over.failure and not rig.asked
+    assert rig.is_in(HandoverState.FAILED) and "armed already" in rig.hand_over.failure and not rig.asked
     assert "without --arm" in rig.hand_over.failure and "uavctl ctl engage" in rig.hand_over.failure
 
 
 def test_once_the_vehicle_is_heard_it_is_too_late_to_stand_by() -> None:
-    rig = Rig().to(State.READY)
+    rig = Rig().to(HandoverState.READY)
     told = rig.tick(commands=(STAND_BY,))
     assert [event.code for event in told.events] == [ORDER_REFUSED]
     rig.be(armed=True, landed=False, mode="OFFBOARD")
@@ -95,14 +96,14 @@ def found_armed(up_s: float | None, at_ns: int) -> Rig:
 @pytest.mark.parametrize(
     ("since_s", "up_s", "state"),
     [
-        (20.0, 25.0, State.RELEASED),  # it was up before that flight began
-        (20.0, 15.0, State.ENGAGED),  # and has started since
-        (20.0, 15.3, State.RELEASED),  # or may only have a slow clock
-        (3000.0, 2600.0, State.RELEASED),
-        (20.0, 0.5, State.ENGAGED),
+        (20.0, 25.0, HandoverState.RELEASED),  # it was up before that flight began
+        (20.0, 15.0, HandoverState.ENGAGED),  # and has started since
+        (20.0, 15.3, HandoverState.RELEASED),  # or may only have a slow clock
+        (3000.0, 2600.0, HandoverState.RELEASED),
+        (20.0, 0.5, HandoverState.ENGAGED),
     ],
 )
-def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: float, state: State) -> None:
+def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: float, state: HandoverState) -> None:
     rig = found_armed(up_s, FLOWN_NS + round(since_s * SECOND))
     assert rig.is_in(state)
 
@@ -111,14 +112,14 @@ def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: f
 def test_its_clock_is_waited_for_with_nothing_sent() -> None:
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
     for _ in range(CLOCK_NS // RIG_TICK_NS - 1):
-        assert rig.is_in(State.WAITING) and rig.tick().sending is NOTHING
+        assert rig.is_in(HandoverState.WAITING) and rig.tick().sending is NOTHING
         seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
         assert seen is not None and not seen.external
     rig.tick()
-    assert rig.is_in(State.RELEASED) and not rig.asked
+    assert rig.is_in(HandoverState.RELEASED) and not rig.asked
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
     rig.tick(up_s=10.0)
-    assert rig.is_in(State.ENGAGED)
+    assert rig.is_in(HandoverState.ENGAGED)
 
 
 @pytest.mark.fault(31)
@@ -131,7 +132,7 @@ def test_the_next_vehicle_on_the_connection_of_a_killed_flight_is_flown(autopilo
     another = Air(autopilot, begins_s=32.0)
     loop, memory = another.begin(Command(order=Order.STAND_BY, flown_ns=0))
     another.run(loop, 5.0)
-    assert loop.who_flies is State.ENGAGED and memory.of(Setpoint)
+    assert loop.who_flies is HandoverState.ENGAGED and memory.of(Setpoint)
     result = replay(iter(memory.entries), lambda sink: make_loop(another.config, sink))
     assert result.identical, result.first_difference
 
@@ -141,7 +142,7 @@ class Air:
 
     def __init__(self, autopilot: str, begins_s: float = 0.0) -> None:
         self.config = load_config(
-            "room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", f'sim.autopilot="{autopilot}"']
+            "room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", f'sim.autopilot.autopilot="{autopilot}"']
         )
         self._tick = round(begins_s * 1e9) // TICK_NS
         self.peers = Peers(self.config, self._tick * TICK_NS)
@@ -175,7 +176,7 @@ def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(auto
     air.run(None, dead_s)
     loop, memory = air.begin(Command(order=Order.STAND_BY, flown_ns=0))
     air.run(loop, 5.0)
-    assert not memory.of(Setpoint) and loop.who_flies is State.RELEASED
+    assert not memory.of(Setpoint) and loop.who_flies is HandoverState.RELEASED
     if autopilot == "px4":
         assert air.peers.autopilot.mode_name != "OFFBOARD"  # its failsafe has it
     loop.order(Command(order=Order.ENGAGE))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import msgspec
 from loopback_rig import Memory, make_loop
 
-from sim.peers import Peers
-from uavctl.cli.ctl_cmd import _relay
+from sim.simulation import Peers
+from uavctl.cli.ctl import _relay
 from uavctl.clock import Due
 from uavctl.config import load_config
-from uavctl.data import ControlMode
-from uavctl.health import Health, HealthWatch, RecorderHealth, RelayHealth, line
+from uavctl.daemon.health import Health, HealthWatch, RecorderHealth, RelayHealth, line
+from uavctl.records import ControlMode
 
 TICK_NS = 50_000_000
 

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from optimisation_cases import TAU_3, coupled, paper, paper_plant, room
 
 from uavctl.errors import DesignError
-from uavctl.smpc.components import Component, decompose, whole
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import Horizon
-from uavctl.smpc.reduction import terminal_bound
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, terminal_bound, whole
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

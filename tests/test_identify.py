@@ -10,21 +10,35 @@ from mavlink_rig import DATA
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.tlog import read_tlog
+from logs.recording.tlog import read_tlog
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
-from uavctl.identify.axis_model import DragLagAxis, LinearMotion, ReferenceAxis, places, values
-from uavctl.identify.dead_time import FINE_S, TRIES, choose_dead_time, is_worse
-from uavctl.identify.fit import AxisFit, fit_axis, standard_errors
-from uavctl.identify.history import Asked, Seen, Stretch, seen_from, stretches, thinned
-from uavctl.identify.link_fit import fit_link
-from uavctl.identify.prediction import predict, predict_ahead
-from uavctl.identify.recorded import History, Senders, from_tlog
-from uavctl.identify.response import INSTANT_S, advance
-from uavctl.identify.result import identify
-from uavctl.smpc.plant import Plant, drag_lag
-from uavctl.smpc.velocity_reference import HeldAxis, velocity_reference
+from uavctl.lab.identify.fit import (
+    FINE_S,
+    TRIES,
+    AxisFit,
+    choose_dead_time,
+    fit_axis,
+    is_worse,
+    predict,
+    predict_ahead,
+    standard_errors,
+)
+from uavctl.lab.identify.history import (
+    FlightHistory,
+    PositionHistory,
+    Senders,
+    SetpointHistory,
+    Stretch,
+    from_tlog,
+    seen_from,
+    stretches,
+    thinned,
+)
+from uavctl.lab.identify.response import INSTANT_S, DragLagAxis, LinearMotion, ReferenceAxis, advance, places, values
+from uavctl.lab.identify.result import fit_link, identify
+from uavctl.smpc.plant import HeldAxis, Plant, drag_lag, velocity_reference
 
 DRAG_LAG, HELD = DragLagAxis(drifts=False), ReferenceAxis(1.0, 2.0, 1.0)
 TICK_S, NOISE_M, WIND_MPS2, DT_S = 0.05, 0.003, 0.15, 0.2
@@ -201,9 +215,9 @@ def test_an_outlier_does_not_spoil_the_fit() -> None:
     assert fit.value("lag_s") == pytest.approx(0.25, abs=0.1)
 
 
-def asked_for(times_s: list[float], flown: list[bool]) -> Asked:
+def asked_for(times_s: list[float], flown: list[bool]) -> SetpointHistory:
     accel = np.column_stack([np.sin(times_s), np.cos(times_s), np.zeros(len(times_s))])
-    return Asked(np.array(times_s), accel, np.array(flown))
+    return SetpointHistory(np.array(times_s), accel, np.array(flown))
 
 
 def test_a_pause_and_a_pilot_end_a_stretch() -> None:
@@ -220,7 +234,7 @@ def test_too_little_is_refused_with_what_is_missing() -> None:
         stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), seen)
 
 
-def sent(lost: NDArray[np.bool_]) -> tuple[Seen, NDArray[np.int64]]:
+def sent(lost: NDArray[np.bool_]) -> tuple[PositionHistory, NDArray[np.int64]]:
     """What a receiver sees of cameras at 25 Hz whose messages are lost as told, 20 to 120 ms on their way."""
     rng = np.random.default_rng(0)
     at_s = [float(t) for t in np.arange(len(lost))[~lost] / 25.0]
@@ -332,10 +346,12 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
 
 def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
     flown = fly(0.25, 0.3, 1.0, seed=1, seconds=20.0)
-    asked = Asked(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
-    seen = Seen(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
+    asked = SetpointHistory(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
+    seen = PositionHistory(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
     with pytest.raises(RecordingError, match="hardly changed in east"):
-        identify(History(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room-hahn-stursberg"), lambda: None)
+        identify(
+            FlightHistory(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room-hahn-stursberg"), lambda: None
+        )
 
 
 @pytest.mark.usefixtures("no_page")

@@ -9,14 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from quadrotor_rig import quadrotor
 
-from sim.quadrotor import STEP_NS, STEP_S
+from sim.vehicle.quadrotor import STEP_NS, STEP_S
 from uavctl.config import load_config
-from uavctl.identify.axis_model import ReferenceAxis
-from uavctl.identify.fit import fit_axes
-from uavctl.identify.history import Asked, Seen, Stretch
-from uavctl.identify.jerk_limit import ramped
-from uavctl.identify.recorded import History
-from uavctl.identify.result import identify
+from uavctl.lab.identify.fit import fit_axes
+from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory, Stretch
+from uavctl.lab.identify.response import ReferenceAxis, ramped
+from uavctl.lab.identify.result import identify
 
 TICK_S = 0.05
 LIMIT_MPS3 = 5.0  # the simulated ArduPilot's
@@ -77,7 +75,7 @@ def test_a_setpoint_that_stays_is_reached_and_no_limit_changes_nothing() -> None
     assert ramped(asked, np.inf, np.inf) is asked
 
 
-def flown(setpoints: NDArray[np.float64], seed: int) -> Seen:
+def flown(setpoints: NDArray[np.float64], seed: int) -> PositionHistory:
     """Positions of the simulated quadrotor under ArduPilot's loops, 20 a second, 3 mm of noise."""
     vehicle = quadrotor("ardupilot", at=(0.0, 0.0, -10.0))
     rng = np.random.default_rng(seed)
@@ -88,7 +86,7 @@ def flown(setpoints: NDArray[np.float64], seed: int) -> Seen:
         for _ in range(round(TICK_S / STEP_S)):
             vehicle.advance(vehicle.now_ns + STEP_NS)
     times_s = TICK_S * np.arange(len(setpoints), dtype=np.float64)
-    return Seen(times_s, np.full(len(times_s), 0.03), np.array(rows))
+    return PositionHistory(times_s, np.full(len(times_s), 0.03), np.array(rows))
 
 
 @pytest.mark.parametrize("slew_mps3", [3.5, 5.0])
@@ -111,9 +109,9 @@ def test_half_of_a_setpoints_ramp_is_in_the_configured_dead_time() -> None:
     setpoints = steps(3, 40.0, 3.5)
     seen = flown(setpoints, 1)
     times_s = TICK_S * np.arange(len(setpoints), dtype=np.float64)
-    asked = Asked(times_s, setpoints, np.ones(len(setpoints), dtype=bool))
+    asked = SetpointHistory(times_s, setpoints, np.ones(len(setpoints), dtype=bool))
     parameters = {"PSC_JERK_XY": 5.0, "PSC_JERK_Z": 5.0}
-    history = History(asked, seen, np.zeros(len(setpoints) - 1, dtype=np.int64), "ardupilot", parameters)
+    history = FlightHistory(asked, seen, np.zeros(len(setpoints) - 1, dtype=np.int64), "ardupilot", parameters)
     found = identify(history, load_config("room-ardupilot", ["plant.dt_s=0.2"]), lambda: None)
     assert found.result.ramp_s == pytest.approx(0.5 * 0.05 * 3.5 / 5.0)
     chosen = found.result.candidates[0]

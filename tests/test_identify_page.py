@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from uavctl.cli import identify_cmd
+from uavctl.cli import identify as identify_cmd
 from uavctl.config import load_config
 from uavctl.errors import DesignError
-from uavctl.identify.history import Asked, Seen
-from uavctl.identify.link_fit import fit_link
-from uavctl.identify.page import _innovations, write_page
-from uavctl.identify.prediction import Prediction
-from uavctl.identify.recorded import History
-from uavctl.identify.result import AxisResponse, Identification, Identified
+from uavctl.lab.identify.fit import Prediction
+from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory
+from uavctl.lab.identify.page import _innovations, write_page
+from uavctl.lab.identify.result import AxisResponse, Identification, Identified, fit_link
 
 AXES = ("north", "east", "down")
 HARDLY = "down: only 26 % of the motion of the next second is predicted"
@@ -28,12 +26,12 @@ HARDLY = "down: only 26 % of the motion of the next second is predicted"
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the sentences at the page's head are read."""
-    monkeypatch.setattr("uavctl.identify.page._sections", lambda *_: iter(()))
+    monkeypatch.setattr("uavctl.lab.identify.page._sections", lambda *_: iter(()))
 
 
-def seen() -> Seen:
+def seen() -> PositionHistory:
     times_s = np.arange(0.0, 20.0, 0.2)
-    return Seen(times_s, np.zeros(len(times_s)), np.zeros((len(times_s), 3)))
+    return PositionHistory(times_s, np.zeros(len(times_s)), np.zeros((len(times_s), 3)))
 
 
 def response(axis: str, r2: float) -> AxisResponse:
@@ -110,8 +108,8 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
     def refused(*_: object) -> None:
         raise DesignError("here", "the gain is too high", "take another")
 
-    asked = Asked(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
-    history = History(asked, seen(), np.zeros(0, dtype=np.int64))
+    asked = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
+    history = FlightHistory(asked, seen(), np.zeros(0, dtype=np.int64))
     monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
     monkeypatch.setattr(identify_cmd, "design_of", refused)

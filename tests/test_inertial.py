@@ -30,14 +30,13 @@ from flight_rig import (
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uavctl.build import build_estimator, build_plant
+from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
 from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decide import back_mps2, place, reckons
+from uavctl.flight.decision import back_mps2, place, reckons
 from uavctl.flight.estimator import (
     Coming,
-    History,
+    FilterHistory,
     absorb,
     act,
     begin,
@@ -48,7 +47,7 @@ from uavctl.flight.estimator import (
     feel,
     set_input,
 )
-from uavctl.flight.fallback import End, Fallback
+from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.kalman import (
     DOUBTED_NS,
     REFUSED,
@@ -62,6 +61,7 @@ from uavctl.flight.kalman import (
     predicted,
 )
 from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.records import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def conditioned(
     return offset + linear @ gain @ np.array(off), linear @ (prior - gain @ h @ prior) @ linear.T
 
 
-def known(kalman: Kalman, history: History, at_ns: int) -> tuple[Array, Array]:
+def known(kalman: Kalman, history: FilterHistory, at_ns: int) -> tuple[Array, Array]:
     belief = belief_at(kalman, history, at_ns)
     assert belief is not None
     return belief.mean[: kalman.n_x], belief.cov[: kalman.n_x, : kalman.n_x]
@@ -198,7 +198,9 @@ def test_late_positions_among_inertial_data_give_the_same_bits_as_positions_in_o
     assert repr(flown(late=True)) == repr(flown(late=False))
 
 
-def blind(history: History, kalman: Kalman, push_mps2: float, seconds: float, *, feels: bool) -> tuple[float, float]:
+def blind(
+    history: FilterHistory, kalman: Kalman, push_mps2: float, seconds: float, *, feels: bool
+) -> tuple[float, float]:
     """Error of position and its deviation [m] after a time without positions under a force that began with it."""
     begin_ns = START_NS + 4 * 1_000_000_000
     v, p, at_ns = 0.0, 0.0, begin_ns
@@ -476,7 +478,7 @@ def test_a_fallback_holds_by_inertial_data_against_a_force_that_it_would_not_kno
 
 
 def test_a_fallback_that_ends_holds_by_nothing() -> None:
-    state = ControlState(fallback=Fallback(ControlMode.HOLD, START_NS, End.LET_GO), held_m=(0.0, 0.0, 0.0))
+    state = ControlState(fallback=Fallback(ControlMode.HOLD, START_NS, FallbackEnd.LET_GO), held_m=(0.0, 0.0, 0.0))
     controller = controller_that_feels()
     kalman = controller.kalman
     history, _, _ = absorb(kalman, begin(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])

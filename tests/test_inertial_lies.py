@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sim.inertial import InertialMeasurement
-from sim.world import World
+from sim.autopilot.inertial import InertialMeasurement
+from sim.simulation import World
 from uavctl.config import load_config
-from uavctl.data import Event, Record, Vec3
+from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
 from uavctl.loop import ControlLoop
-from uavctl.trial.fly import WatchedFlyer, controller_of
-from uavctl.trial.metrics import beyond_m
-from uavctl.trial.room import room_of
+from uavctl.records import Event, Record, Vec3
 
 BLACKOUT_S = (5.0, 9.0)
 GUSTS = ("sim.wind.velocity_mps=[0.6, -0.36, 0.0]", "sim.wind.gust_wind_mps=3.0")
@@ -56,7 +54,7 @@ def furthest_m(
         silent_s: from when on the vehicle says nothing of its own velocity.
     """
     preset = preset or f"room-{autopilot}"
-    design = (f"sim.autopilot={autopilot}", *(("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()))
+    design = (f"sim.autopilot.autopilot={autopilot}", *(("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()))
     flown = load_config(
         preset,
         [

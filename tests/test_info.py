@@ -9,17 +9,17 @@ from recording_fakes import HEADER, Clock, record_flight, write_two_segments
 from rich.console import Console
 from view_rig import record
 
-from logs.disk import check_room
-from logs.info import RecordingInfo, info
-from logs.reader import header, read
-from logs.recorder import SyncRecorder
-from logs.recover import recover
-from logs.segment import MAGIC
-from logs.topics import RecorderNote
+from logs.recording.disk import check_room
+from logs.recording.info import RecordingInfo, info
+from logs.recording.reader import header, read
+from logs.recording.recorder import SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.segment import MAGIC
+from logs.recording.topics import RecorderNote
 from uavctl.cli.app import run
-from uavctl.cli.info_table import info_table
-from uavctl.data import Datagram, LinkEstimate, LinkStats, Refused, Truth
+from uavctl.cli.log import info_table
 from uavctl.errors import RecordingError
+from uavctl.records import Datagram, LinkEstimate, LinkStats, Refused, Truth
 
 
 def shown(found: RecordingInfo) -> str:

@@ -12,17 +12,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from uavctl.build import build_controller, build_design, build_plant, build_spec
+from uavctl.build.controller import build_controller, build_design, build_plant, build_spec
 from uavctl.config import load_config
-from uavctl.data import PositionSample
 from uavctl.errors import DesignError
 from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, first_belief, make_kalman, predicted, updated
-from uavctl.smpc.bias import with_bias
-from uavctl.smpc.components import decompose
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, make_design
-from uavctl.smpc.feasibility import check_schedule
-from uavctl.smpc.innovation import innovations
+from uavctl.records import PositionSample
+from uavctl.smpc.estimate import innovations, with_bias
+from uavctl.smpc.hahn_stursberg.design import Design, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule
+from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.plant import Plant, drag_lag
 
 Array = NDArray[np.float64]

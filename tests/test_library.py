@@ -10,17 +10,14 @@ import pytest
 from design_rig import one_axis, paper_plant, spec
 from library_rig import PRESETS, bounds, case
 
-from uavctl.data import SolveStatus
 from uavctl.errors import DesignError
-from uavctl.smpc import library as maker
-from uavctl.smpc.components import decompose
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, DesignSpec, make_design
-from uavctl.smpc.late import with_late
-from uavctl.smpc.library import Library, make_library
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.records import SolveStatus
+from uavctl.smpc.hahn_stursberg import library as maker
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, with_late
+from uavctl.smpc.hahn_stursberg.horizon import decompose
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, Region, make_library
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.region import Region
 from uavctl.smpc.sets import Polytope
 
 

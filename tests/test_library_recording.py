@@ -15,22 +15,19 @@ from loopback_rig import lockstep, make_loop
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own
 from report_rig import unpaged
 
-from logs.chunks import Message
-from logs.info import info
-from logs.reader import read, records, walk
-from logs.recorder import SyncRecorder
-from logs.recover import recover
-from logs.replay import recorded_library, replay
-from uavctl.build import build_design
+from logs.recording.info import info
+from logs.recording.reader import RecordedMessage, read, records, walk
+from logs.recording.recorder import SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.replay import recorded_library, replay
+from uavctl.build.controller import build_design
+from uavctl.build.library import StoredLibrary, cache_file, decider_id, decode, encode, library_for
 from uavctl.cli.app import run
-from uavctl.code_id import decider_id
 from uavctl.config import load_config
-from uavctl.config.log import LogConfig
-from uavctl.data import Header, Plan, PolicyLibrary
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
-from uavctl.library_bytes import StoredLibrary, decode, encode
-from uavctl.library_store import cache_file, library_for
-from uavctl.smpc.library import Library
+from uavctl.records import Header, Plan, PolicyLibrary
+from uavctl.smpc.hahn_stursberg.library import Library
 
 LIBRARY = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) * 20)
 
@@ -215,7 +212,7 @@ def test_each_later_segment_begins_with_the_library_too(tmp_path: Path) -> None:
     status = recorder.close()
     assert (status.ok, status.failures, len(status.segments)) == (True, 1, 2)
     assert own(list(read(path))) == items  # told once
-    topics = [one.definition.topic for one in walk(path) if isinstance(one, Message)]
+    topics = [one.definition.topic for one in walk(path) if isinstance(one, RecordedMessage)]
     assert topics.count("/uavctl/header") == topics.count("/uavctl/library") == 2
     assert info(path).missing == 0
     recover(path, tmp_path / "whole.mcap")

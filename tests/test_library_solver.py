@@ -27,15 +27,13 @@ from library_rig import (
 from numpy.typing import NDArray
 from test_library import small
 
-from uavctl.data import SolveStatus
-from uavctl.smpc.answer import Answer, Outlook, Path
-from uavctl.smpc.assemble import gave_way
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
-from uavctl.smpc.library import make_library
-from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.meanqp import Kind
-from uavctl.smpc.plan_map import TOLERANCE
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, gave_way
+from uavctl.smpc.hahn_stursberg.frozen import TOLERANCE
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver, make_library
+from uavctl.smpc.hahn_stursberg.mean import RowKind
 
 Array = NDArray[np.float64]
 OK = SolveStatus.OPTIMAL
@@ -106,7 +104,7 @@ def independent_cost(design: Design, name: str, ask: Asked, answer: Answer, cova
     beyond = answer.states @ design.state_set.c.T + answer.backoff_x - limits
     for problem, part in zip(case(name).problems, case(name).components, strict=True):
         for row in problem.rows:
-            if row.kind is Kind.STATE:
+            if row.kind is RowKind.STATE:
                 sides = [beyond[row.t, part.rows_x[side]] for side in (row.upper, row.lower) if side >= 0]
                 slack = max(0.0, *sides)
                 cost += design.slack_linear * slack + design.slack_quadratic * slack**2
@@ -190,7 +188,7 @@ def test_same_question_same_bits_whatever_came_before(name: str) -> None:
     for solver in (used, whole):
         for scale in (np.nan, np.inf, 1e3, 1e9, 1e200):
             solver.solve(0, one.design.target + scale * np.ones(one.design.plant.n_x), one.design.target)
-        solver.solve(0, asks[0].x, asks[0].target, Outlook(limits=np.full_like(limits(one.design), -1.0)))
+        solver.solve(0, asks[0].x, asks[0].target, Preview(limits=np.full_like(limits(one.design), -1.0)))
     assert bits_of(whole, asks[::-1])[::-1] == fresh
     quick = [k for k, ask in enumerate(asks) if one.solver.solve(0, ask.x, ask.target, ask.outlook).method != "exact"]
     assert bits_of(used, [asks[k] for k in quick]) == [fresh[k] for k in quick]
@@ -268,9 +266,9 @@ def test_numbers_that_are_none_fail_without_a_plan(name: str, bad: float) -> Non
     spoilt = home.copy()
     spoilt[1] = bad
     path = Path(np.zeros((design.horizon, design.plant.n_x)), np.full((design.horizon, design.plant.n_u), bad))
-    questions = [(spoilt, home, Outlook()), (home, spoilt, Outlook()), (home, home, Outlook(path=path))]
+    questions = [(spoilt, home, Preview()), (home, spoilt, Preview()), (home, home, Preview(path=path))]
     if not np.isfinite(bad):
-        questions.append((home, home, Outlook(limits=np.full_like(limits(design), bad))))
+        questions.append((home, home, Preview(limits=np.full_like(limits(design), bad))))
     for solver in (one.solver, one.alone):
         for x, target, outlook in questions:
             answer = solver.solve(9, x, target, outlook)
@@ -280,7 +278,7 @@ def test_numbers_that_are_none_fail_without_a_plan(name: str, bad: float) -> Non
 
 def test_a_position_later_than_the_design_knows_fails() -> None:
     one = case("paper")
-    answer = one.solver.solve(0, one.design.target, one.design.target, Outlook(late=1))
+    answer = one.solver.solve(0, one.design.target, one.design.target, Preview(late=1))
     assert (answer.status, answer.inputs.size) == (SolveStatus.FAILED, 0)
 
 
@@ -315,8 +313,8 @@ def test_late_positions_have_libraries_of_their_own_that_agree_with_the_exact_pr
     costs = []
     for _ in range(40):
         x = rng.uniform([-20.0, -5.0], [30.0, 5.0])
-        fresh, late = (solver.solve(0, x, design.target, Outlook(late=j)) for j in (0, 1))
-        wanted = exact.solve(0, x, design.target, Outlook(late=1))
+        fresh, late = (solver.solve(0, x, design.target, Preview(late=j)) for j in (0, 1))
+        wanted = exact.solve(0, x, design.target, Preview(late=1))
         size = max(1.0, wanted.cost)
         assert (late.status, wanted.status) == (OK, OK)
         assert late.cost_lower <= wanted.cost + 1e-7 * size

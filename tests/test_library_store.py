@@ -13,19 +13,25 @@ import numpy as np
 import pytest
 from optimisation_cases import START, paper_spec
 
-from uavctl import library_store
-from uavctl.code_id import maker_id
+from uavctl.build import library as library_store
+from uavctl.build.library import (
+    Advance,
+    LibraryCheck,
+    cache_file,
+    check_fits,
+    check_library,
+    decode,
+    encode,
+    library_for,
+    load,
+    maker_id,
+)
 from uavctl.errors import DesignError, LibraryError
-from uavctl.library_bytes import check_fits, decode, encode
-from uavctl.library_check import LibraryCheck, check_library
-from uavctl.library_store import Advance, cache_file, library_for, load
-from uavctl.smpc.components import decompose
-from uavctl.smpc.design import Design, make_design
-from uavctl.smpc.horizon import horizon_of
-from uavctl.smpc.library import Library, PartLibrary
-from uavctl.smpc.library_solver import LibrarySolver
-from uavctl.smpc.meanqp import MeanProblem
-from uavctl.smpc.policies import PolicyProgram
+from uavctl.smpc.hahn_stursberg.design import Design, make_design
+from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem
+from uavctl.smpc.hahn_stursberg.policies import PolicyProgram
 
 NAMES = ("component 0", "component 1")
 CHECK = LibraryCheck(states=4, methods={"frozen": 1, "mixture": 3, "exact": 0}, worst_gap=2e-5)

@@ -8,8 +8,8 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from uavctl.data import Vec3
 from uavctl.flight.limits import LimitsParameters, gate
+from uavctl.records import Vec3
 
 LIMITS = LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=20.0)
 TICK_S = 0.05  # a change of 1 m/s² in a tick

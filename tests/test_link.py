@@ -8,15 +8,15 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import MS, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 
-from uavctl.build import build_estimator
+from uavctl.build.controller import build_estimator
 from uavctl.config import load_config
-from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import Setpoint, SetpointSource, Severity
-from uavctl.flight.samples import refusal
-from uavctl.mavlink.encoder import UnsendableError
-from uavctl.mavlink.link import Link
-from uavctl.mavlink.request import Ask
+from uavctl.flight.gating import refusal
+from uavctl.mavlink.codec import UnsendableError
+from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import Setpoint, SetpointSource, Severity
 
 NOW = 50_000 * SECOND
 SETPOINT = Setpoint(at_ns=NOW, accel_mps2=(0.5, 0.0, -0.25), source=SetpointSource.PLAN)
@@ -24,8 +24,7 @@ SETPOINT = Setpoint(at_ns=NOW, accel_mps2=(0.5, 0.0, -0.25), source=SetpointSour
 
 def test_a_position_becomes_a_sample() -> None:
     link = make_link(
-        frame=FrameConfig(convention="enu", origin_m=(10.0, 20.0, 0.0), yaw_deg=90.0),
-        clock=ClockConfig(latency_s=0.01),
+        frame=FrameConfig(convention="enu", origin_m=(10.0, 20.0, 0.0), yaw_deg=90.0), clock=ClockConfig(latency_s=0.01)
     )
     (sample,) = samples(link.receive(Peer(17, 18).vision(5_000_000, 1.0, 2.0, 0.5), NOW))
     # ENU (1, 2, 0.5) is NED (2, 1, -0.5); a heading of 90 degrees turns north to east
@@ -255,7 +254,7 @@ def test_the_vehicles_words_are_events() -> None:
 def test_setpoint_and_landing_go_to_the_vehicle() -> None:
     link = make_link(daemon=DaemonConfig(tick_s=0.05, system_id=200, component_id=30))
     link.receive(Peer(7, 3).heartbeat(), NOW)
-    setpoint, land = read(link.setpoint(SETPOINT) + link.ask(Ask.LAND, 0.0))
+    setpoint, land = read(link.setpoint(SETPOINT) + link.ask(RequestKind.LAND, 0.0))
     assert (setpoint.get_type(), setpoint.target_system, setpoint.target_component) == (
         "SET_POSITION_TARGET_LOCAL_NED",
         7,
@@ -266,7 +265,7 @@ def test_setpoint_and_landing_go_to_the_vehicle() -> None:
     assert land.get_seq() == setpoint.get_seq() + 1
 
 
-def sent(link: Link, name: str, period_ns: int, count: int) -> list[int]:
+def sent(link: MavlinkConnection, name: str, period_ns: int, count: int) -> list[int]:
     """Times, in ns from NOW, at which ticks send a message of this name."""
     return [
         n * period_ns
@@ -286,7 +285,7 @@ def test_time_is_asked_for_quickly_at_first_and_then_every_second() -> None:
     assert {later - earlier for earlier, later in pairwise(times[9:])} == {950 * MS}
 
 
-def answered(link: Link, at_ns: int, peer: Peer, offset_ns: int, delay_ns: int = MS) -> bool:
+def answered(link: MavlinkConnection, at_ns: int, peer: Peer, offset_ns: int, delay_ns: int = MS) -> bool:
     """Let a peer answer what the link asks at `at_ns`; whether it asked."""
     for data in link.due(at_ns):
         (raw,) = read(data)

@@ -14,14 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import beta, binom, chi2_contingency, norm
 
-from uavctl.data import LinkEstimate
-from uavctl.flight.link_estimate import (
-    LinkBelief,
-    LinkEstimateParameters,
-    burst_statistic,
-    observe,
-    report,
-)
+from uavctl.flight.link_estimate import LinkBelief, LinkEstimateParameters, burst_statistic, observe, report
+from uavctl.records import LinkEstimate
 
 FOREVER = LinkEstimateParameters(promised=0.7, half_life_steps=1e12)
 DEFAULT = LinkEstimateParameters(promised=0.7)

@@ -11,14 +11,12 @@ from loopback_rig import lockstep
 from numpy.typing import NDArray
 
 from sim.channel import Channel
-from uavctl.build_late import build_delayed_link
-from uavctl.build_link import build_link, promised
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
+from uavctl.build.link import build_delayed_link, build_link, promised
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
-from uavctl.data import Truth
 from uavctl.errors import ConfigError, DesignError
+from uavctl.lab.campaign.world import draw, newest
+from uavctl.records import Truth
 
 S = 1_000_000_000
 INF = math.inf

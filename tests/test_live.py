@@ -16,16 +16,14 @@ import pytest
 from live_rig import Viewer
 from view_rig import flown
 
-from logs.live import BACKLOG, live_view
-from logs.onlookers import Onlookers, Watcher
-from logs.reader import read, records
-from logs.recorder import Recorder
-from logs.topics import definition
-from logs.view_topics import VIEWS
-from logs.views import Views
+from logs.recording.derived_topics import VIEWS
+from logs.recording.reader import read, records
+from logs.recording.recorder import BACKLOG, DerivedTopics, Recorder, Watcher, live_view
+from logs.recording.topics import definition
+from logs.recording.views import Views
 from uavctl.cli.app import run
-from uavctl.data import Decision
 from uavctl.errors import UsageError
+from uavctl.records import Decision
 
 EVENT = "/uavctl/event"
 PATIENCE_S = 60.0
@@ -66,7 +64,7 @@ def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
     ports: list[int] = []
     told = {topic for topic, _, _ in flown().entries if not topic.startswith("/raw/")} | {view.name for view in VIEWS}
     with live_view(0, on_open=ports.append) as watch:
-        recorder = Recorder(tmp_path / "a.mcap", onlookers=Onlookers(Views(), watch))
+        recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(Views(), watch))
         for entry in flown().entries:
             recorder.put(*entry)
         assert recorder.close().ok
@@ -95,7 +93,7 @@ def test_a_stalled_viewer_holds_nothing_up_and_the_oldest_messages_go(tmp_path: 
             with telling(watch, 1, b"{}"):
                 next(messages)
             # From here on the viewer does not read.
-            recorder = Recorder(tmp_path / "a.mcap", onlookers=Onlookers(Views(), watch))
+            recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(Views(), watch))
 
             def fly() -> None:
                 for entry in flown().entries:

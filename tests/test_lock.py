@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from uavctl.daemon.lock import LONGEST_FLIGHT_NS, VehicleLock, identity, sole_daemon
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
-from uavctl.lock import LONGEST_FLIGHT_NS, Tenure, identity, sole_daemon
 
 URL = "udpin://127.0.0.1:14540"
 
@@ -75,7 +75,7 @@ def test_two_vehicles_do_not_meet(tmp_path: Path) -> None:
 @pytest.mark.fault(31, 35)
 def test_a_killed_holder_lets_go(tmp_path: Path) -> None:
     program = (
-        "import sys, time; from pathlib import Path; from uavctl.lock import sole_daemon\n"
+        "import sys, time; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
         "with sole_daemon(sys.argv[1], Path(sys.argv[2])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, URL, str(tmp_path)], stdout=subprocess.PIPE) as process:
@@ -90,7 +90,7 @@ def test_a_killed_holder_lets_go(tmp_path: Path) -> None:
 @pytest.mark.fault(31)
 def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: Path) -> None:
     program = (
-        "import os, sys; from pathlib import Path; from uavctl.lock import sole_daemon\n"
+        "import os, sys; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
         "with sole_daemon(sys.argv[1], Path(sys.argv[2])) as tenure:\n"
         "    for word in sys.argv[3:]: tenure.note({'yes': True, 'no': False, 'unheard': None}[word])\n"
         "    os.abort()"
@@ -150,11 +150,11 @@ def test_what_the_last_holder_wrote_counts_for_as_long_as_a_battery_lasts(
     file = tmp_path / "lock"
     file.write_bytes(f"123 {URL}\n{word.format(**times)}\n".encode("latin-1"))
     with file.open("r+b") as one:
-        tenure = Tenure([one.fileno()], URL, lambda: now)
+        tenure = VehicleLock([one.fileno()], URL, lambda: now)
         assert tenure.leaves is leaves
         tenure.note(True)
         tenure.note(True)
-        again = Tenure([one.fileno()], URL, lambda: now)
+        again = VehicleLock([one.fileno()], URL, lambda: now)
         assert again.leaves
         again.note(False)
     assert file.read_text() == f"{os.getpid()} {URL}\n"

@@ -16,16 +16,13 @@ from loopback_rig import Memory, lockstep
 from report_rig import unwritten, walk
 from rich.console import Console
 
-from logs.compare import Comparison, compare
-from logs.compare_figures import Figure
-from logs.compare_page import comparison_html
-from logs.compare_side import load_all
-from logs.flight_data import FlightData
-from logs.recorder import SyncRecorder
-from logs.summary import summarise
+from logs.recording.flight import FlightData
+from logs.recording.recorder import SyncRecorder
+from logs.recording.summary import summarise
+from logs.report.compare import Figure, FlightComparison, compare, comparison_html, load_all
 from uavctl.cli.app import run
-from uavctl.cli.log_compare_cmd import comparison_picture
-from uavctl.data import Decision, Header, Record, Timing
+from uavctl.cli.log_report import comparison_picture
+from uavctl.records import Decision, Header, Record, Timing
 
 SECONDS = 6.0
 EXACT = "solver.method=exact"
@@ -50,7 +47,7 @@ def record(path: Path, entries: Sequence[tuple[str, int, Record]]) -> Path:
     return path
 
 
-def figures(found: Comparison) -> dict[str, Figure]:
+def figures(found: FlightComparison) -> dict[str, Figure]:
     return {one.key: one for one in found.figures}
 
 
@@ -148,7 +145,7 @@ def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> N
     assert [one.finished for one in found.recordings] == [True, False]
 
 
-def shown(found: Comparison, width: int) -> str:
+def shown(found: FlightComparison, width: int) -> str:
     out = io.StringIO()
     Console(file=out, width=width).print(comparison_picture(found))
     return out.getvalue()
@@ -174,7 +171,7 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
     assert run(["log", "compare", str(a), str(b), "--out", str(page), "--json"]) == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in document["recordings"]] == ["A", "B"]
-    assert msgspec.convert(document, Comparison).figures
+    assert msgspec.convert(document, FlightComparison).figures
     text = page.read_text(encoding="utf-8")
     for part in ('id="path-above"', 'id="position-north"', 'id="age"', "sim.seed", "distance from target"):
         assert part in text

@@ -8,11 +8,11 @@ from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
-from logs.replay import replay
-from sim.peers import Peers
+from logs.recording.replay import replay
+from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Event, Setpoint, SetpointSource, StepInput
 from uavctl.loop import MAX_SAMPLES
+from uavctl.records import ControlMode, Datagram, Event, Setpoint, SetpointSource, StepInput
 
 TICK_NS = 50_000_000
 OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)

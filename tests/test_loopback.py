@@ -11,13 +11,12 @@ import pytest
 from report_rig import unpaged
 from udp_rig import assert_in_order, fly_over_udp
 
-from logs.chunks import Message
-from logs.reader import read, records, walk
-from uavctl.build import build_design
+from logs.recording.reader import RecordedMessage, read, records, walk
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.data import Header
-from uavctl.library_store import library_for
+from uavctl.records import Header
 
 KEYS = {
     "steps", "duration_s", "received", "lost", "max_age", "fallbacks", "state_violations", "input_violations",
@@ -89,7 +88,9 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
     cut.write_bytes(flown.read_bytes()[:-40_000])
     found = document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
-    assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(isinstance(one, Message) for one in walk(whole))
+    assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(
+        isinstance(one, RecordedMessage) for one in walk(whole)
+    )
     # a prefix of what was recorded, to the record; what is made for viewers is no record
     kept = list(read(whole))
     assert kept[:-1] == list(read(flown))[: len(kept) - 1] and len(kept) > 100

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
-from logs.many import Many
+from logs.recording.views import Many
 
 
 def poses(places: list[list[float]]) -> PosesInFrame:

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from optimisation_cases import coupled
 from scipy.linalg import null_space
 
-from uavctl.smpc.answer import Outlook
-from uavctl.smpc.components import Component, decompose
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import horizon_of
-from uavctl.smpc.meanqp import Kind, MeanProblem, Row
-from uavctl.smpc.policies import Covariance
+from uavctl.smpc.answer import Preview
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
+from uavctl.smpc.hahn_stursberg.policies import Covariance
 
 Array = NDArray[np.float64]
 
@@ -35,11 +34,11 @@ def simulated(design: Design, part: Component, x: Array, v: Array, y: Array) -> 
 def placed(row: Row, part: Component, states: Array, inputs: Array, y: Array, there: Array) -> float:
     """What a row limits, in the simulated mean."""
     what = {
-        Kind.INPUT: inputs[min(row.t, len(inputs) - 1)],
-        Kind.STATE: states[row.t],
-        Kind.REFERENCE: part.x_eq @ y,
-        Kind.REST: part.u_eq @ y,
-        Kind.OFFSET: y - there,
+        RowKind.INPUT: inputs[min(row.t, len(inputs) - 1)],
+        RowKind.STATE: states[row.t],
+        RowKind.REFERENCE: part.x_eq @ y,
+        RowKind.REST: part.u_eq @ y,
+        RowKind.OFFSET: y - there,
     }
     return float(row.c @ what[row.kind])
 
@@ -109,10 +108,10 @@ def test_every_limit_has_its_row_and_side(design: Design, i: int) -> None:
     free = design.horizon - design.terminal.tau
     told = set()
     for row, upper, lower in zip(problem.rows, problem.upper, problem.lower, strict=True):
-        if row.kind is Kind.OFFSET:
+        if row.kind is RowKind.OFFSET:
             assert (upper, lower) == (0.0, 0.0)
             continue
-        c, b = (part.c_x, part.b_x) if row.kind in (Kind.STATE, Kind.REFERENCE) else (part.c_u, part.b_u)
+        c, b = (part.c_x, part.b_x) if row.kind in (RowKind.STATE, RowKind.REFERENCE) else (part.c_u, part.b_u)
         for side, sign, value in ((row.upper, 1.0, upper), (row.lower, -1.0, -lower)):
             if side < 0:
                 assert value == np.inf
@@ -120,12 +119,12 @@ def test_every_limit_has_its_row_and_side(design: Design, i: int) -> None:
                 assert c[side] == pytest.approx(sign * row.c)
                 assert value == b[side]
                 told.add((row.kind, row.t, side))
-    wanted = {(Kind.INPUT, t, k) for t in range(free) for k in range(len(part.b_u))}
-    wanted |= {(Kind.STATE, t, k) for t in range(1, free) for k in range(len(part.b_x))}
-    wanted |= {(Kind.REFERENCE, free, k) for k in np.flatnonzero(np.any(part.c_x @ part.x_eq != 0, axis=1)).tolist()}
-    wanted |= {(Kind.REST, free, k) for k in np.flatnonzero(np.any(part.c_u @ part.u_eq != 0, axis=1)).tolist()}
+    wanted = {(RowKind.INPUT, t, k) for t in range(free) for k in range(len(part.b_u))}
+    wanted |= {(RowKind.STATE, t, k) for t in range(1, free) for k in range(len(part.b_x))}
+    wanted |= {(RowKind.REFERENCE, free, k) for k in np.flatnonzero(np.any(part.c_x @ part.x_eq != 0, axis=1)).tolist()}
+    wanted |= {(RowKind.REST, free, k) for k in np.flatnonzero(np.any(part.c_u @ part.u_eq != 0, axis=1)).tolist()}
     assert told == wanted
-    assert sum(row.kind is Kind.OFFSET for row in problem.rows) == part.x_eq.shape[1]
+    assert sum(row.kind is RowKind.OFFSET for row in problem.rows) == part.x_eq.shape[1]
 
 
 @pytest.mark.parametrize(("design", "i"), CASES)
@@ -139,15 +138,15 @@ def test_backoffs_that_no_gain_moves_are_those_of_the_open_loop(design: Design, 
     checked = 0
     for k, row in enumerate(problem.rows):
         linked = k in problem.links
-        if row.kind is Kind.INPUT:
+        if row.kind is RowKind.INPUT:
             assert linked == (row.t in first)
             assert linked or problem.backoff[k] == 0.0
-        elif row.kind is Kind.STATE and row.t <= min(first):
+        elif row.kind is RowKind.STATE and row.t <= min(first):
             wanted = design.kappa_x[row.t] * np.sqrt(row.c @ (covariances[row.t] + part.estimate_cov) @ row.c)
             assert not linked
             assert problem.backoff[k] == pytest.approx(wanted, rel=1e-12)
             checked += 1
-        elif row.kind is Kind.REFERENCE:
+        elif row.kind is RowKind.REFERENCE:
             sigma_x = part.sigma_x + part.estimate_cov
             wanted = design.kappa_x_terminal * np.sqrt(row.c @ sigma_x @ row.c)
             assert problem.backoff[k] == pytest.approx(wanted, rel=1e-12)
@@ -162,12 +161,12 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
     limits[free + 2] -= 3.0 * m_x
     for i, part in enumerate(decompose(design)):
         problem = problem_of(design, i)
-        upper, lower = problem.sides(Outlook(limits=limits))
+        upper, lower = problem.sides(Preview(limits=limits))
         for k, row in enumerate(problem.rows):
-            if row.kind not in (Kind.STATE, Kind.REFERENCE):
+            if row.kind not in (RowKind.STATE, RowKind.REFERENCE):
                 assert (upper[k], lower[k]) == (problem.upper[k], problem.lower[k])
                 continue
-            stage = row.t if row.kind is Kind.STATE else free + 2
+            stage = row.t if row.kind is RowKind.STATE else free + 2
             assert upper[k] == limits[stage, part.rows_x[row.upper]]
             assert lower[k] == -limits[stage, part.rows_x[row.lower]]
 

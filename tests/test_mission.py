@@ -10,11 +10,10 @@ import pytest
 from flight_rig import room_of, small_plant
 from numpy.typing import NDArray
 
-from uavctl.build import build_controller, build_design
-from uavctl.build_mission import build_mission, build_rests, build_trajectory
+from uavctl.build.controller import build_controller, build_design
+from uavctl.build.mission import build_mission, build_rests, build_trajectory
 from uavctl.config import load_config
 from uavctl.config.types import Config
-from uavctl.data import GaveWay, Vec3
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.mission import (
     Fence,
@@ -31,8 +30,9 @@ from uavctl.flight.mission import (
     stay,
     wanted,
 )
-from uavctl.naming import names_of, tell, tell_all
-from uavctl.smpc.design import Design
+from uavctl.labels import names_of, tell, tell_all
+from uavctl.records import GaveWay, Vec3
+from uavctl.smpc.hahn_stursberg.design import Design
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from library_rig import PRESETS, Asked, all_kinds, case, mean_optimum
 from numpy.typing import NDArray
 
-from uavctl.data import SolveStatus
-from uavctl.smpc.cuts import RowOrder
-from uavctl.smpc.meanqp import Question
+from uavctl.records import SolveStatus
+from uavctl.smpc.hahn_stursberg.mean import Question
+from uavctl.smpc.hahn_stursberg.mixture import RowOrder
 
 Array = NDArray[np.float64]
 Optimum = tuple[Asked, int, float, float]

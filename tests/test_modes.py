@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sim.personality import PERSONALITIES, px4_custom
-from uavctl.mavlink.modes import HABITS, autopilot_name, describe_mode
+from sim.autopilot.profile import PERSONALITIES, px4_custom
+from uavctl.mavlink.autopilots import HABITS, autopilot_name, describe_mode
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, levelled, rotate
+from uavctl.io.camera import BodyPose, CameraError, Echo, NatNetUrl, parse
+from uavctl.io.camera_host import Words, questions
+from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Position, TimeSync
-from uavctl.sources.camera import CameraError, Echo, Sight
-from uavctl.sources.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
-from uavctl.sources.natnet_url import NatNetUrl, parse
-from uavctl.sources.words import Words, questions
 
 SECOND = 1_000_000_000
 VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 4))
@@ -31,8 +30,8 @@ def ready(version: tuple[int, int] = (4, 1), up: Up = "z") -> NatNet:
     return camera
 
 
-def sights(camera: NatNet, data: bytes, at_ns: int = 0) -> list[Sight]:
-    return [told for told in camera.receive(data, at_ns) if isinstance(told, Sight)]
+def sights(camera: NatNet, data: bytes, at_ns: int = 0) -> list[BodyPose]:
+    return [told for told in camera.receive(data, at_ns) if isinstance(told, BodyPose)]
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -172,7 +171,7 @@ def test_a_raised_body_is_above_the_floor_and_a_nose_to_the_left_turns_left(
 
 def test_what_is_said_is_mavlink_that_declares_its_axes() -> None:
     words = Words()
-    said = words.say(Sight(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
+    said = words.say(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
     (position,) = decode(said).messages
     assert isinstance(position, Position)
     assert (position.name, position.system, position.stamp_us) == ("ODOMETRY", 246, 5_000_000_123)

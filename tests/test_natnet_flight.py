@@ -17,13 +17,13 @@ from operation_rig import Scene, ended, scene
 from patience import LIMIT_S, until
 from sim_rig import decode
 
-from logs.reader import records
-from sim.mocap import UPTIME_S
-from uavctl.build import build_design
+from logs.recording.reader import records
+from sim.cameras import UPTIME_S
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Decision, StepInput
-from uavctl.library_store import library_for
+from uavctl.records import ControlMode, Decision, StepInput
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from uavctl.clock import Due
+from uavctl.daemon.health import Notifier
 from uavctl.errors import UsageError
-from uavctl.notify import Notifier
 
 TICK_NS = 50_000_000
 

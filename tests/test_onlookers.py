@@ -8,17 +8,15 @@ import pytest
 from recording_fakes import Clock, Disk, flight, own
 from view_rig import flown, record
 
-from logs.chunks import Message, scan
-from logs.info import info
-from logs.onlookers import Onlookers
-from logs.reader import read, records, segment_files
-from logs.recorder import Recorder, SyncRecorder
-from logs.recover import recover
-from logs.topics import Definition, RecorderNote, is_view
-from logs.view_topics import VIEWS
-from logs.views import Views
-from uavctl.config.log import LogConfig
-from uavctl.data import Estimate, Record
+from logs.recording.derived_topics import VIEWS
+from logs.recording.info import info
+from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
+from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.topics import Definition, RecorderNote, is_view
+from logs.recording.views import Views
+from uavctl.config.types import LogConfig
+from uavctl.records import Estimate, Record
 
 
 def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None:
@@ -32,17 +30,17 @@ def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None
 def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
     items = flown().entries[:120]
     whole = tmp_path / "whole.mcap"
-    recorder = SyncRecorder(whole, onlookers=Onlookers(Views()))
+    recorder = SyncRecorder(whole, onlookers=DerivedTopics(Views()))
     for item in items:
         recorder.put(*item)
     recorder.close()
-    want = [m.data for m in scan(whole) if isinstance(m, Message) and is_view(m.definition.topic)]
+    want = [m.data for m in scan(whole) if isinstance(m, RecordedMessage) and is_view(m.definition.topic)]
     number = 0
     while True:
         path = tmp_path / f"at{number}" / "flight.mcap"
         clock, disk = Clock(), Disk({number}.__contains__)
         recorder = SyncRecorder(
-            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=Onlookers(Views())
+            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=DerivedTopics(Views())
         )
         for item in items:
             clock.now_s += 0.1
@@ -51,7 +49,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         if disk.operations <= number:
             break
         assert status.ok and own(list(read(path))) == items, number
-        messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, Message)]
+        messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, RecordedMessage)]
         assert [m.data for m in messages if is_view(m.definition.topic)] == want
         number += 1
     assert number > 20
@@ -70,7 +68,7 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
 
 def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
     # This header's design lacks what a view needs.
-    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=Onlookers(Views()))
+    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(Views()))
     for item in flight(30):
         recorder.put(*item)
     status = recorder.close()
@@ -88,7 +86,7 @@ def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Pa
                 raise error("no")
             return super().made(at_ns, record)
 
-    recorder = Recorder(tmp_path / "flight.mcap", onlookers=Onlookers(Failing()))
+    recorder = Recorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(Failing()))
     for item in flown().entries:
         recorder.put(*item)
     status = recorder.close()
@@ -104,10 +102,10 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
         seen.append((definition.topic, at_ns, data))
 
     path = tmp_path / "flight.mcap"
-    recorder = SyncRecorder(path, onlookers=Onlookers(Views(), watch))
+    recorder = SyncRecorder(path, onlookers=DerivedTopics(Views(), watch))
     for item in flown().entries:
         recorder.put(*item)
     recorder.close()
-    written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, Message)]
+    written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, RecordedMessage)]
     unnoted = [one for one in written if one[0] != "/uavctl/recorder"]
     assert seen == unnoted

@@ -19,11 +19,11 @@ from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
-from logs.reader import records
-from uavctl.build import build_design
+from logs.recording.reader import records
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
 from uavctl.config import load_config
-from uavctl.data import ControlMode, Datagram, Decision, Order, StepInput
-from uavctl.library_store import library_for
+from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -161,7 +161,7 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
                 for _ in range(100):  # what was on its way
                     manager.recv(4096)
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("uavctl.cli.ctl_cmd.ANSWER_LIMIT_S", 0.5)
+                patch.setattr("uavctl.cli.ctl.ANSWER_LIMIT_S", 0.5)
                 code, _, hanging = air.ctl("hold")
             assert code == 1 and "the control loop may hang" in hanging
             process.send_signal(signal.SIGCONT)

@@ -25,11 +25,12 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.build import build_controller
+from uavctl.build.controller import build_controller
 from uavctl.config import load_config
-from uavctl.data import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Severity, Vec3, VehicleStatus
+from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Waypoint
-from uavctl.flight.step import Controller, StepOutput
+from uavctl.flight.step import StepOutput
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Severity, Vec3, VehicleStatus
 
 WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
 STAY, RESUME, DOWN, ENGAGE = (Command(order=order) for order in (Order.HOLD, Order.RESUME, Order.LAND, Order.ENGAGE))
@@ -239,10 +240,7 @@ def test_a_plant_that_cannot_rest_everywhere_is_not_sent_anywhere() -> None:
     commands = {3: (goto(1.0, 0, 0), STAY)}
     outputs = run(controller, inputs_of(range(2 * TICKS), one_a_step(), commands=commands))
     reason = "there are places where this plant cannot rest"
-    assert answers(outputs[3]) == [
-        (ORDER_REFUSED, f"goto (1, 0, 0) m: {reason}"),
-        (ORDER_REFUSED, f"hold: {reason}"),
-    ]
+    assert answers(outputs[3]) == [(ORDER_REFUSED, f"goto (1, 0, 0) m: {reason}"), (ORDER_REFUSED, f"hold: {reason}")]
 
 
 def test_orders_and_their_answers_are_replayed_bit_for_bit() -> None:

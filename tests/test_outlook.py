@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_LOWER, PAPER_UPPER, ROOM_CORNER, START, paper, room
 from scipy.linalg import null_space, solve_discrete_lyapunov
 
-from uavctl.data import SolveStatus
-from uavctl.smpc.answer import Answer, Outlook, Path
-from uavctl.smpc.components import Component, decompose
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 
 Array = NDArray[np.float64]
 
@@ -131,22 +131,22 @@ def wave(design: Design, seed: int) -> Path:
     return Path(size * rng.normal(size=(design.horizon, 4)).cumsum(axis=0) / 3, rng.normal(size=(design.horizon, 2)))
 
 
-def questions() -> list[tuple[str, Array, Array, Outlook]]:
+def questions() -> list[tuple[str, Array, Array, Preview]]:
     design, _ = paper_case()
     far = np.array([12.0, 0.0, -6.0, 0.0])
     fence = closing(design, 0, 1, np.linspace(45.0, 20.0, 13))
     both = closing(design, 2, -1, np.concatenate([np.full(4, -25.0), np.full(9, -21.0)]))
     return [
-        ("a path", START, ORIGIN, Outlook(path=wave(design, 1))),
-        ("a path elsewhere", START, far, Outlook(path=wave(design, 2))),
-        ("a fence closing in", START, ORIGIN, Outlook(limits=fence)),
-        ("a fence beside the target", START, np.array([15.0, 0.0, -9.0, 0.0]), Outlook(limits=fence)),
-        ("a fence and a path", START, far, Outlook(limits=both, path=wave(design, 3))),
+        ("a path", START, ORIGIN, Preview(path=wave(design, 1))),
+        ("a path elsewhere", START, far, Preview(path=wave(design, 2))),
+        ("a fence closing in", START, ORIGIN, Preview(limits=fence)),
+        ("a fence beside the target", START, np.array([15.0, 0.0, -9.0, 0.0]), Preview(limits=fence)),
+        ("a fence and a path", START, far, Preview(limits=both, path=wave(design, 3))),
     ]
 
 
 @pytest.mark.parametrize(("x", "target", "outlook"), [pytest.param(*q[1:], id=q[0]) for q in questions()])
-def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, outlook: Outlook) -> None:
+def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, outlook: Preview) -> None:
     design, solver = paper_case()
     limits = constant_limits(design) if outlook.limits is None else outlook.limits
     path = no_path(design) if outlook.path is None else outlook.path
@@ -166,7 +166,7 @@ def test_without_an_outlook_it_is_the_papers_answer_bit_for_bit() -> None:
     plain = solver.solve(0, START, ORIGIN)
     assert plain.cost == pytest.approx(PAPER_COST, abs=0.01)
     assert plain.gave_way == ()
-    for outlook in (Outlook(limits=constant_limits(design)), Outlook(path=no_path(design)), Outlook()):
+    for outlook in (Preview(limits=constant_limits(design)), Preview(path=no_path(design)), Preview()):
         assert bits(solver.solve(0, START, ORIGIN, outlook)) == bits(plain)
 
 
@@ -178,7 +178,7 @@ def test_a_path_that_the_plant_can_fly_to_rest_is_flown_exactly() -> None:
     inputs = np.zeros((design.horizon, 3))
     inputs[:rest] = 0.5 * null_space(reach)[:, :3].sum(axis=1).reshape(rest, 3)
     states = motion(design, np.zeros(9), inputs)
-    answer = solver.solve(0, there, there, Outlook(path=Path(states[:-1], inputs)))
+    answer = solver.solve(0, there, there, Preview(path=Path(states[:-1], inputs)))
     assert answer.states == pytest.approx(there + states, abs=1e-5)
     assert np.abs(states[:rest, [0, 3, 6]]).max() > 0.005
     # With nothing known ahead the same state is held.
@@ -220,7 +220,7 @@ def test_a_fence_that_shuts_the_drone_out_is_answered_and_told() -> None:
     row = row_of(design, 0, 1)
     limits = closing(design, 0, 1, np.full(13, 20.0))
     x = np.array([22.0, 0.0, 0.0, 0.0])
-    answer = solver.solve(0, x, ORIGIN, Outlook(limits=limits))
+    answer = solver.solve(0, x, ORIGIN, Preview(limits=limits))
     assert answer.status is SolveStatus.OPTIMAL
     assert {(one.constraint, one.index) for one in answer.gave_way} == {("state", row)}
     assert {one.stage for one in answer.gave_way} == set(range(1, 1 + len(answer.gave_way)))
@@ -235,7 +235,7 @@ def test_a_fence_around_nothing_is_answered_and_told() -> None:
     """Upper limit below the lower one: no place to rest is left."""
     design, solver = paper_case()
     limits = np.minimum(closing(design, 0, 1, np.full(13, -10.0)), closing(design, 0, -1, np.full(13, 5.0)))
-    answer = solver.solve(0, START, ORIGIN, Outlook(limits=limits))
+    answer = solver.solve(0, START, ORIGIN, Preview(limits=limits))
     assert answer.status is SolveStatus.OPTIMAL
     assert {"state", "terminal"} <= kinds(answer)
     check_told(design, answer, limits)
@@ -244,7 +244,7 @@ def test_a_fence_around_nothing_is_answered_and_told() -> None:
 def test_a_target_out_of_reach_or_outside_gives_the_nearest_place_and_no_constraint_gives_way() -> None:
     design, solver = paper_case()
     for target in ([1000.0, 0.0, 0.0, 0.0], [49.9, 0.0, -24.9, 0.0]):
-        answer = solver.solve(0, START, np.array(target), Outlook())
+        answer = solver.solve(0, START, np.array(target), Preview())
         assert answer.status is SolveStatus.OPTIMAL
         assert answer.gave_way == ()
         assert answer.offset > 1.0
@@ -273,7 +273,7 @@ def test_in_a_room_everything_that_gives_way_is_told() -> None:
     design, solver = room_case()
     limits = closing(design, 0, 1, np.linspace(-2.0, -2.8, 13))
     for x in (ROOM_CORNER, ROOM_CORNER + np.array([0.0, 1.4, 0, 0, 0, 0, 0, 0, 0])):
-        answer = solver.solve(0, x, design.target, Outlook(limits=limits))
+        answer = solver.solve(0, x, design.target, Preview(limits=limits))
         assert answer.status is SolveStatus.OPTIMAL
         assert answer.gave_way
         check_told(design, answer, limits)
@@ -292,7 +292,7 @@ def test_a_kept_plan_tells_nothing() -> None:
 
 def extremes(
     design: Design, lower: Array, upper: Array, count: int, farthest: float
-) -> Iterator[tuple[Array, Outlook]]:
+) -> Iterator[tuple[Array, Preview]]:
     """States from inside to `farthest` boxes away, half of them with limits that leave little or nothing."""
     rng = np.random.default_rng(11)
     size = np.where(np.isfinite(upper - lower), upper - lower, 4.0)
@@ -302,7 +302,7 @@ def extremes(
         limits = constant_limits(design)
         if rng.random() < 0.5:
             limits *= rng.uniform(-1.0, 1.0, size=limits.shape)
-        yield x, Outlook(limits=limits)
+        yield x, Preview(limits=limits)
 
 
 @pytest.mark.parametrize(("count", "farthest"), [(250, 100.0), (50, 1e4)])

@@ -12,11 +12,11 @@ from xml.etree import ElementTree
 import msgspec
 import pytest
 
-from uavctl.cli import paper_cmd
+from uavctl.cli import paper as paper_cmd
 from uavctl.cli.app import run as command
-from uavctl.paper import depth as deep
-from uavctl.paper import run
-from uavctl.paper.result import Complexity, Depth, DesignTried
+from uavctl.lab.paper import depth as deep
+from uavctl.lab.paper import runs as run
+from uavctl.lab.paper.claims import Complexity, Depth, DesignTried
 
 WANTED = {
     "runs", "mean_cost", "cost_stderr", "infeasible", "slack_used", "state_violations", "input_violations", "max_age",

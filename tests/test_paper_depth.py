@@ -7,16 +7,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from uavctl.bench.growth import copies
-from uavctl.build import build_design, build_spec
+from uavctl.build.controller import build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import UavctlError
-from uavctl.paper import depth as deep
-from uavctl.paper.optimum import Fineness, least_settled_cost
-from uavctl.paper.result import Depth
-from uavctl.smpc.components import decompose
-from uavctl.smpc.design import Design
-from uavctl.smpc.lqg_bound import lqr, stationary_bound
+from uavctl.lab.bench.timing import copies
+from uavctl.lab.paper import depth as deep
+from uavctl.lab.paper.claims import Depth
+from uavctl.lab.paper.depth import Fineness, least_settled_cost
+from uavctl.smpc.bounds import lqr, stationary_bound
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.sets import Polytope
 
 COARSE = Fineness(states=35, inputs=31)

@@ -10,15 +10,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from uavctl.build import build_design
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
-from uavctl.paper.figures import Link, ages_svg, trajectories_svg
-from uavctl.paper.svg import Frame, decades, ticks
-from uavctl.smpc.design import Design
+from uavctl.lab.paper.figures import AgeReference, PictureFrame, ages_svg, decades, ticks, trajectories_svg
+from uavctl.smpc.hahn_stursberg.design import Design
 
 Array = NDArray[np.float64]
 SVG = "{http://www.w3.org/2000/svg}"
-LINK = Link(tau=4, horizon=12, loss=0.3)
+LINK = AgeReference(tau=4, horizon=12, loss=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +97,7 @@ def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
 def test_ages_without_loss_and_of_few_steps_are_drawn() -> None:
     ages = np.zeros((4, 4), dtype=np.intp)
     ages[:, 0] = 5
-    root = ElementTree.fromstring(ages_svg(ages, Link(tau=4, horizon=12, loss=0.0)))
+    root = ElementTree.fromstring(ages_svg(ages, AgeReference(tau=4, horizon=12, loss=0.0)))
     assert len(of_class(root, "age")) == 4
 
 
@@ -109,6 +108,6 @@ def test_ticks_are_round_and_within() -> None:
 
 
 def test_a_frame_maps_corners_to_corners() -> None:
-    frame = Frame(10, 20, 100, 50, (0.0, 4.0), (0.01, 1.0), log_y=True)
+    frame = PictureFrame(10, 20, 100, 50, (0.0, 4.0), (0.01, 1.0), log_y=True)
     places = frame.pixels(np.array([[0.0, 0.01], [4.0, 1.0], [1.0, 0.1]]))
     assert places == pytest.approx(np.array([[10, 70], [110, 20], [35, 45]]))

@@ -7,22 +7,24 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.build import build_design, build_plant, start_state
-from uavctl.campaign.chance import draw
-from uavctl.campaign.links import newest
-from uavctl.campaign.world import Flown, Scene, fly
+from uavctl.build.controller import build_design, build_plant, start_state
+from uavctl.build.library import library_for
 from uavctl.config import load_config
-from uavctl.library_store import library_for
-from uavctl.paper import run
-from uavctl.paper.assess import age_distribution, assess
-from uavctl.paper.claims import claims_of
-from uavctl.paper.flights import Chunk, Pilot, Setup, Watched
-from uavctl.paper.result import Claim, VariantResult
-from uavctl.paper.run import fly_all
-from uavctl.paper.totals import Moments, in_ellipsoid, together, total
-from uavctl.paper.variants import PRINTED, SMALLEST, VARIANTS
-from uavctl.smpc.batch_smpc import BatchSmpc, Decisions, OneByOne
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.lab.paper import runs as run
+from uavctl.lab.paper.claims import (
+    PRINTED,
+    SMALLEST,
+    VARIANTS,
+    Claim,
+    VariantResult,
+    age_distribution,
+    assess,
+    claims_of,
+)
+from uavctl.lab.paper.runs import Chunk, ChunkRunner, Moments, Setup, Watched, fly_all, in_ellipsoid, together, total
+from uavctl.smpc.batch import BatchSmpc, Decisions, OneByOne
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver
 
 Array = NDArray[np.float64]
 
@@ -108,7 +110,7 @@ def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch
 
 
 def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
-    pilot = Pilot(setup, many=False)
+    pilot = ChunkRunner(setup, many=False)
     few, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
     assert few.flown.states[2] == pytest.approx(more.flown.states[0], abs=1e-9)
 

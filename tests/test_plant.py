@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from uavctl.errors import DesignError
-from uavctl.smpc.digest import digest
-from uavctl.smpc.plant import Plant, drag_lag, steps_to_reach
+from uavctl.smpc.plant import Plant, digest, drag_lag, steps_to_reach
 from uavctl.smpc.sets import Polytope
 
 DRAG, LAG, GAIN, DT = 0.3, 0.25, 0.9, 0.2

@@ -14,16 +14,15 @@ from library_rig import PRESETS, all_kinds, asked, design_of, mean_optimum
 from numpy.typing import NDArray
 from optimisation_cases import coupled
 
-from uavctl.build import build_design
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL
-from uavctl.smpc.components import decompose
-from uavctl.smpc.conic import PartSolver
-from uavctl.smpc.design import Design
-from uavctl.smpc.horizon import horizon_of
-from uavctl.smpc.meanqp import Kind, MeanProblem
-from uavctl.smpc.policies import Covariance, Policy, PolicyProgram
-from uavctl.smpc.region import Region
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import PartSolver
+from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Region
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind
+from uavctl.smpc.hahn_stursberg.policies import Covariance, Policy, PolicyProgram
 
 Array = NDArray[np.float64]
 Multipliers = tuple[Array, Array, Array, list[Array]]
@@ -54,7 +53,7 @@ def test_the_paper_s_cheapest_policy() -> None:
         policy = program.cheapest()
         assert policy is not None
         rows = [program.problem.rows[k] for k in program.problem.links]
-        at = [(row.kind, row.t) for row in rows].index((Kind.INPUT, 6))
+        at = [(row.kind, row.t) for row in rows].index((RowKind.INPUT, 6))
         assert policy.cost == pytest.approx(2740.81, abs=0.005)
         assert policy.backoff[at] == pytest.approx(7.5, abs=1e-6)
         assert policy.slope[at] == pytest.approx(11.09, abs=0.006)
@@ -75,8 +74,8 @@ def test_backoffs_and_cost_are_those_of_the_covariances_recursion(design: Design
             found = evaluated(design, alone(design, i, theta))
             others = sum(horizon.c_0 for k, (_, horizon) in enumerate(horizons(design)) if k != i)
             wanted = [
-                (found.backoff_x if row.kind is Kind.STATE else found.backoff_u)[
-                    0, row.t, (part.rows_x if row.kind is Kind.STATE else part.rows_u)[max(row.upper, row.lower)]
+                (found.backoff_x if row.kind is RowKind.STATE else found.backoff_u)[
+                    0, row.t, (part.rows_x if row.kind is RowKind.STATE else part.rows_u)[max(row.upper, row.lower)]
                 ]
                 for row in rows
             ]
@@ -260,7 +259,7 @@ def test_a_proof_that_there_is_no_policy_serves_other_questions_and_harms_none(m
         solves.append(program)
         return solver(*program)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("uavctl.smpc.policies.clarabel.DefaultSolver", counted)
+    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.policies.clarabel.DefaultSolver", counted)
     shared = [program.best(question) for question in questions]
     assert [None if policy is None else policy.theta.tobytes() for policy in shared] == [
         None if policy is None else policy.theta.tobytes() for policy in alone

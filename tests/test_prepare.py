@@ -7,15 +7,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from uavctl import library_store
-from uavctl.build import build_design
+from uavctl.build import library as library_store
+from uavctl.build.controller import build_design
+from uavctl.build.library import Advance, StoredLibrary, library_for
 from uavctl.cli import prepare
 from uavctl.config import load_config
-from uavctl.library_bytes import StoredLibrary
-from uavctl.library_store import Advance, library_for
-from uavctl.smpc.design import Design
-from uavctl.smpc.library import Library
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
 
 CONFIG = load_config("paper")
 

@@ -12,12 +12,12 @@ import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_COST_X, PAPER_COST_Y, START, paper, room
 from rich.console import Console
 
-from uavctl.cli.solve_cmd import solve_document, solve_picture
+from uavctl.cli.solve import solve_document, solve_picture
 from uavctl.config import load_config
-from uavctl.data import SolveStatus
-from uavctl.smpc.components import decompose, whole
-from uavctl.smpc.design import Design
-from uavctl.smpc.printed import PrintedProblem, PrintedSolver
+from uavctl.records import SolveStatus
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import decompose, whole
+from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 
 
 @pytest.fixture(scope="module")

@@ -17,18 +17,14 @@ from optimisation_cases import ORIGIN, PAPER_LOWER, PAPER_UPPER, START, paper, p
 from plant_cases import case, kept
 from plant_units import Units, in_units
 
-from uavctl.data import SolveStatus
-from uavctl.smpc import conic
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Solver
-from uavctl.smpc.components import decompose, whole
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, DesignSpec, make_design
-from uavctl.smpc.feasibility import optimal_cost
-from uavctl.smpc.horizon import Horizon, horizon_of
-from uavctl.smpc.library import Library, make_library
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.smpc.hahn_stursberg import exact as conic
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, make_library
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.risk import kappa
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
@@ -54,10 +50,7 @@ def from_library(design: Design) -> Solver:
 
 
 # The library's plans are within its tolerance of the optimum; where a cost is flat they may be far apart.
-SOLVERS = {
-    "exact": Kind(ConicSolver, cost=1e-7, plan=1e-4),
-    "library": Kind(from_library, cost=1e-3, plan=np.inf),
-}
+SOLVERS = {"exact": Kind(ConicSolver, cost=1e-7, plan=1e-4), "library": Kind(from_library, cost=1e-3, plan=np.inf)}
 
 SYMMETRIC = Polytope.from_box([-40.0, -8.0, -25.0, -8.0], [40.0, 8.0, 25.0, 8.0])
 
@@ -211,9 +204,7 @@ def test_moving_everything_moves_the_plan_along(kind: Kind, move_m: tuple[float,
     move = np.array([move_m[0], 0.0, move_m[1], 0.0])
     spec = paper_spec()
     moved = replace(
-        spec,
-        state_set=replace(spec.state_set, b=spec.state_set.b + spec.state_set.c @ move),
-        target_m=(*move_m, 0.0),
+        spec, state_set=replace(spec.state_set, b=spec.state_set.b + spec.state_set.c @ move), target_m=(*move_m, 0.0)
     )
     points = states(5, 10)
     here = answers(kind, spec, points)

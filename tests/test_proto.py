@@ -8,8 +8,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from logs.proto import message_class, pack, schema_of
-from uavctl.data import Record
+from logs.recording.derived_topics import message_class, pack, schema_of
+from uavctl.records import Record
 
 
 class Pair(Record, frozen=True, kw_only=True):

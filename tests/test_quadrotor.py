@@ -8,10 +8,9 @@ import pytest
 from quadrotor_rig import BOTH, Array, Autopilot, allowing, gusty, quadrotor, run, steady, tilt
 from scipy.optimize import fsolve
 
-from sim.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
-from sim.battery import Battery
-from sim.cascade import REFERENCE_ACCEL_MPS2, TUNINGS
-from sim.quadrotor import STEP_NS, STEP_S
+from sim.vehicle.loops import REFERENCE_ACCEL_MPS2, TUNINGS
+from sim.vehicle.quadrotor import STEP_NS, STEP_S
+from sim.vehicle.rigid_body import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2, BatteryModel
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
@@ -60,7 +59,7 @@ def test_rotors_at_their_limit_wind_nothing_up() -> None:
     one.face(1.5)
     run(one, 3.0)
     assert abs(one.attitude[3]) < 0.05
-    one.battery = Battery(CRAZYFLIE_2)
+    one.battery = BatteryModel(CRAZYFLIE_2)
     one.brake()
     yaws: list[float] = []
     run(one, 6.0, lambda it: yaws.append(2.0 * math.atan2(it.attitude[3], it.attitude[0])))
@@ -112,7 +111,7 @@ def test_a_climb_that_the_battery_denied_is_not_made_up_for() -> None:
     one.go_to((0.0, 0.0, -61.0))
     run(one, 6.0)
     assert one.position_m[2] > -45.0
-    one.battery = Battery(CRAZYFLIE_2)
+    one.battery = BatteryModel(CRAZYFLIE_2)
     climbs: list[float] = []
     run(one, 25.0, lambda it: climbs.append(-it.velocity_mps[2]))
     np.testing.assert_allclose(one.position_m, (0.0, 0.0, -61.0), atol=0.2)

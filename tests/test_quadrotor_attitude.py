@@ -7,12 +7,10 @@ import pytest
 from quadrotor_rig import HOVER_SUM_RPS, Array, quadrotor, run
 from scipy.linalg import expm
 
-from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
-from sim.attitude import YAW_INTEGRAL_1PS2, YAW_RATE_GAIN_1PS, AttitudeLoop, lean
-from sim.quadrotor import STEP_S
-from sim.rigid_body import LEVEL, Body, Motion, step, turned
-from sim.rotors import Rotors
-from uavctl.data import Vec3
+from sim.vehicle.loops import YAW_INTEGRAL_1PS2, YAW_RATE_GAIN_1PS, AttitudeLoop, lean
+from sim.vehicle.quadrotor import STEP_S
+from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, LEVEL, Body, BodyState, Rotors, step, turned
+from uavctl.records import Vec3
 
 DRAG_1PS = CRAZYFLIE_2.rotor_drag_kg[0] * HOVER_SUM_RPS / CRAZYFLIE_2.mass_kg  # at hover
 
@@ -22,7 +20,7 @@ def turn_to(angle: Vec3, seconds: float) -> Array:
     body, rotors = Body.of(CRAZYFLIE_2), Rotors(CRAZYFLIE_2, STEP_S)
     rotors.speeds_rps = rotors.commands_rps = (CRAZYFLIE_2.hover_rps,) * 4
     loop = AttitudeLoop(CRAZYFLIE_2, 7.0, STEP_S)
-    motion = Motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
+    motion = BodyState((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
     rows = []
     for _ in range(round(seconds / STEP_S)):
         rotors.command(CRAZYFLIE_2.weight_n, loop.torque(motion, turned(LEVEL, angle), integrate=True), 3000.0)
@@ -76,7 +74,7 @@ def test_rates_are_limited_to_those_of_an_autopilot() -> None:
 def test_an_attitude_and_its_negative_are_one() -> None:
     one, other = (AttitudeLoop(CRAZYFLIE_2, 7.0, STEP_S) for _ in range(2))
     w, x, y, z = turned(LEVEL, (0.3, -0.2, 0.4))
-    motion = Motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
+    motion = BodyState((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
     first = one.torque(motion, (w, x, y, z), integrate=True)
     assert first == other.torque(motion, (-w, -x, -y, -z), integrate=True)
     assert [math.copysign(1.0, torque) for torque in first] == [1.0, -1.0, 1.0]

@@ -10,9 +10,20 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from sim.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
-from sim.rigid_body import LEVEL, Body, Motion, Wrench, acceleration, step, turned, uprighted
-from uavctl.data import Vec3
+from sim.vehicle.rigid_body import (
+    AIR_DENSITY_KGPM3,
+    CRAZYFLIE_2,
+    GRAVITY_MPS2,
+    LEVEL,
+    Body,
+    BodyState,
+    Wrench,
+    acceleration,
+    step,
+    turned,
+    uprighted,
+)
+from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
 
@@ -21,17 +32,17 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 NOTHING = Wrench(0.0, ZERO, 0.0)
 FLYING = Body.of(CRAZYFLIE_2)
 IN_VACUUM = replace(FLYING, rotor_drag_kg=ZERO, body_drag_kgpm=ZERO)
-TUMBLING = Motion((1.0, 2.0, -50.0), (1.5, -0.5, -2.0), turned(LEVEL, (0.4, -0.9, 0.3)), (9.0, -6.0, 4.0))
+TUMBLING = BodyState((1.0, 2.0, -50.0), (1.5, -0.5, -2.0), turned(LEVEL, (0.4, -0.9, 0.3)), (9.0, -6.0, 4.0))
 
 
-def fly(body: Body, start: Motion, wrench: Wrench, seconds: float, h: float = H, wind: Vec3 = ZERO) -> Motion:
+def fly(body: Body, start: BodyState, wrench: Wrench, seconds: float, h: float = H, wind: Vec3 = ZERO) -> BodyState:
     motion = start
     for _ in range(round(seconds / h)):
         motion = step(body, motion, (wrench, wrench, wrench), wind, h)
     return motion
 
 
-def matrix(motion: Motion) -> Array:
+def matrix(motion: BodyState) -> Array:
     w, x, y, z = motion.attitude
     return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
 
@@ -41,7 +52,7 @@ def test_free_fall_is_a_parabola_and_keeps_its_energy() -> None:
     np.testing.assert_allclose(motion.velocity_mps, (1.5, -0.5, -2.0 + 2.0 * GRAVITY_MPS2), rtol=1e-12)
     np.testing.assert_allclose(motion.position_m, (4.0, 1.0, -50.0 - 4.0 + 2.0 * GRAVITY_MPS2), rtol=0, atol=1e-11)
 
-    def energy_per_mass(one: Motion) -> float:
+    def energy_per_mass(one: BodyState) -> float:
         return 0.5 * sum(v * v for v in one.velocity_mps) - GRAVITY_MPS2 * one.position_m[2]
 
     assert energy_per_mass(motion) == pytest.approx(energy_per_mass(TUMBLING), rel=1e-12)
@@ -57,7 +68,7 @@ def test_without_thrust_or_air_a_tumbling_body_keeps_its_horizontal_momentum() -
 def test_without_torque_angular_momentum_and_energy_of_rotation_stay() -> None:
     body = replace(IN_VACUUM, inertia_kgm2=(1e-5, 2e-5, 3e-5))  # three moments: the middle axis is unstable
     inertia = np.diag(body.inertia_kgm2)
-    motion = Motion(ZERO, ZERO, TUMBLING.attitude, (0.3, 9.0, 0.2))
+    motion = BodyState(ZERO, ZERO, TUMBLING.attitude, (0.3, 9.0, 0.2))
     momentum = matrix(motion) @ inertia @ motion.rates_rps
     energy = np.array(motion.rates_rps) @ inertia @ motion.rates_rps
     flipped = False
@@ -72,7 +83,7 @@ def test_without_torque_angular_momentum_and_energy_of_rotation_stay() -> None:
 
 def test_a_steady_turn_about_an_axis_is_exact() -> None:
     rates = (0.0, 0.0, 7.0)
-    motion = fly(IN_VACUUM, Motion(ZERO, ZERO, LEVEL, rates), NOTHING, 3.0)
+    motion = fly(IN_VACUUM, BodyState(ZERO, ZERO, LEVEL, rates), NOTHING, 3.0)
     np.testing.assert_allclose(motion.attitude, (math.cos(10.5), 0.0, 0.0, math.sin(10.5)), rtol=0, atol=1e-12)
 
 
@@ -81,7 +92,7 @@ def test_torque_turns_each_axis_the_right_way() -> None:
         torque = [0.0, 0.0, 0.0]
         torque[axis] = 1e-6
         motion = fly(
-            IN_VACUUM, Motion(ZERO, ZERO, LEVEL, ZERO), Wrench(0.0, (torque[0], torque[1], torque[2]), 0.0), 0.5
+            IN_VACUUM, BodyState(ZERO, ZERO, LEVEL, ZERO), Wrench(0.0, (torque[0], torque[1], torque[2]), 0.0), 0.5
         )
         rate = 1e-6 * 0.5 / IN_VACUUM.inertia_kgm2[axis]
         np.testing.assert_allclose(np.delete(motion.rates_rps, axis), 0.0, atol=0)
@@ -89,7 +100,7 @@ def test_torque_turns_each_axis_the_right_way() -> None:
         assert 2.0 * math.asin(motion.attitude[axis + 1]) == pytest.approx(0.25 * rate, rel=1e-9)
 
 
-def oracle(body: Body, start: Motion, wrench: Wrench, wind: Vec3, seconds: float) -> Array:
+def oracle(body: Body, start: BodyState, wrench: Wrench, wind: Vec3, seconds: float) -> Array:
     """Positions and velocities by an adaptive integrator of another order, on the nine numbers of the matrix."""
     inertia = np.diag(body.inertia_kgm2)
 
@@ -128,11 +139,11 @@ def test_everything_at_once_agrees_with_an_independent_integrator_to_fourth_orde
 def test_a_fall_without_rotors_ends_at_the_speed_where_drag_is_the_weight() -> None:
     area = CRAZYFLIE_2.drag_area_m2[2]
     speed = math.sqrt(2.0 * CRAZYFLIE_2.weight_n / (AIR_DENSITY_KGPM3 * area))
-    motion = fly(FLYING, Motion(ZERO, ZERO, LEVEL, ZERO), NOTHING, 20.0)
+    motion = fly(FLYING, BodyState(ZERO, ZERO, LEVEL, ZERO), NOTHING, 20.0)
     assert motion.velocity_mps[:2] == (0.0, 0.0)
     assert motion.velocity_mps[2] == pytest.approx(speed, rel=1e-8)
     # On the way there: v = v∞ tanh(g t / v∞).
-    motion = fly(FLYING, Motion(ZERO, ZERO, LEVEL, ZERO), NOTHING, 1.0)
+    motion = fly(FLYING, BodyState(ZERO, ZERO, LEVEL, ZERO), NOTHING, 1.0)
     assert motion.velocity_mps[2] == pytest.approx(speed * math.tanh(GRAVITY_MPS2 / speed), rel=1e-9)
 
 
@@ -140,7 +151,7 @@ def test_air_takes_a_hovering_body_along_with_the_rotors_drag() -> None:
     speeds, wind = 4.0 * CRAZYFLIE_2.hover_rps, (1.0, 0.0, 0.0)
     body = replace(FLYING, body_drag_kgpm=ZERO)
     hover = Wrench(CRAZYFLIE_2.weight_n, ZERO, speeds)
-    motion = fly(body, Motion(ZERO, ZERO, LEVEL, ZERO), hover, 3.0, wind=wind)
+    motion = fly(body, BodyState(ZERO, ZERO, LEVEL, ZERO), hover, 3.0, wind=wind)
     drag_1ps = CRAZYFLIE_2.rotor_drag_kg[0] * speeds / CRAZYFLIE_2.mass_kg
     assert motion.velocity_mps[0] == pytest.approx(-math.expm1(-3.0 * drag_1ps), rel=1e-9)
 

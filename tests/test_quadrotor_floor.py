@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from quadrotor_rig import BOTH, Autopilot, allowing, quadrotor, run, steady
 
-from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
-from sim.battery import Battery
-from sim.cascade import TUNINGS
-from sim.craft import Craft
-from sim.quadrotor import STEP_NS, Quadrotor
-from sim.rigid_body import LEVEL
+from sim.vehicle.interface import Vehicle
+from sim.vehicle.loops import TUNINGS
+from sim.vehicle.quadrotor import STEP_NS, Quadrotor
+from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, LEVEL, BatteryModel
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
@@ -109,7 +107,7 @@ def test_a_weak_battery_limits_the_thrust_and_a_weaker_one_cannot_lift_it() -> N
     one = quadrotor(at=(0.0, 0.0, -60.0))
     run(one, 1.0)
     assert one.battery.current_a == pytest.approx(2.0, abs=0.2)
-    one.battery = Battery(CRAZYFLIE_2, charge=0.5)
+    one.battery = BatteryModel(CRAZYFLIE_2, charge=0.5)
     assert one.battery.largest_rps == CRAZYFLIE_2.speed_at_0v_rps + CRAZYFLIE_2.speed_per_v_rps * 3.92
     one.accelerate((0.0, 0.0, -50.0))
     run(one, 2.5)
@@ -219,7 +217,7 @@ def test_on_the_floor_nothing_moves_but_the_battery() -> None:
 
 
 def test_misled_loops_hold_the_wrong_place() -> None:
-    one: Craft = quadrotor(at=(0.0, 0.0, -5.0))
+    one: Vehicle = quadrotor(at=(0.0, 0.0, -5.0))
     one.go_to((1.0, 0.0, -5.0))
     one.mislead((0.4, -0.3, 0.2), (0.0, 0.0, 0.0))
     assert isinstance(one, Quadrotor)

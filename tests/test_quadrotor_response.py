@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from quadrotor_rig import WITH_SIH_DRAG, Record, fitted, quadrotor, run
 
-from sim.quadrotor import Quadrotor
-from uavctl.data import Vec3
+from sim.vehicle.quadrotor import Quadrotor
+from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
-from sim.battery import Battery
-from sim.rotors import STOPPED, Rotors
-from uavctl.data import Vec3
+from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, STOPPED, BatteryModel, Rotors
+from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
 
@@ -143,7 +141,7 @@ def test_commands_stay_between_idling_and_what_the_voltage_allows() -> None:
 
 
 def test_the_battery_gives_the_power_asked_for_through_its_resistance() -> None:
-    battery = Battery(CRAZYFLIE_2)
+    battery = BatteryModel(CRAZYFLIE_2)
     for thrust in (0.0, 0.1, CRAZYFLIE_2.weight_n, 0.6):
         source = battery.open_circuit_v
         battery.drain(thrust, 1e-6)
@@ -153,13 +151,13 @@ def test_the_battery_gives_the_power_asked_for_through_its_resistance() -> None:
 
 
 def test_a_shorted_battery_gives_what_it_can() -> None:
-    battery = Battery(CRAZYFLIE_2)
+    battery = BatteryModel(CRAZYFLIE_2)
     battery.drain(100.0, H)
     assert battery.voltage_v == pytest.approx(0.5 * 4.2)
 
 
 def test_an_empty_battery_gives_nothing_until_it_has_charge_again() -> None:
-    battery = Battery(CRAZYFLIE_2, charge=1e-6)
+    battery = BatteryModel(CRAZYFLIE_2, charge=1e-6)
     while not battery.empty:
         battery.drain(CRAZYFLIE_2.weight_n, H)
     used_c = battery.used_c
@@ -171,7 +169,7 @@ def test_an_empty_battery_gives_nothing_until_it_has_charge_again() -> None:
 
 
 def test_charge_is_the_integral_of_the_current_and_hovering_lasts_as_long_as_its_maker_says() -> None:
-    battery = Battery(CRAZYFLIE_2)
+    battery = BatteryModel(CRAZYFLIE_2)
     flown_s = used_c = 0.0
     while battery.voltage_v > 3.0:  # where the Crazyflie's firmware counts it as empty
         battery.drain(CRAZYFLIE_2.weight_n, 0.1)
@@ -183,12 +181,12 @@ def test_charge_is_the_integral_of_the_current_and_hovering_lasts_as_long_as_its
 
 
 def test_the_voltage_falls_with_the_charge_and_takes_rotor_speed_along() -> None:
-    last = Battery(CRAZYFLIE_2)
+    last = BatteryModel(CRAZYFLIE_2)
     assert last.open_circuit_v == pytest.approx(4.2)
-    assert Battery(CRAZYFLIE_2, charge=0.55).open_circuit_v == pytest.approx(0.5 * (3.92 + 3.96))
+    assert BatteryModel(CRAZYFLIE_2, charge=0.55).open_circuit_v == pytest.approx(0.5 * (3.92 + 3.96))
     for charge in np.arange(0.99, -0.01, -0.01):
-        battery = Battery(CRAZYFLIE_2, charge=float(charge))
+        battery = BatteryModel(CRAZYFLIE_2, charge=float(charge))
         assert battery.open_circuit_v < last.open_circuit_v
         assert battery.largest_rps < last.largest_rps
         last = battery
-    assert Battery(CRAZYFLIE_2, charge=-1.0).open_circuit_v == 3.0
+    assert BatteryModel(CRAZYFLIE_2, charge=-1.0).open_circuit_v == 3.0

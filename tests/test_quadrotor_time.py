@@ -7,11 +7,11 @@ import pytest
 from quadrotor_rig import MODEL, gusty, quadrotor, run, tilt
 from scipy.spatial.transform import Rotation
 
-from sim.airframe import CRAZYFLIE_2, GRAVITY_MPS2
-from sim.quadrotor import STEP_NS, Quadrotor
-from sim.vehicle import Vehicle, linear_model
+from sim.vehicle.linear import LinearVehicle, linear_model
+from sim.vehicle.quadrotor import STEP_NS, Quadrotor
+from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2
 from uavctl.config import load_config
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:
@@ -105,7 +105,7 @@ def test_absurd_setpoints_are_limited_and_stay_finite() -> None:
 
 def test_it_can_take_the_place_of_the_linear_vehicle() -> None:
     config = load_config("room-hahn-stursberg")
-    linear = Vehicle(config, np.random.SeedSequence(1), 0)
+    linear = LinearVehicle(config, np.random.SeedSequence(1), 0)
     one = quadrotor()
     for name in ("model", "now_ns", "grounded", "has_down", "state", "input", "position_m", "velocity_mps"):
         assert type(getattr(one, name)) is type(getattr(linear, name)), name

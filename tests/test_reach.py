@@ -26,9 +26,10 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, PositionSample
-from uavctl.flight.reach import GateParameters
-from uavctl.flight.step import Controller, StepOutput
+from uavctl.flight.controller import Controller
+from uavctl.flight.gating import GateParameters
+from uavctl.flight.step import StepOutput
+from uavctl.records import ControlMode, PositionSample
 from uavctl.smpc.answer import Answer
 
 WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode

@@ -11,9 +11,9 @@ from flight_rig import DT_NS, HORIZON, MS, TICK_NS, TICKS, estimator_parameters,
 from msgspec import structs
 from scipy.integrate import quad
 
+from uavctl.flight.gating import GateParameters, OutlierTrack, Reach, doubt, judge, make_reach, radius
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.limits import LimitsParameters
-from uavctl.flight.reach import GateParameters, Reach, Suspect, doubt, judge, make_reach, radius
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 LIMITS = LimitsParameters(accel_mps2=(2.0, 9.0, 1.5), slew_mps3=1.0)
@@ -104,7 +104,7 @@ def test_who_is_suspected() -> None:
 
 def test_nearer_is_meant_in_space_and_not_axis_by_axis() -> None:
     wide, narrow = np.array([1.0, 1.0]), np.array([0.125, 0.25])
-    suspect = Suspect(5, 5, 1, np.array([0.25, 0.5]))
+    suspect = OutlierTrack(5, 5, 1, np.array([0.25, 0.5]))
     # The second is nearer to the suspect in one axis, the third in none; all are inside the set.
     assert judge(suspect, 9, np.array([0.25, 0.25]), wide, 2)[0] is False
     assert judge(suspect, 9, np.array([-0.5, 0.5]), wide, 2) == (True, None)
@@ -129,7 +129,7 @@ def test_a_velocity_outside_suspects_and_the_offset_is_of_positions_only() -> No
 def test_a_source_has_moved_after_three_that_agree_and_the_configured_time(
     count: int, last_ns: int, moved: bool
 ) -> None:
-    assert Suspect(7, 7 + last_ns, count, off(1.0)).moved(PARAMETERS) is moved
+    assert OutlierTrack(7, 7 + last_ns, count, off(1.0)).moved(PARAMETERS) is moved
 
 
 @pytest.mark.parametrize(
@@ -146,11 +146,11 @@ def test_a_source_has_moved_after_three_that_agree_and_the_configured_time(
 def test_a_source_may_well_have_moved_after_two_that_agree_and_a_tenth_of_a_second(
     count: int, last_ns: int, likely: bool
 ) -> None:
-    assert Suspect(7 * MS, 7 * MS + last_ns, count, off(1.0)).likely is likely
+    assert OutlierTrack(7 * MS, 7 * MS + last_ns, count, off(1.0)).likely is likely
 
 
 def test_who_is_suspected_and_how_far_inputs_carry_are_objects_that_nobody_changes(reach: Reach) -> None:
-    suspect = Suspect(5, 7, 2, np.array([1.0, 2.0]))
+    suspect = OutlierTrack(5, 7, 2, np.array([1.0, 2.0]))
     with pytest.raises(FrozenInstanceError):
         suspect.count = 3  # type: ignore[misc]
     with pytest.raises(FrozenInstanceError):

@@ -5,15 +5,14 @@ from pathlib import Path
 import pytest
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, write_two_segments
 
-from logs.disk import DiskFile
-from logs.encoding import encode
-from logs.reader import header, read, records, segment_files
-from logs.recorder import SyncRecorder
-from logs.segment import Entry, Segment
-from logs.topics import definition
-from uavctl.config.log import LogConfig
-from uavctl.data import Datagram, Event, Record, Setpoint, Severity
+from logs.recording.disk import DiskFile
+from logs.recording.reader import header, read, records, segment_files
+from logs.recording.recorder import SyncRecorder
+from logs.recording.segment import QueuedMessage, Segment
+from logs.recording.topics import definition, encode
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
+from uavctl.records import Datagram, Event, Record, Setpoint, Severity
 
 
 def test_records_of_one_type(tmp_path: Path) -> None:
@@ -88,7 +87,8 @@ def test_a_missing_message_is_noticed_also_one_for_viewers(lacks: str, tmp_path:
     path = tmp_path / "flight.mcap"
     event = encode(Event(at_ns=7, severity=Severity.INFO, code="code", text="text"))
     messages = [
-        Entry(definition(topic), 1 + n, n, event) for n, topic in enumerate(["/uavctl/event", "/view/estimate"] * 9)
+        QueuedMessage(definition(topic), 1 + n, n, event)
+        for n, topic in enumerate(["/uavctl/event", "/view/estimate"] * 9)
     ]
     at = next(n for n, one in enumerate(messages) if n > 5 and one.definition.topic == lacks)
     for entries, good in ((messages, True), (messages[:at] + messages[at + 1 :], False)):

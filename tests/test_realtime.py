@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from uavctl import realtime as module
 from uavctl.clock import Due
-from uavctl.realtime import Collector, Outcome, collected_between_ticks, realtime
+from uavctl.daemon import realtime as module
+from uavctl.daemon.realtime import Collector, Outcome, collected_between_ticks, realtime
 
 SECOND = 1_000_000_000
 

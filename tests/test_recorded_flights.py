@@ -34,14 +34,12 @@ from recorded_rig import (
 from report_rig import words_of
 
 from uavctl.config import load_config
-from uavctl.data import Command, ControlMode, Decision, Event, Order
-from uavctl.identify.dead_time import choose_dead_time
-from uavctl.identify.exchange import Exchange
-from uavctl.identify.link_fit import LinkFit, fit_link
-from uavctl.identify.recorded import History, from_tlog
-from uavctl.identify.result import flown_stretches, identify, kinds_of
+from uavctl.lab.identify.fit import choose_dead_time
+from uavctl.lab.identify.history import Exchange, FlightHistory, from_tlog
+from uavctl.lab.identify.result import LinkFit, fit_link, flown_stretches, identify, kinds_of
+from uavctl.lab.trial import room_of
 from uavctl.mavlink.clocksync import RoundTrips
-from uavctl.trial.room import room_of
+from uavctl.records import Command, ControlMode, Decision, Event, Order
 
 GPS, VICON, OFFBOARD = OF_OTHERS
 WIND, PILOT, BLOWN, RELEASED, WAYPOINTS = RELAYED
@@ -71,10 +69,7 @@ def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -
     ("name", "flown"),
     [
         (GPS, ["STABILIZE, disarmed", "GUIDED, disarmed", "GUIDED", "LAND", "LAND, disarmed"]),
-        (
-            VICON,
-            ["STABILIZE, disarmed", "GUIDED, disarmed", "GUIDED", "LAND, failsafe", "LAND, disarmed, failsafe"],
-        ),
+        (VICON, ["STABILIZE, disarmed", "GUIDED, disarmed", "GUIDED", "LAND, failsafe", "LAND, disarmed, failsafe"]),
         (AT_REST, ["AUTO.LOITER, disarmed", "AUTO.TAKEOFF, disarmed"]),
         (
             RELEASED,
@@ -119,7 +114,7 @@ def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answ
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)
 
 
-def history(name: str) -> History:
+def history(name: str) -> FlightHistory:
     return from_tlog(packets(name), config_of(name))
 
 

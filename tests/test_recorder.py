@@ -9,19 +9,16 @@ from patience import until
 from recording_fakes import Clock, Disk, flight, own
 from view_rig import flown
 
-import logs.recorder
-from logs.chunks import Message, scan
-from logs.disk import DiskFile, OutputFile
-from logs.journal import Journal
-from logs.onlookers import Onlookers
-from logs.reader import read, records, segment_files
-from logs.recorder import RECORDS, VIEWS, Recorder, SyncRecorder, portion
-from logs.topics import RecorderNote, is_view
-from logs.view_topics import LOG
-from logs.views import Views
-from uavctl.config.log import LogConfig
-from uavctl.data import Datagram, Event, Record, Severity
+import logs.recording.recorder as recorder_module
+from logs.recording.derived_topics import LOG
+from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
+from logs.recording.recorder import RECORDS, VIEWS, DerivedTopics, Recorder, SyncRecorder, WriteQueue, portion
+from logs.recording.topics import RecorderNote, is_view
+from logs.recording.views import Views
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
+from uavctl.records import Datagram, Event, Record, Severity
 
 EVENT = Event(at_ns=1, severity=Severity.INFO, code="x", text="y")
 
@@ -42,7 +39,7 @@ def test_thread_writes_what_was_put_in_order(tmp_path: Path) -> None:
 
 def test_the_thread_catches_up_when_it_is_asked_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Right after a tick, so that its rounds are over when the next one begins; of itself it looks far more rarely."""
-    monkeypatch.setattr(logs.recorder, "POLL_S", 1e6)
+    monkeypatch.setattr(recorder_module, "POLL_S", 1e6)
     recorder = Recorder(tmp_path / "flight.mcap")
     for count, (topic, at_ns, record) in enumerate(flight(5), start=1):
         recorder.put(topic, at_ns, record)
@@ -148,7 +145,7 @@ def test_the_first_drop_is_noted_before_what_was_put_after_it(tmp_path: Path) ->
     path = tmp_path / "flight.mcap"
     items = flight(100)
     log = LogConfig(chunk_bytes=1024)
-    journal = Journal(path, log, DiskFile, lambda _: None, Clock(), Onlookers())
+    journal = WriteQueue(path, log, DiskFile, lambda _: None, Clock(), DerivedTopics())
     journal.queue.extend(items[:50])
     journal.drain(1, 0)
     journal.drop()  # item 50
@@ -176,7 +173,7 @@ def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path:
             return []
 
     items = flight(RECORDS)
-    recorder = Recorder(path, LogConfig(chunk_bytes=1024), open_file=open_file, onlookers=Onlookers(Looking()))
+    recorder = Recorder(path, LogConfig(chunk_bytes=1024), open_file=open_file, onlookers=DerivedTopics(Looking()))
     recorder.put(*items[0])
     assert reached.wait(30.0)  # the first round took one record
     for item in items[1:]:
@@ -196,7 +193,7 @@ def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> Non
 
     path = tmp_path / "flight.mcap"
     log, clock, free = LogConfig(), Clock(), [10**9]
-    journal = Journal(path, log, DiskFile, lambda _: free[0], clock, Onlookers(Same()))
+    journal = WriteQueue(path, log, DiskFile, lambda _: free[0], clock, DerivedTopics(Same()))
     items = flight(30)
     journal.queue.extend(items)
     journal.drain(len(items), 0)
@@ -205,7 +202,7 @@ def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> Non
     assert journal.status().reason and len(journal.views_due) == len(items)
     journal.finish()
     assert own(list(read(path))) == items
-    files = [[one for one in scan(file) if isinstance(one, Message)] for file in segment_files(path)]
+    files = [[one for one in scan(file) if isinstance(one, RecordedMessage)] for file in segment_files(path)]
     assert [sum(one.definition.topic == LOG for one in file) for file in files] == [0, 10]
 
 
@@ -218,7 +215,7 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         path = tmp_path / f"at{number}" / "flight.mcap"
         disk = Disk({number - 1}.__contains__)  # none first, to know the views
         recorder = Recorder(
-            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=Clock(0.01), onlookers=Onlookers(Views())
+            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=Clock(0.01), onlookers=DerivedTopics(Views())
         )
         for item in items:
             recorder.put(*item)
@@ -226,7 +223,7 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         if 0 < disk.operations < number:
             break
         assert status.ok and own(list(read(path))) == items, number
-        messages = [one for file in segment_files(path) for one in scan(file) if isinstance(one, Message)]
+        messages = [one for file in segment_files(path) for one in scan(file) if isinstance(one, RecordedMessage)]
         shown = [one.data for one in messages if is_view(one.definition.topic)]
         views = views or shown
         assert shown == views and len(views) > len(items) // 2, number

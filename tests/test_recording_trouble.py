@@ -12,12 +12,11 @@ import pytest
 from patience import until
 from recording_fakes import Clock, flight, own
 
-from logs.disk import DiskFile, OutputFile
-from logs.journal import LATE_S, RecorderStatus
-from logs.reader import read
-from logs.recorder import Recorder, SyncRecorder
-from uavctl.cli.operation import recorder_health
-from uavctl.config.log import LogConfig
+from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.reader import read
+from logs.recording.recorder import LATE_S, Recorder, RecorderStatus, SyncRecorder
+from uavctl.cli.fly import recorder_health
+from uavctl.config.types import LogConfig
 
 ITEMS = flight(400)
 

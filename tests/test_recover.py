@@ -6,11 +6,11 @@ import pytest
 from mcap.reader import make_reader
 from recording_fakes import flight, own, record_flight, write_two_segments
 
-from logs.disk import DiskFile
-from logs.info import info
-from logs.reader import read, records
-from logs.recover import recover
-from logs.topics import RecorderNote
+from logs.recording.disk import DiskFile
+from logs.recording.info import info
+from logs.recording.reader import read, records
+from logs.recording.recover import recover
+from logs.recording.topics import RecorderNote
 from uavctl.errors import RecordingError
 
 

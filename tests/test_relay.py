@@ -13,18 +13,18 @@ from mavlink_rig import MS, SECOND, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
-from sim.autopilot import UPTIME_NS
-from sim.peers import Peers
-from sim.personality import PERSONALITIES
+from sim.autopilot.autopilot import UPTIME_NS
+from sim.autopilot.profile import PERSONALITIES
+from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.config.preflight import RelayConfig
-from uavctl.data import Datagram, Event, LinkStats, PositionSample, Vec3
+from uavctl.config.connections import RelayConfig
 from uavctl.frames import from_euler
-from uavctl.mavlink.encoder import Encoder, UnsendableError
-from uavctl.mavlink.link import Link
-from uavctl.mavlink.mode import State
+from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.mavlink.codec import Encoder, UnsendableError
+from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.handover_guards import HandoverState
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
-from uavctl.trial.own_loop import EXTERNAL_ONLY
+from uavctl.records import Datagram, Event, LinkStats, PositionSample, Vec3
 
 NOW = 1_000 * SECOND
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -164,7 +164,7 @@ class Indoors:
         self.config = load_config(
             "room-hahn-stursberg",
             [
-                f"sim.autopilot={name}",
+                f"sim.autopilot.autopilot={name}",
                 "sim.camera.rate_hz=30.0",
                 "relay.enabled=true",
                 "link.loss=0.0",
@@ -201,7 +201,7 @@ class Indoors:
         self.run(5.0)
         assert pilot.change(kind.mode(external), self.peers.now_ns) == 0
         self.run(3.0)
-        assert self.loop.who_flies is State.ENGAGED and not self.loop.finished
+        assert self.loop.who_flies is HandoverState.ENGAGED and not self.loop.finished
 
     def sent(self, *kinds: str) -> Iterator[tuple[int, Any]]:
         for record in self.memory.of(Datagram):
@@ -267,7 +267,7 @@ def test_px4_moves_stamps_once_its_timesync_has_converged_and_moved_here_too_the
     assert estimator.position_ok
     assert min(ages_ms[-20:]) > 45 and max(ages_ms[-20:]) < 200  # the cameras' time, and the wait for the tick
     # As if nobody had noticed that PX4 moves stamps itself.
-    monkeypatch.setattr(Link, "vehicle_asks_time", False)
+    monkeypatch.setattr(MavlinkConnection, "vehicle_asks_time", False)
     rig.run(7.0)
     assert len([at_ns for at_ns, _ in rig.relayed() if at_ns > 53 * SECOND]) > 90
     assert not estimator.position_ok
@@ -280,7 +280,7 @@ def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(nam
     rig.run(8.0)
     rig.pilot_flies(external)
     rig.run(40.0, stop=True)
-    assert rig.loop.finished and rig.loop.who_flies is State.DONE
+    assert rig.loop.finished and rig.loop.who_flies is HandoverState.DONE
     assert not rig.peers.autopilot.pilot.armed and rig.peers.autopilot.estimator.position_ok
     assert not any("Failsafe" in event.text for event in rig.memory.of(Event))
     end_ns = rig.peers.now_ns
@@ -295,7 +295,7 @@ def test_without_the_relay_a_vehicle_that_the_pilot_took_off_is_left_as_soon_as_
     rig.run(3.0)
     rig.pilot_flies("OFFBOARD")
     rig.run(40.0, stop=True)
-    assert rig.loop.finished and rig.loop.who_flies is State.SETTLING and rig.peers.autopilot.pilot.armed
+    assert rig.loop.finished and rig.loop.who_flies is HandoverState.SETTLING and rig.peers.autopilot.pilot.armed
 
 
 def test_frozen_cameras_are_not_passed_on() -> None:

@@ -8,20 +8,19 @@ import pytest
 from take_off_rig import RELAYED, Flight
 
 from uavctl import loop as control
-from uavctl.data import Event, RelayStats, StepInput
-from uavctl.ending import Cause
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.step import StepOutput, step
-from uavctl.mavlink.hand_over import HandOver, Told
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.sight import View
+from uavctl.mavlink.handover import HandOver, HandoverStep
+from uavctl.mavlink.handover_guards import HandoverState, HandoverView
+from uavctl.outcome import Cause
+from uavctl.records import Event, RelayStats, StepInput
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 POSE, LAND = "VISION_POSITION_ESTIMATE", 21
 SECOND = 1_000_000_000
 
 
-def airborne(autopilot: str, *overrides: str, until: State = State.ENGAGED) -> Flight:
+def airborne(autopilot: str, *overrides: str, until: HandoverState = HandoverState.ENGAGED) -> Flight:
     flight = Flight(autopilot, *RELAYED, *overrides).relayed().take_off()
     flight.run(40.0, until=until)
     return flight.run(5.0)  # the rotors spin up first, for as long as 4.2 s
@@ -51,9 +50,9 @@ def is_down(flight: Flight) -> bool:
 @pytest.mark.fault(64)
 @pytest.mark.usefixtures("control_may_fail")
 @BOTH
-@pytest.mark.parametrize("until", [State.CLIMBING, State.ENGAGED])
+@pytest.mark.parametrize("until", [HandoverState.CLIMBING, HandoverState.ENGAGED])
 def test_a_core_that_fails_lands_the_vehicle_and_leaves_it_its_positions_until_then(
-    monkeypatch: pytest.MonkeyPatch, autopilot: str, until: State
+    monkeypatch: pytest.MonkeyPatch, autopilot: str, until: HandoverState
 ) -> None:
     fail = failing(monkeypatch)
     flight = airborne(autopilot, until=until)
@@ -83,14 +82,14 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
     fail = failing(monkeypatch)
     flight = airborne("px4")
     flight.stick("POSCTL")
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     before, failed_ns = flight.commands(), flight.now_ns
     fail()
     flight.run(20.0)
     assert not flight.loop.finished and flight.commands() == before
     assert len(poses_after(flight, failed_ns)) > 50
     flight.stick("AUTO.LAND")
-    flight.run(30.0, until=State.DONE)
+    flight.run(30.0, until=HandoverState.DONE)
     assert flight.loop.finished and flight.commands() == before
 
 
@@ -99,7 +98,7 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
 def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = airborne("px4")
 
-    def faulty(hand_over: HandOver, view: View) -> Told:
+    def faulty(hand_over: HandOver, view: HandoverView) -> HandoverStep:
         raise LookupError("no such state")
 
     monkeypatch.setattr(HandOver, "update", faulty)
@@ -121,7 +120,7 @@ def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(m
 def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopilot: str) -> None:
     flight = airborne(autopilot, "hand_over.land_s=5.0")
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     flight.run(40.0, stop=True)
     assert flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
@@ -132,7 +131,7 @@ def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
     flight.run(40.0, stop=True)
-    assert flight.is_in(State.FAILED) and flight.loop.carries and not flight.loop.finished
+    assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED
 

@@ -10,15 +10,13 @@ import msgspec
 import pytest
 from loopback_rig import Memory, lockstep, make_loop
 
-from logs.encoding import encode
-from logs.replay import replay
-from logs.replay_tlog import replay_tlog
-from logs.tlog import read_tlog
-from logs.topics import raw_link
+from logs.recording.replay import replay
+from logs.recording.tlog import read_tlog, replay_tlog
+from logs.recording.topics import encode, raw_link
 from uavctl.config import load_config
-from uavctl.data import Datagram, Decision, Event, Plan, Setpoint, StepInput
 from uavctl.errors import RecordingError
 from uavctl.loop import VEHICLE
+from uavctl.records import Datagram, Decision, Event, Plan, Setpoint, StepInput
 
 DATA = Path(__file__).parent / "data"
 
@@ -92,8 +90,7 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
         if isinstance(r, Datagram) and r.link == "mocap" and not r.outgoing
     )
     result = replay(
-        flown.entries[:position] + flown.entries[position + 1 :],
-        lambda sink: make_loop(load_config("paper"), sink),
+        flown.entries[:position] + flown.entries[position + 1 :], lambda sink: make_loop(load_config("paper"), sink)
     )
     assert not result.identical
 

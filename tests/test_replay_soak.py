@@ -9,7 +9,7 @@ import pytest
 from draw_flight import drawn
 from soak_replay import replayed, tally
 
-from logs.reader import segment_files
+from logs.recording.reader import segment_files
 
 SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for below
 

@@ -14,12 +14,13 @@ from report_rig import data, html_of, unwritten, walk, words_of
 from synthetic_flight import fly
 from synthetic_scene import Scene, paper, room
 
-from logs.flight_data import FlightData
-from logs.report import picture, write_report
-from logs.summary import summarise
-from logs.svg import PALETTE, compact
-from uavctl.data import Checked, ControlMode, Decision, Estimate, Plan, Record, StepInput, Timing, Truth
+from logs.recording.flight import FlightData
+from logs.recording.summary import summarise
+from logs.report.figures import picture
+from logs.report.flight_page import write_report
+from logs.report.svg import PALETTE, compact
 from uavctl.errors import RecordingError
+from uavctl.records import Checked, ControlMode, Decision, Estimate, Plan, Record, StepInput, Timing, Truth
 
 SECTIONS = [
     *("What happened", "Summary", "Timeline", "Path", "Each axis against its limits", "Age of information"),

@@ -15,18 +15,17 @@ from matplotlib.figure import Figure
 from report_rig import data, words_of
 from synthetic_scene import room
 
-from logs import plots, plots_link, plots_solver
-from logs.flight_data import FlightData
-from logs.path3d import path_3d
-from logs.plots import POINTS, along
-from logs.plots_control import picture
-from logs.summary import summarise
-from logs.svg import colour
-from logs.topics import RecorderNote
-from logs.verdict_clock import plain
-from logs.verdict_link import judge_link
-from logs.verdicts import judge
-from uavctl.data import ControlMode, Decision
+from logs.recording.flight import FlightData
+from logs.recording.summary import summarise
+from logs.recording.topics import RecorderNote
+from logs.report import figures as plots_link
+from logs.report import figures as plots_solver
+from logs.report import plots
+from logs.report.figures import picture
+from logs.report.plots import POINTS, along, path_3d
+from logs.report.svg import colour
+from logs.report.verdicts import judge, judge_link, plain
+from uavctl.records import ControlMode, Decision
 
 
 @pytest.fixture(scope="module")

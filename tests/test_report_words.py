@@ -11,13 +11,14 @@ from report_rig import words_of
 from synthetic_flight import fly
 from synthetic_scene import room
 
-from logs.digits import number
-from logs.flight_data import FlightData
-from logs.summary import Spread, predicted_only, rows, summarise
-from logs.words import story
+from logs.recording.flight import FlightData
+from logs.recording.summary import Percentiles, predicted_only, rows, summarise
+from logs.report.summary_text import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
-from uavctl.data import (
+from uavctl.flight.decision import MISSION_OVER
+from uavctl.labels import number
+from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,
     Decision,
@@ -29,7 +30,6 @@ from uavctl.data import (
     StepInput,
     Truth,
 )
-from uavctl.flight.decide import MISSION_OVER
 
 TICK_S = room().tick_s
 
@@ -122,7 +122,7 @@ def test_what_went_amiss_is_told() -> None:
     flight = FlightData.from_records(fly(room(), 4.0))
     good = summarise(flight, wall_s=1.0)
     assert not any("missed" in sentence or "dropped" in sentence for sentence in story(flight, good))
-    times = Spread(p50=100.0, p99=900.0, max=73_400.0)
+    times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
     bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
     told = story(flight, bad)
     assert "3 ticks were missed; the latest tick began 73.4 ms late." in told

@@ -12,16 +12,14 @@ from baseline_rig import problem
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from uavctl.campaign.cells import Cell
-from uavctl.campaign.tasks import fly_task, tasks_of
-from uavctl.smpc.age_risk import age_risk
-from uavctl.smpc.allocation import quantile
-from uavctl.smpc.baselines.problem import unseen
-from uavctl.smpc.conditioned import ConditionedSolver
-from uavctl.smpc.innovation import innovations
+from uavctl.lab.campaign.tasks import Cell, fly_task, tasks_of
+from uavctl.smpc.conditioned.backoffs import SLACK, rest_backoffs
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.conditioned.program import SlewRows
+from uavctl.smpc.conditioned.risk import age_risk, quantile
+from uavctl.smpc.estimate import innovations
 from uavctl.smpc.link import AgeModel, bernoulli, gilbert_elliott
-from uavctl.smpc.rest_backoffs import SLACK, rest_backoffs
-from uavctl.smpc.slew import SlewRows
+from uavctl.smpc.nominal import unseen
 
 Array = NDArray[np.float64]
 ALLOWED = 0.05

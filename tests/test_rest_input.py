@@ -12,11 +12,10 @@ from scipy.optimize import linprog
 
 from uavctl.errors import DesignError
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import DesignSpec, make_design
-from uavctl.smpc.equilibria import rest_input
-from uavctl.smpc.sets import Polytope
-from uavctl.smpc.synthesis import synthesize, terminal_factors
+from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
+from uavctl.smpc.sets import Polytope, rest_input
 
 Array = NDArray[np.float64]
 
@@ -55,10 +54,7 @@ def some_rest_fits(given: DesignSpec) -> bool:
     x = given.plant.equilibrium(PLACE_M)
     limits = list(zip(*np.split(given.input_set.b, 2), strict=True))
     found = linprog(
-        np.zeros(2),
-        A_eq=given.plant.b,
-        b_eq=x - given.plant.a @ x,
-        bounds=[(-lower, upper) for upper, lower in limits],
+        np.zeros(2), A_eq=given.plant.b, b_eq=x - given.plant.a @ x, bounds=[(-lower, upper) for upper, lower in limits]
     )
     return bool(found.status == 0)
 

@@ -9,10 +9,9 @@ import pytest
 from design_rig import spec
 from scipy.stats import chi2, norm
 
-from uavctl.compare import RISK_OPTIONS, RiskComparison, RiskReport, compare_risk
 from uavctl.errors import DesignError
-from uavctl.smpc.design import make_design
-from uavctl.smpc.risk import Allocation, component_kappa, kappa
+from uavctl.lab.compare_designs import RISK_OPTIONS, RiskComparison, RiskReport, compare_risk
+from uavctl.smpc.hahn_stursberg.design import Allocation, component_kappa, kappa, make_design
 from uavctl.smpc.sets import Polytope
 
 START = np.array([35.0, -2.0, -20.0, -4.0])

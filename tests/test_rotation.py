@@ -13,21 +13,20 @@ from loopback_rig import header as made_header
 from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own
 
-from logs.disk import DiskFile, RoomWatch
-from logs.info import info
-from logs.onlookers import Onlookers
-from logs.reader import header, read, records, segment_files
-from logs.recorder import SyncRecorder
-from logs.recover import recover
-from logs.segment import Entry, Segment
-from logs.topics import RecorderNote, definition
-from logs.view_topics import LOG
-from logs.views import Views
-from uavctl.build import build_design
+from logs.recording.derived_topics import LOG
+from logs.recording.disk import DiskFile, RoomWatch
+from logs.recording.info import info
+from logs.recording.reader import header, read, records, segment_files
+from logs.recording.recorder import DerivedTopics, SyncRecorder
+from logs.recording.recover import recover
+from logs.recording.segment import QueuedMessage, Segment
+from logs.recording.topics import RecorderNote, definition
+from logs.recording.views import Views
+from uavctl.build.controller import build_design
 from uavctl.config import load_config
-from uavctl.config.log import LogConfig
-from uavctl.data import PolicyLibrary
+from uavctl.config.types import LogConfig
 from uavctl.errors import ConfigError, RecordingError
+from uavctl.records import PolicyLibrary
 
 SMALL = LogConfig(chunk_bytes=1024, segment_bytes=6000)
 LOW, STOP = 3000, 1000
@@ -168,7 +167,7 @@ def test_an_index_takes_few_bytes_of_memory(tmp_path: Path) -> None:
     tracemalloc.start()
     try:
         for number in range(4000):
-            segment.add(Entry(kinds[number % 4], number + 1, number, bytes(400)))
+            segment.add(QueuedMessage(kinds[number % 4], number + 1, number, bytes(400)))
         grown, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -258,7 +257,7 @@ def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
 def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     seen: list[tuple[str, bytes]] = []
     room, clock = Room(), Clock()
-    looking = Onlookers(Views(), lambda definition, _, data: seen.append((definition.topic, data)))
+    looking = DerivedTopics(Views(), lambda definition, _, data: seen.append((definition.topic, data)))
     log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
     recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, onlookers=looking)
     loaded = load_config("room-hahn-stursberg")

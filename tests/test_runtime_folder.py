@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 from user_rig import OTHER, as_other, shared_folder
 
-from uavctl import runtime_folder
+from uavctl.daemon import lock as runtime_folder
+from uavctl.daemon.lock import is_own, lock_paths, runtime_folders, sole_daemon
 from uavctl.errors import UsageError, VehicleTakenError
-from uavctl.lock import lock_paths, sole_daemon
-from uavctl.runtime_folder import is_own, runtime_folders
 
 URL = "udpin://127.0.0.1:14540"
 ME = os.geteuid()

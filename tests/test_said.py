@@ -6,11 +6,11 @@ import pytest
 from loopback_rig import Memory, make_loop
 from mavlink_rig import Peer, events, make_link, packets
 
-from uavctl.cli.said import AGAIN_NS, Said, waits_for
+from uavctl.cli.flying import AGAIN_NS, Said, waits_for
 from uavctl.config import load_config
-from uavctl.data import Event, Severity
-from uavctl.mavlink.mode import State
-from uavctl.mavlink.texts import LOST, MOST, WAIT_NS
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.vehicle import LOST, MOST, WAIT_NS
+from uavctl.records import Event, Severity
 
 SECOND = 1_000_000_000
 NOT_NEUTRAL = "Arm: Throttle (RC3) is not neutral"
@@ -25,24 +25,26 @@ def test_a_refusal_that_goes_on_is_said_at_once_and_again_after_a_while() -> Non
     """As observed: ArduPilot refused 26 times in 54 s."""
     said = Said()
     times = [round(n * 54 / 25 * SECOND) for n in range(26)]
-    told = [at_ns for at_ns in times if said.line(words(at_ns), State.ARMING)]
+    told = [at_ns for at_ns in times if said.line(words(at_ns), HandoverState.ARMING)]
     again = next(at_ns for at_ns in times if at_ns >= AGAIN_NS)
     assert told == [0, again]
 
 
 def test_it_is_said_in_the_vehicle_s_words_with_what_is_waited_for() -> None:
-    line = Said().line(words(0), State.ARMING)
-    assert line is not None and NOT_NEUTRAL in line and waits_for(State.ARMING) in line
-    flying = Said().line(words(0), State.ENGAGED)
+    line = Said().line(words(0), HandoverState.ARMING)
+    assert line is not None and NOT_NEUTRAL in line and waits_for(HandoverState.ARMING) in line
+    flying = Said().line(words(0), HandoverState.ENGAGED)
     assert flying is not None and "waiting" not in flying
 
 
 def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:
     said = Said()
-    assert said.line(words(0), State.ARMING) and said.line(words(0, "Arm: VisOdom: not healthy"), State.ARMING)
-    assert said.line(words(0, "Arming motors", Severity.INFO), State.ARMING) is None
+    assert said.line(words(0), HandoverState.ARMING) and said.line(
+        words(0, "Arm: VisOdom: not healthy"), HandoverState.ARMING
+    )
+    assert said.line(words(0, "Arming motors", Severity.INFO), HandoverState.ARMING) is None
     for n in range(10_000):
-        said.line(words(n, f"text {n}"), State.ARMING)
+        said.line(words(n, f"text {n}"), HandoverState.ARMING)
     assert len(said._said_ns) < 1000
 
 
@@ -56,7 +58,7 @@ def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
         begun_ns = begun_ns or at_ns
         loop.receive("vehicle", data, at_ns)
         while loop.news:
-            line = said.line(loop.news.popleft(), State.ARMING)
+            line = said.line(loop.news.popleft(), HandoverState.ARMING)
             if line is not None:
                 lines[line] = (at_ns - begun_ns) * 1e-9
     assert len(lines) == 1

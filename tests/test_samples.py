@@ -10,20 +10,25 @@ import pytest
 from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, vehicle
 from msgspec import structs
 
-from uavctl.data import PositionSample, StepInput, Vec3, VehicleMotion
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
-from uavctl.flight.reach import GateParameters
-from uavctl.flight.samples import Intake, Trust, take
-from uavctl.flight.stuck import FROZEN, REPEATED
+from uavctl.flight.gating import FROZEN, REPEATED, GateParameters, MeasurementUpdate, SourceHealth, take
+from uavctl.records import PositionSample, StepInput, Vec3, VehicleMotion
 
 CONTROLLER = make_controller()
 
 
-def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> Intake:
+def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> MeasurementUpdate:
     """Intake after several ticks, each (time in ms, samples)."""
     history = begin(CONTROLLER.kalman, START_NS, START_NS)
-    intake = Intake(
-        history=history, trust=Trust(), moved=False, absurd=False, accepted=(), refused=(), clean_ns=None, fresh=0
+    intake = MeasurementUpdate(
+        history=history,
+        trust=SourceHealth(),
+        moved=False,
+        absurd=False,
+        accepted=(),
+        refused=(),
+        clean_ns=None,
+        fresh=0,
     )
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
@@ -90,7 +95,7 @@ def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_t
 
 def pushed(
     says: dict[str, int], ticks: int, *, believes: bool = True, own: Vec3 | None = None, at_rest_mps: float = 0.0
-) -> list[Intake]:
+) -> list[MeasurementUpdate]:
     """Cameras, some millimetres off, of a vehicle pushed north from tick 12 on; each says the same from a tick on.
 
     A tick of -1 is never. Where they are not to be believed, what is said again does not come. `own` is the velocity
@@ -101,8 +106,15 @@ def pushed(
     history = begin(controller.kalman, START_NS, START_NS)
     a, b, _ = controller.plant.transition(TICK_NS * 1e-9)
     x, intakes, last = np.zeros(3), [], dict.fromkeys(says, 0.0)
-    intake = Intake(
-        history=history, trust=Trust(), moved=False, absurd=False, accepted=(), refused=(), clean_ns=None, fresh=0
+    intake = MeasurementUpdate(
+        history=history,
+        trust=SourceHealth(),
+        moved=False,
+        absurd=False,
+        accepted=(),
+        refused=(),
+        clean_ns=None,
+        fresh=0,
     )
     for tick in range(ticks):
         at_ns, samples = START_NS + tick * TICK_NS, []
@@ -121,7 +133,7 @@ def pushed(
     return intakes
 
 
-def refused_as(intake: Intake) -> set[str]:
+def refused_as(intake: MeasurementUpdate) -> set[str]:
     return {why for _, why in intake.refused}
 
 
@@ -171,11 +183,11 @@ def test_what_others_said_meanwhile_is_kept() -> None:
     assert found[-1].history.captured_ns == START_NS + 39 * TICK_NS
 
 
-def flown_on(values: dict[int, float], ticks: int) -> list[Intake]:
+def flown_on(values: dict[int, float], ticks: int) -> list[MeasurementUpdate]:
     """Ticks that push all the time, and what a camera says in some of them (north) [m]."""
     controller = replace(make_controller(), trust=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
-    intakes: list[Intake] = []
-    history, trust = begin(controller.kalman, START_NS, START_NS), Trust()
+    intakes: list[MeasurementUpdate] = []
+    history, trust = begin(controller.kalman, START_NS, START_NS), SourceHealth()
     for tick in range(ticks):
         at_ns = START_NS + tick * TICK_NS
         said = (sample(at_ns, position_m=(values[tick], 0.0, 0.0)),) if tick in values else ()

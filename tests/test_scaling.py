@@ -11,12 +11,12 @@ from optimisation_cases import ORIGIN, ROOM_CORNER, ROOM_TARGET, START, paper, p
 from plant_cases import SHAPES, case, kept
 from plant_units import Units, design_in_units, in_units
 
-from uavctl.data import SolveStatus
-from uavctl.smpc import conic_settings
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design, make_design
-from uavctl.smpc.scaling import equilibrated
+from uavctl.smpc.hahn_stursberg import cones as conic_settings
+from uavctl.smpc.hahn_stursberg.design import Design, make_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.sets import equilibrated
 
 Array = NDArray[np.float64]
 
@@ -146,7 +146,7 @@ def test_a_target_far_away_is_approached() -> None:
 def test_a_hard_answer_is_the_same_wherever_the_numbers_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """The origin that large numbers are relative to is no part of the problem."""
     made = case("coupled 0")
-    monkeypatch.setattr("uavctl.smpc.scaling._USUAL", 0.0)
+    monkeypatch.setattr("uavctl.smpc.sets._USUAL", 0.0)
     moved = ConicSolver(made.design).solve(0, made.x, made.design.target)
     assert kept(moved)
     assert moved.cost == pytest.approx(made.answer.cost, rel=1e-7)

@@ -12,22 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
+from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed, greedy, nested
 from uavctl.smpc.link import bernoulli, gilbert_elliott
-from uavctl.smpc.schedule import Demand, fixed, greedy, nested
 
 Array = NDArray[np.float64]
 H = 12
 
 
 def demand(
-    tau: int = 4,
-    horizon: int = H,
-    p: float = 0.7,
-    delta_x: float = 0.95,
-    delta_u: float = 0.9,
-    joint: bool = False,
-) -> Demand:
-    return Demand(bernoulli(np.array([p])), horizon, tau, delta_x, delta_u, joint)
+    tau: int = 4, horizon: int = H, p: float = 0.7, delta_x: float = 0.95, delta_u: float = 0.9, joint: bool = False
+) -> ScheduleDemand:
+    return ScheduleDemand(bernoulli(np.array([p])), horizon, tau, delta_x, delta_u, joint)
 
 
 def test_fixed_delay_of_the_paper() -> None:
@@ -49,7 +44,7 @@ def test_likelihoods_multiply_back_to_the_deltas() -> None:
 
 def test_varying_link_enters_stage_by_stage() -> None:
     p = np.array([0.7, 0.9, 0.8, 0.95, 0.7, 0.9, 0.99, 0.9])
-    schedule = fixed(Demand(bernoulli(p), 8, 2, 0.9, 0.9), 3)
+    schedule = fixed(ScheduleDemand(bernoulli(p), 8, 2, 0.9, 0.9), 3)
     # a(k+t) > 2 if the packets of t, t-1 and t-2 are all lost
     expected = [1.0] * 3 + [1.0 - float(np.prod(1.0 - p[t - 3 : t])) for t in range(3, 8)]
     np.testing.assert_allclose(schedule.alpha, expected)
@@ -125,7 +120,7 @@ def test_short_horizon_feeds_nothing_back() -> None:
         (4, demand(tau=3), r"smpc\.delta_x: 0\.95 is out of reach: .* 0\.9370"),
     ],
 )
-def test_a_schedule_that_cannot_be_is_refused(delays: int | list[int], given: Demand, message: str) -> None:
+def test_a_schedule_that_cannot_be_is_refused(delays: int | list[int], given: ScheduleDemand, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         fixed(given, delays)
 
@@ -204,7 +199,7 @@ def test_bursts_of_the_same_mean_loss_ask_for_more() -> None:
     # 10 % lost both ways; in bursts of four packets on average, the tails of the age are far longer.
     bursts = gilbert_elliott(enter=0.25 / 9, leave=0.25, good_loss=0.0, bad_loss=1.0)
     assert bursts.outage(1) == pytest.approx(0.1)
-    even, uneven = (fixed(Demand(link, H, 4, 0.85, 0.85), 5) for link in (bernoulli(np.array([0.9])), bursts))
+    even, uneven = (fixed(ScheduleDemand(link, H, 4, 0.85, 0.85), 5) for link in (bernoulli(np.array([0.9])), bursts))
     assert even.alpha.min() > 0.9999
     assert uneven.alpha.min() < 0.98
     assert np.all(uneven.gamma_x >= even.gamma_x)

@@ -15,17 +15,16 @@ from mavlink_rig import Peer
 from signing_rig import EPOCH_S, KEY, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, frames, make_signing, sign
 from test_daemon import Bench, Wire
 
-from logs.encoding import encode
-from logs.replay import replay
+from logs.recording.replay import replay
+from logs.recording.topics import encode
 from uavctl.clock import Ticker
 from uavctl.config import load_config
-from uavctl.daemon import fly
-from uavctl.data import ControlMode, Datagram, Decision, Event, LinkStats, Refused, Setpoint
+from uavctl.daemon.daemon import fly
 from uavctl.errors import ConnectionSpecError, KeyFileError
-from uavctl.mavlink.gate import Gate
-from uavctl.mavlink.signing import NEWEST_STAMP, Signing, SigningKey, Stamps
-from uavctl.sealed import Sealed, connected, sealed
-from uavctl.transport import Connection
+from uavctl.io.base import Connection
+from uavctl.io.signed_connection import Sealed, connected, sealed
+from uavctl.mavlink.signing import NEWEST_STAMP, Gate, Signing, SigningKey, Stamps
+from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Refused, Setpoint
 
 VEHICLE_ON_HOLD = {"custom_mode": (4 << 16) | (3 << 24)}
 

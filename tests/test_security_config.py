@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from uavctl.config import load_config
+from uavctl.config.connections import SecurityConfig, warnings
 from uavctl.config.load import dump_config
-from uavctl.config.security import SecurityConfig, warnings
 from uavctl.errors import ConfigError
 
 UDP = ("daemon.vehicle=udpin://0.0.0.0:14540", "daemon.mocap=udpin://0.0.0.0:14560")

@@ -10,9 +10,9 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from recording_fakes import record_flight
 
-from logs.disk import DiskFile, check_room, later_segments, segment_path
-from logs.segment import Entry, Segment
-from logs.topics import definition
+from logs.recording.disk import DiskFile, check_room, later_segments, segment_path
+from logs.recording.segment import QueuedMessage, Segment
+from logs.recording.topics import definition
 from uavctl.errors import RecordingError
 
 
@@ -95,7 +95,7 @@ def test_message_larger_than_a_chunk_has_its_own(tmp_path: Path) -> None:
     path = tmp_path / "big.mcap"
     segment = Segment(DiskFile(path), 1024)
     for number, size in enumerate((10, 5000, 10, 10), 1):
-        segment.add(Entry(definition("/raw/vehicle/in"), number, number, bytes(size)))
+        segment.add(QueuedMessage(definition("/raw/vehicle/in"), number, number, bytes(size)))
     segment.finish()
     counts = [sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks(path)]
     assert counts == [1, 1, 2]

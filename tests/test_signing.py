@@ -5,25 +5,13 @@ from __future__ import annotations
 import pytest
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from signing_rig import (
-    EPOCH_S,
-    KEY,
-    NOW_S,
-    OFFSET_NS,
-    OTHER_KEY,
-    SECOND,
-    STAMP,
-    SignedPeer,
-    make_signing,
-    seal,
-    sign,
-)
+from signing_rig import EPOCH_S, KEY, NOW_S, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, make_signing, seal, sign
 
 from uavctl.mavlink.signing import (
     MAX_STREAMS,
     NEWEST_STAMP,
     SKEW,
-    Refusal,
+    SignatureRefusal,
     Signing,
     SigningKey,
     Stamps,
@@ -89,7 +77,7 @@ def test_a_stamp_counts_whole_units_since_2015_and_none_before(wall_ns: int, sta
 @pytest.mark.fault(37)
 def test_where_nothing_was_kept_only_a_stamp_of_zero_is_old() -> None:
     early = Signing(SigningKey(KEY), 7, Stamps(), 0)
-    assert early.verify(sign(Peer().heartbeat(), 0), 0) is Refusal.REPLAYED
+    assert early.verify(sign(Peer().heartbeat(), 0), 0) is SignatureRefusal.REPLAYED
     assert early.verify(sign(Peer().heartbeat(), 1), 0) is None
 
 
@@ -115,13 +103,13 @@ def test_no_bit_of_a_signed_frame_can_be_changed() -> None:
     for bit in range(8 * len(frame)):
         forged = bytearray(frame)
         forged[bit // 8] ^= 1 << bit % 8
-        assert signing.verify(bytes(forged), 0) is Refusal.FORGED
+        assert signing.verify(bytes(forged), 0) is SignatureRefusal.FORGED
     assert signing.verify(frame, 0) is None
 
 
 @pytest.mark.fault(36)
 def test_another_key_is_no_key() -> None:
-    assert make_signing().verify(SignedPeer(OTHER_KEY).heartbeat(), 0) is Refusal.FORGED
+    assert make_signing().verify(SignedPeer(OTHER_KEY).heartbeat(), 0) is SignatureRefusal.FORGED
 
 
 @pytest.mark.fault(37)
@@ -129,9 +117,9 @@ def test_a_frame_is_taken_once_and_an_older_one_never() -> None:
     peer, signing = SignedPeer(), make_signing()
     sent = [peer.heartbeat() for _ in range(50)]
     assert signing.verify(sent[10], 0) is None
-    assert [signing.verify(frame, 0) for frame in sent[:11]] == [Refusal.REPLAYED] * 11
+    assert [signing.verify(frame, 0) for frame in sent[:11]] == [SignatureRefusal.REPLAYED] * 11
     assert [signing.verify(frame, 0) for frame in sent[11:]] == [None] * 39
-    assert {signing.verify(frame, 0) for frame in sent} == {Refusal.REPLAYED}
+    assert {signing.verify(frame, 0) for frame in sent} == {SignatureRefusal.REPLAYED}
 
 
 @pytest.mark.fault(37)
@@ -140,7 +128,7 @@ def test_a_frame_of_another_link_is_not_taken_over_to_this_one() -> None:
     assert signing.verify(here.heartbeat(), 0) is None
     for link_id in (2, 4):
         there = SignedPeer(link_id=link_id, stamp=STAMP + 5)
-        assert signing.verify(there.heartbeat(), 0) is Refusal.LINK_ID
+        assert signing.verify(there.heartbeat(), 0) is SignatureRefusal.LINK_ID
     assert signing.verify(here.heartbeat(), 0) is None
     camera = SignedPeer(link_id=4, system=17)  # another system has links of its own, and so has each of its parts
     gimbal = SignedPeer(link_id=5, component=154)
@@ -152,7 +140,7 @@ def test_a_frame_of_another_link_is_not_taken_over_to_this_one() -> None:
 def test_link_ids_of_peers_can_be_given() -> None:
     signing = make_signing(peer_link_ids=(4, 5))
     verdicts = [signing.verify(SignedPeer(link_id=link, stamp=STAMP).heartbeat(), 0) for link in (3, 4, 5, 6)]
-    assert verdicts == [Refusal.LINK_ID, None, None, Refusal.LINK_ID]
+    assert verdicts == [SignatureRefusal.LINK_ID, None, None, SignatureRefusal.LINK_ID]
 
 
 @pytest.mark.fault(37)
@@ -165,7 +153,7 @@ def test_genuine_frames_that_somebody_brings_elsewhere_first_are_not_old_here() 
         frame = peer.heartbeat()
         assert elsewhere.verify(frame, 0) is None
         assert here.verify(frame, 0) is None
-        assert {one.verify(frame, 0) for one in (here, elsewhere)} == {Refusal.REPLAYED}
+        assert {one.verify(frame, 0) for one in (here, elsewhere)} == {SignatureRefusal.REPLAYED}
 
 
 @pytest.mark.fault(37)
@@ -175,7 +163,7 @@ def test_old_frames_of_one_connection_are_none_of_another() -> None:
     old, new = SignedPeer(), SignedPeer(stamp=STAMP + SKEW + 100)
     kept = [old.heartbeat() for _ in range(10)]
     assert here.verify(new.heartbeat(), 0) is None
-    assert {elsewhere.verify(frame, 0) for frame in kept} == {Refusal.REPLAYED}
+    assert {elsewhere.verify(frame, 0) for frame in kept} == {SignatureRefusal.REPLAYED}
     assert elsewhere.verify(new.heartbeat(), 0) is None
 
 
@@ -183,11 +171,11 @@ def test_old_frames_of_one_connection_are_none_of_another() -> None:
 def test_a_stream_begins_at_most_a_minute_behind() -> None:
     signing = make_signing()
     behind = STAMP - MINUTE
-    assert signing.verify(SignedPeer(stamp=behind - 1).heartbeat(), 0) is Refusal.STALE
+    assert signing.verify(SignedPeer(stamp=behind - 1).heartbeat(), 0) is SignatureRefusal.STALE
     assert signing.verify(SignedPeer(stamp=behind).heartbeat(), 0) is None
     # One that has begun may fall back as far as it likes: its own stamps have to grow, that is all.
     assert signing.verify(SignedPeer(stamp=behind + 1).heartbeat(), 3600 * 10**9) is None
-    assert signing.verify(SignedPeer(stamp=behind + 2, system=2).heartbeat(), 3600 * 10**9) is Refusal.STALE
+    assert signing.verify(SignedPeer(stamp=behind + 2, system=2).heartbeat(), 3600 * 10**9) is SignatureRefusal.STALE
 
 
 @pytest.mark.fault(37)
@@ -198,20 +186,20 @@ def test_nothing_from_before_the_start_is_taken() -> None:
     old = [peer.heartbeat() for _ in range(20)] + [camera.vision(5)]
     assert [first.verify(frame, 0) for frame in old] == [None] * 21
     again = make_signing(Stamps(floor=before.own, own=before.own))
-    assert {again.verify(frame, 0) for frame in old} == {Refusal.REPLAYED}
-    assert again.verify(camera.vision(6), 0) is Refusal.REPLAYED  # behind the others: it has to hear us first
+    assert {again.verify(frame, 0) for frame in old} == {SignatureRefusal.REPLAYED}
+    assert again.verify(camera.vision(6), 0) is SignatureRefusal.REPLAYED  # behind the others: it has to hear us first
     assert again.verify(peer.heartbeat(), 0) is None
 
 
 def test_our_stamp_follows_the_newest_that_was_verified() -> None:
     signing, frame = make_signing(), Peer(245, 25).heartbeat()
     hour = 3600 * SECOND
-    assert signing.verify(SignedPeer(OTHER_KEY, STAMP + 2 * hour).heartbeat(), 0) is Refusal.FORGED
+    assert signing.verify(SignedPeer(OTHER_KEY, STAMP + 2 * hour).heartbeat(), 0) is SignatureRefusal.FORGED
     assert stamp_of(signing.sign(frame, 0)) == STAMP
     assert signing.verify(SignedPeer(stamp=STAMP + hour).heartbeat(), 0) is None
     assert stamp_of(signing.sign(frame, 0)) == STAMP + hour + 1
     # ... and then a new stream is measured against it.
-    assert signing.verify(SignedPeer(stamp=STAMP, system=2).heartbeat(), 0) is Refusal.STALE
+    assert signing.verify(SignedPeer(stamp=STAMP, system=2).heartbeat(), 0) is SignatureRefusal.STALE
 
 
 @pytest.mark.fault(38)
@@ -219,7 +207,7 @@ def test_a_forged_stamp_from_the_future_locks_nobody_out() -> None:
     genuine, signing = SignedPeer(), make_signing()
     forged = SignedPeer(OTHER_KEY, NEWEST_STAMP - 5).heartbeat()
     assert signing.verify(genuine.heartbeat(), 0) is None
-    assert signing.verify(forged, 0) is Refusal.FORGED
+    assert signing.verify(forged, 0) is SignatureRefusal.FORGED
     assert [signing.verify(genuine.heartbeat(), n * 10**6) for n in range(1000)] == [None] * 1000
 
 
@@ -246,7 +234,9 @@ def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
     first = [SignedPeer(system=1 + n // 250, component=1 + n % 250, stamp=STAMP + n).heartbeat() for n in range(300)]
     assert {signing.verify(frame, 0) for frame in first} == {None}
     assert len(stamps.streams) == len(signing._newest) == MAX_STREAMS
-    assert {signing.verify(frame, 0) for frame in first} == {Refusal.REPLAYED}  # also of those that are not kept
+    assert {signing.verify(frame, 0) for frame in first} == {
+        SignatureRefusal.REPLAYED
+    }  # also of those that are not kept
     late = SignedPeer(system=1, component=1, stamp=STAMP + 1000, link_id=9)
     assert signing.verify(late.heartbeat(), 0) is None  # one that was not kept may have another link id
     assert len(signing._links) <= MAX_STREAMS

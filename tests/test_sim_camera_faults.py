@@ -11,14 +11,14 @@ import pytest
 from msgspec.structs import replace
 from sim_rig import decode
 
-from sim.craft import LEVEL, Quaternion
-from sim.mocap import UPTIME_S, Cameras
-from sim.peers import MOCAP, Peers
+from sim.cameras import UPTIME_S, Cameras
+from sim.simulation import MOCAP, Peers
+from sim.vehicle.interface import LEVEL, Quaternion
 from uavctl.config import load_config
-from uavctl.config.peers import FrameConfig
+from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
-from uavctl.data import Vec3
 from uavctl.errors import ConfigError
+from uavctl.records import Vec3
 
 S = 1_000_000_000
 PLAIN = CameraConfig(rate_hz=10.0, message="odometry")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sim.channel import Channel
-from uavctl.config.section import Spans
-from uavctl.config.types import LinkConfig
+from uavctl.config.document import Spans
+from uavctl.config.link import LinkConfig
 
 MS = 1_000_000
 N = 50_000

@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, heartbeat
 
-from sim.parameters import TABLES
+from sim.autopilot.profile import TABLES
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
 RADIO = 1 << 16  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER

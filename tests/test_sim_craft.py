@@ -7,9 +7,9 @@ import math
 import pytest
 from sim_rig import CALM, bench
 
-from sim.craft import SteeredPlant, heading_rad, rotated
-from sim.peers import Peers
-from sim.vehicle import Vehicle
+from sim.simulation import Peers
+from sim.vehicle.interface import SteeredPlant, heading_rad, rotated
+from sim.vehicle.linear import LinearVehicle
 from uavctl.config import load_config
 
 AT = "sim.start_position_m=[0.0,0.0,-1.5]"
@@ -21,7 +21,7 @@ SHORT = 2.0 / 2.3
 
 def craft(*overrides: str) -> SteeredPlant:
     vehicle = Peers(load_config("room-hahn-stursberg", [*CALM, AT, *overrides]), 0).vehicle
-    assert isinstance(vehicle, Vehicle)
+    assert isinstance(vehicle, LinearVehicle)
     return SteeredPlant(vehicle)
 
 

@@ -12,13 +12,13 @@ import pytest
 from sim_rig import Bench, decode
 
 from sim.faults import problems
-from sim.peers import MOCAP, VEHICLE, Peers
-from sim.quadrotor import Quadrotor
+from sim.simulation import MOCAP, VEHICLE, Peers
+from sim.vehicle.quadrotor import Quadrotor
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
-from uavctl.config.fault_file import with_faults
-from uavctl.data import Truth
+from uavctl.config.load import with_faults
 from uavctl.errors import ConfigError
+from uavctl.records import Truth
 
 S = 1_000_000_000
 HEAD = ["link.loss=0", "link.jitter_s=0", "sim.camera.rate_hz=10", "sim.camera.phase_s=0"]
@@ -27,7 +27,8 @@ HEAD = ["link.loss=0", "link.jitter_s=0", "sim.camera.rate_hz=10", "sim.camera.p
 def config(*faults: str, plant: str = "linear", autopilot: str = "px4") -> Config:
     listed = ", ".join(f"{{{fault}}}" for fault in faults)
     return load_config(
-        "room-hahn-stursberg", [*HEAD, f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.fault=[{listed}]"]
+        "room-hahn-stursberg",
+        [*HEAD, f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", f"sim.fault=[{listed}]"],
     )
 
 

@@ -11,12 +11,11 @@ from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import LAND, Bench, Client, bench, decode
 
-from sim.fleet import fleet
-from sim.server import Ready, Seat, serve_all
+from sim.server import Ready, Seat, fleet, serve_all
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.data import Truth
 from uavctl.errors import ConfigError, ConnectionSpecError
+from uavctl.records import Truth
 
 ANY = "udpin://127.0.0.1:0"
 
@@ -108,7 +107,9 @@ class Station:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_only_it(autopilot: str) -> None:
     told: tuple[list[Truth], list[Truth]] = ([], [])
-    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"])
+    config = load_config(
+        "room-hahn-stursberg", [f"sim.autopilot.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"]
+    )
     pair = [
         Seat(one.config, one.vehicle, one.mocap, told[i].append)
         for i, one in enumerate(fleet(config, ANY, ANY, 2, ignore))

@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 from fuzz_rig import MAY_CHANGE, Judge
 
-from sim.parameters import Parameters
+from sim.autopilot.profile import Parameters
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])

@@ -10,9 +10,9 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 from sim_rig import decode
 
-from sim.craft import LEVEL, Quaternion
-from sim.mocap import UPTIME_S, Cameras
-from uavctl.config.peers import FrameConfig
+from sim.cameras import UPTIME_S, Cameras
+from sim.vehicle.interface import LEVEL, Quaternion
+from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
 from uavctl.errors import ConfigError
 

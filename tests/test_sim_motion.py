@@ -11,12 +11,12 @@ from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import S, quadrotor, run
 
-from sim.craft import LEVEL
-from sim.personality import PERSONALITIES
-from sim.quadrotor import Quadrotor
-from sim.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, Ask, Setpoint, interpret
-from uavctl.data import Vec3
-from uavctl.trial.own_loop import EXTERNAL_ONLY
+from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, interpret
+from sim.vehicle.interface import LEVEL
+from sim.vehicle.quadrotor import Quadrotor
+from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.records import Vec3
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 HERE: Vec3 = (1.0, 2.0, -3.0)
@@ -24,7 +24,7 @@ AHEAD: Vec3 = (0.5, -0.25, 0.125)
 CHANGE: Vec3 = (0.25, 0.5, -0.5)
 
 
-def told(name: str, mask: int, velocity: Vec3 = AHEAD, accel: Vec3 = CHANGE) -> Setpoint:
+def told(name: str, mask: int, velocity: Vec3 = AHEAD, accel: Vec3 = CHANGE) -> ParsedSetpoint:
     message = mavlink.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, mask, *HERE, *velocity, *accel, 0.0, 0.0
     )
@@ -34,9 +34,9 @@ def told(name: str, mask: int, velocity: Vec3 = AHEAD, accel: Vec3 = CHANGE) -> 
 @BOTH
 def test_a_position_alone_is_a_place_and_with_a_velocity_it_moves(name: str) -> None:
     place = told(name, IGNORE_VELOCITY | IGNORE_ACCEL)
-    assert (place.ask, place.vector, place.velocity_mps) == (Ask.POSITION, HERE, None)
+    assert (place.ask, place.vector, place.velocity_mps) == (SetpointKind.POSITION, HERE, None)
     moving = told(name, IGNORE_ACCEL)
-    assert (moving.ask, moving.vector) == (Ask.POSITION, HERE)
+    assert (moving.ask, moving.vector) == (SetpointKind.POSITION, HERE)
     assert (moving.velocity_mps, moving.accel_mps2) == (AHEAD, (0.0, 0.0, 0.0))
     assert told(name, 0).accel_mps2 == CHANGE
 
@@ -44,18 +44,14 @@ def test_a_position_alone_is_a_place_and_with_a_velocity_it_moves(name: str) -> 
 def test_a_velocity_that_is_no_number_is_left_out_by_px4_and_kills_ardupilot() -> None:
     broken = (math.nan, 0.0, 0.0)
     assert told("px4", IGNORE_ACCEL, velocity=broken).velocity_mps is None
-    assert told("ardupilot", IGNORE_ACCEL, velocity=broken).ask is Ask.FATAL
+    assert told("ardupilot", IGNORE_ACCEL, velocity=broken).ask is SetpointKind.FATAL
 
 
 def orbit(time_s: float) -> tuple[Vec3, Vec3, Vec3]:
     """A circle of 1 m in 8 s, from its westernmost point."""
     rate = math.tau / 8.0
     north, east = math.cos(rate * time_s), math.sin(rate * time_s)
-    return (
-        (north, east, -5.0),
-        (-rate * east, rate * north, 0.0),
-        (-rate * rate * north, -rate * rate * east, 0.0),
-    )
+    return ((north, east, -5.0), (-rate * east, rate * north, 0.0), (-rate * rate * north, -rate * rate * east, 0.0))
 
 
 @BOTH

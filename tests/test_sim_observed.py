@@ -13,8 +13,8 @@ from mavlink_rig import read
 from quadrotor_rig import quadrotor, steady
 from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, decode
 
-from logs.tlog import TlogPacket, read_tlog
-from sim.autopilot import Autopilot
+from logs.recording.tlog import TlogPacket, read_tlog
+from sim.autopilot.autopilot import Autopilot
 from uavctl.config import load_config
 
 DATA = Path(__file__).parent / "data"

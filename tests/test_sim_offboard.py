@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import SET_MODE, bench, flying
 
-from sim.setpoints import Ask, Setpoint
+from sim.autopilot.setpoints import ParsedSetpoint, SetpointKind
 
 OFFBOARD = (1, 6, 0)
 
@@ -60,5 +60,5 @@ def test_px4_flies_what_is_set_beside_numbers_that_are_none() -> None:
     assert flying(one) == (0.5, 0.0, 0.0)
     # A velocity with the force bit, which is about accelerations.
     one.send(one.client.pack(message(0, 1, 1, 1, 0xDC7 | 0x200, *nothing, 1.0, 0.0, 0.0, *nothing, 0.0, 0.0)))
-    assert one.peers.autopilot.pilot.helm.obeyed == Setpoint(Ask.VELOCITY, (1.0, 0.0, 0.0))
+    assert one.peers.autopilot.pilot.helm.obeyed == ParsedSetpoint(SetpointKind.VELOCITY, (1.0, 0.0, 0.0))
     assert one.texts == []

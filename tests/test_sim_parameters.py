@@ -11,7 +11,7 @@ import pytest
 from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.parameters import TABLES, Kind
+from sim.autopilot.profile import TABLES, ParameterType
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 # Of vehicles that were flown: what a ground check reads before take-off.
@@ -70,7 +70,7 @@ def test_px4_tells_a_digest_of_all_parameters_that_is_not_in_the_list() -> None:
     crc = 0
     for name in sorted(TABLES["px4"]):
         entry = TABLES["px4"][name]
-        form, value = ("<f", entry.value) if entry.kind is Kind.REAL32 else ("<i", int(entry.value))
+        form, value = ("<f", entry.value) if entry.kind is ParameterType.REAL32 else ("<i", int(entry.value))
         crc = zlib.crc32(name.encode() + struct.pack(form, value), crc)
     assert struct.unpack("<I", struct.pack("<f", answer.param_value)) == (crc,)
     assert (answer.param_index, answer.param_type) == (65535, mavlink.MAV_PARAM_TYPE_UINT32)

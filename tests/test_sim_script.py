@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.peers import MOCAP, Peers
-from sim.script import Script, ScriptedChannel
+from sim.simulation import MOCAP, Peers
+from sim.vehicle.linear import Script, ScriptedChannel
 from uavctl.config import load_config
-from uavctl.data import Truth
+from uavctl.records import Truth
 
 SECOND_NS = 1_000_000_000
 

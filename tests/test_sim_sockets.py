@@ -8,8 +8,8 @@ import pytest
 from patience import LIMIT_S
 from sim_rig import Client, bench
 
-from sim.personality import ARDUPILOT
-from sim.sockets import UdpPort, open_port
+from sim.autopilot.profile import ARDUPILOT
+from sim.server import UdpPort, open_port
 from uavctl.cli.app import run
 from uavctl.mavlink.codec import StreamDecoder
 from uavctl.mavlink.messages import Heartbeat

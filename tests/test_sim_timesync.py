@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.timesync import WINDOW, TimeSync
+from sim.autopilot.autopilot import WINDOW, PeerClock
 
 MS = 1_000_000
 OFFSET_NS = -7_123_456_789
@@ -12,7 +12,7 @@ PERIOD_NS = 100 * MS
 
 
 def answered(
-    sync: TimeSync, times: int, *, from_ns: int = 20_000 * MS, trip_ns: int = 2 * MS, extra_ns: int = 0
+    sync: PeerClock, times: int, *, from_ns: int = 20_000 * MS, trip_ns: int = 2 * MS, extra_ns: int = 0
 ) -> int:
     """Let it ask so often at 10 Hz a peer whose time is its own less `OFFSET_NS + extra_ns`; the time after that."""
     for n in range(times):
@@ -22,7 +22,7 @@ def answered(
 
 
 def test_until_500_answers_what_arrives_is_of_now_and_then_stamps_are_moved() -> None:
-    sync = TimeSync()
+    sync = PeerClock()
     now_ns = answered(sync, WINDOW - 1)
     assert not sync.converged and sync.moved_ns(12345, now_ns) == now_ns
     now_ns = answered(sync, 1, from_ns=now_ns)
@@ -32,21 +32,21 @@ def test_until_500_answers_what_arrives_is_of_now_and_then_stamps_are_moved() ->
 
 @pytest.mark.parametrize(("trip_ns", "counts"), [(0, True), (10 * MS - 1, True), (10 * MS, False), (-1, False)])
 def test_only_answers_that_were_back_in_less_than_10_ms_count(trip_ns: int, counts: bool) -> None:
-    sync = TimeSync()
+    sync = PeerClock()
     answered(sync, WINDOW, trip_ns=trip_ns)
     assert sync.converged is counts
 
 
 @pytest.mark.parametrize("theirs_ns", [0, -1, -(2**63)])
 def test_a_request_is_no_answer(theirs_ns: int) -> None:
-    sync = TimeSync()
+    sync = PeerClock()
     for n in range(WINDOW):
         sync.take(n * PERIOD_NS, theirs_ns, n * PERIOD_NS + MS)
     assert not sync.converged
 
 
 def test_five_answers_of_another_clock_are_dropped_and_the_sixth_begins_anew() -> None:
-    sync = TimeSync()
+    sync = PeerClock()
     now_ns = answered(sync, WINDOW)
     now_ns = answered(sync, 5, from_ns=now_ns, extra_ns=101 * MS)
     now_ns = answered(sync, 1, from_ns=now_ns)  # one of the old clock: five more are dropped
@@ -59,7 +59,7 @@ def test_five_answers_of_another_clock_are_dropped_and_the_sixth_begins_anew() -
 
 
 def test_a_clock_that_is_a_little_off_is_followed_with_half_a_millisecond_s_lag_at_most() -> None:
-    sync = TimeSync()
+    sync = PeerClock()
     now_ns, extra_ns = 20_000 * MS, 0
     for _ in range(3 * WINDOW):
         extra_ns += 1000  # 10 millionths

@@ -8,10 +8,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from sim.vehicle import MAX_ACCEL_MPS2, Vehicle, linear_model
+from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearVehicle, linear_model
 from uavctl.config import Config, load_config
-from uavctl.data import Vec3
 from uavctl.errors import DesignError
+from uavctl.records import Vec3
 
 S = 1_000_000_000
 Array = NDArray[np.float64]
@@ -23,8 +23,8 @@ DRAGGED = [
 ]
 
 
-def vehicle(config: Config, seed: int = 1, start_ns: int = 0) -> Vehicle:
-    return Vehicle(config, np.random.SeedSequence(seed), start_ns)
+def vehicle(config: Config, seed: int = 1, start_ns: int = 0) -> LinearVehicle:
+    return LinearVehicle(config, np.random.SeedSequence(seed), start_ns)
 
 
 def accels(n: int) -> list[Vec3]:

@@ -9,14 +9,14 @@ from patience import LIMIT_S
 from rich.console import Console
 from sim_rig import bench
 
-from sim.look import Look
 from sim.server import Seat, serve_all
+from sim.simulation import VehicleSnapshot
 from uavctl.cli.app import run
-from uavctl.cli.sim_view import LANDED, line, view, watching
+from uavctl.cli.sim import LANDED, line, view, watching
 from uavctl.config import load_config
 
 ANY = "udpin://127.0.0.1:0"
-ONE = Look(
+ONE = VehicleSnapshot(
     system_id=3,
     time_s=12.34,
     mode="OFFBOARD",
@@ -35,7 +35,7 @@ ONE = Look(
 TOLD = ("3", "OFFBOARD", "in the air", "+1.00 -2.50 -1.50", "87%", "245/25, 0.05 s ago", "600", "17", "blackout, wind")
 
 
-def drawn(*looks: Look, width: int = 250) -> str:
+def drawn(*looks: VehicleSnapshot, width: int = 250) -> str:
     console = Console(file=io.StringIO(), width=width)
     console.print(view(looks))
     assert isinstance(console.file, io.StringIO)
@@ -141,16 +141,9 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
 
 
 def test_looks_come_with_the_run_and_at_its_end() -> None:
-    looks: list[tuple[Look, ...]] = []
+    looks: list[tuple[VehicleSnapshot, ...]] = []
     seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda _: None)
-    serve_all(
-        (seat,),
-        duration_s=1.0,
-        airborne=True,
-        on_ready=lambda _: None,
-        stop=lambda: False,
-        on_look=looks.append,
-    )
+    serve_all((seat,), duration_s=1.0, airborne=True, on_ready=lambda _: None, stop=lambda: False, on_look=looks.append)
     times = [one.time_s for (one,) in looks]
     assert times == sorted(times)
     assert 3 <= len(times) <= 6 + 2  # at most four a second (the wait for the grid too), one at the end

@@ -9,26 +9,26 @@ import pytest
 from baseline_rig import problem
 from numpy.typing import NDArray
 
-from uavctl.data import GaveWay, SolveStatus
-from uavctl.naming import names_of, tell, worst
-from uavctl.smpc.answer import Outlook
-from uavctl.smpc.baselines import Problem
-from uavctl.smpc.baselines.problem import parts
-from uavctl.smpc.conditioned import ConditionedSolver
+from uavctl.labels import names_of, tell, worst
+from uavctl.records import GaveWay, SolveStatus
+from uavctl.smpc.answer import Preview
+from uavctl.smpc.baselines import ControlProblem
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import bernoulli
+from uavctl.smpc.nominal import parts
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.slew import SlewRows
 
 Array = NDArray[np.float64]
 LINK = bernoulli(np.array([0.7]))
 ROOM_MPS3 = 5.0
 
 
-def solver_of(given: Problem, slew_mps3: float) -> ConditionedSolver:
+def solver_of(given: ControlProblem, slew_mps3: float) -> ConditionedSolver:
     return ConditionedSolver(given, LINK, 0.05, slew_mps3=slew_mps3)
 
 
-def hard_states(given: Problem, count: int, seed: int) -> list[tuple[Array, Array, Array]]:
+def hard_states(given: ControlProblem, count: int, seed: int) -> list[tuple[Array, Array, Array]]:
     """States, targets and inputs last sent, all of them beyond limits too."""
     rng = np.random.default_rng(seed)
     low, high = (np.where(np.isfinite(side), side, 1.0) for side in given.state_set.bounds)
@@ -51,7 +51,7 @@ def test_there_is_a_plan_from_everywhere_and_its_setpoints_change_no_faster(name
     low, high = given.input_set.bounds
     relaxed = 0
     for seq, (x, target, sent) in enumerate(hard_states(given, 60, 3)):
-        answer = solver.solve(seq, x, target, Outlook(sent=sent))
+        answer = solver.solve(seq, x, target, Preview(sent=sent))
         assert answer.status is SolveStatus.OPTIMAL
         assert (answer.inputs >= low).all() and (answer.inputs <= high).all()
         assert np.abs(np.diff(answer.inputs, axis=0) @ d.T).max() <= side + 1e-8
@@ -74,7 +74,7 @@ def test_a_plan_ends_at_rest_when_the_gate_has_limited_it() -> None:
     a, b, _ = plant.transition(plant.dt_s / ticks)
     speeds = []
     for slew_mps3 in (np.inf, ROOM_MPS3):
-        answer = solver_of(given, slew_mps3).solve(0, x, target, Outlook(sent=np.zeros(3)))
+        answer = solver_of(given, slew_mps3).solve(0, x, target, Preview(sent=np.zeros(3)))
         state, sent, most = x, np.zeros(3), 0.0
         for t, want in enumerate(answer.inputs):
             for _ in range(ticks):
@@ -99,7 +99,7 @@ def test_without_a_word_of_what_was_sent_the_first_input_is_free() -> None:
     solver = solver_of(given, 0.5)
     x, target, _ = hard_states(given, 1, 4)[0]
     free = solver.solve(0, x, target).inputs
-    held = solver.solve(0, x, target, Outlook(sent=np.zeros(3))).inputs
+    held = solver.solve(0, x, target, Preview(sent=np.zeros(3))).inputs
     assert np.abs(free[0]).max() > 0.2 > 0.1 + 1e-8 >= np.abs(held[0]).max()
 
 
@@ -110,7 +110,7 @@ def test_axes_that_share_inputs_are_one_part() -> None:
     shared = replace(given, plant=mixed)
     assert len(parts(shared, SlewRows(mixed, given.input_set, 0.9).d)) == 1
     sent = np.array([6.0, -9.0])
-    answer = solver_of(shared, 0.9).solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Outlook(sent=sent))
+    answer = solver_of(shared, 0.9).solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Preview(sent=sent))
     change = np.diff(answer.inputs, axis=0, prepend=sent[None]) @ mixed.accel_map.T
     assert answer.status is SolveStatus.OPTIMAL
     assert np.abs(change[1:]).max() <= 0.9 + 1e-8
@@ -126,7 +126,7 @@ def test_the_first_rows_reach_a_set_of_inputs_that_is_no_box() -> None:
     assert at == pytest.approx([3.0 * scale, 0.0])
     assert side == pytest.approx([1.0 * scale, 0.1])
     solver = ConditionedSolver(replace(given, input_set=diamond), LINK, 0.05, slew_mps3=0.1)
-    answer = solver.solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Outlook(sent=np.array([3.0, 0.0])))
+    answer = solver.solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Preview(sent=np.array([3.0, 0.0])))
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.inputs[0] == pytest.approx([2.0, 0.0], abs=1e-6)
 

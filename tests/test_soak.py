@@ -17,10 +17,10 @@ from soak_rig import prepared_for
 from soak_take_off import fly_take_off, outcome, tally_take_offs
 from take_off_rig import RELAYED, Flight
 
-from logs.reader import read
+from logs.recording.reader import read
 from uavctl.cli.prepare import Prepared
-from uavctl.data import Truth, Vec3
-from uavctl.mavlink.mode import State
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.records import Truth, Vec3
 
 TOOL = Path(__file__).parent.parent / "tools" / "soak.py"
 
@@ -83,11 +83,11 @@ def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch:
 
 def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes_it_for() -> None:
     flight = Flight("ardupilot", *RELAYED).relayed().take_off()
-    flight.run(30.0, until=State.ENGAGED).run(1.0)
+    flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
     assert outcome(flight) == "engaged"
     flight = Flight("ardupilot", *RELAYED).relayed().take_off()
     flight.hears = lambda data: not is_setpoint(data)
-    flight.run(30.0, until=State.ENGAGED).run(1.0)
+    flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
     assert outcome(flight) == "hovers"
 
 

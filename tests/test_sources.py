@@ -21,20 +21,20 @@ from natnet_server import UPTIME_S, Body, Server
 from patience import LIMIT_S, until
 
 from uavctl.config import Config, load_config
-from uavctl.config.security import warnings
-from uavctl.data import PositionSample
+from uavctl.config.connections import warnings
 from uavctl.errors import ConfigError, ConnectionSpecError
+from uavctl.io.admission import Rules
+from uavctl.io.base import Connection
+from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
+from uavctl.io.camera_host import OVERRUN, Host
+from uavctl.io.signed_connection import connected
+from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
-from uavctl.mavlink.link import Link
+from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Position
-from uavctl.sealed import connected
-from uavctl.sources import open_source
-from uavctl.sources.camera import Echo, Sight
-from uavctl.sources.host import OVERRUN, Host
-from uavctl.sources.pipe import COUNTS, READY
-from uavctl.transport import Connection, Rules
+from uavctl.records import PositionSample
 
-HOST = "uavctl.sources.host"
+HOST = "uavctl.io.camera_host"
 DRONE, OTHER = Body(7, "drone 1", (1.0, 1.5, 2.0)), Body(3, "table")
 
 
@@ -78,7 +78,7 @@ class Desk:
             self.connection.send(data)
 
 
-def off_ns(link: Link) -> float:
+def off_ns(link: MavlinkConnection) -> float:
     """Error of what the link believes of the server's clock."""
     return (link.stats(0).clock_offset_ns or 0) + UPTIME_S * 1e9
 
@@ -87,8 +87,8 @@ def age_ns(sample: PositionSample) -> int:
     return sample.received_ns - sample.captured_ns
 
 
-def make_link(config: Config) -> Link:
-    return Link(
+def make_link(config: Config) -> MavlinkConnection:
+    return MavlinkConnection(
         "mocap",
         roles=frozenset({"mocap"}),
         daemon=config.daemon,
@@ -167,7 +167,9 @@ def test_a_group_is_joined() -> None:
 
 def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() -> None:
     with Server([DRONE]) as server:
-        daemon = f"from uavctl.sources import open_source; c = open_source({url(server)!r}); print(flush=True); input()"
+        daemon = (
+            f"from uavctl.io.sources import open_source; c = open_source({url(server)!r}); print(flush=True); input()"
+        )
         command = [sys.executable, "-c", daemon]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
@@ -235,10 +237,10 @@ class Counting:
         self.taken = 0
         self.dropped: Counter[str] = Counter()
 
-    def receive(self, data: bytes, at_ns: int) -> tuple[Sight | Echo, ...]:
+    def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
         self.taken += 1
         self.ready = True
-        return (Sight(1000 * int(data), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),)
+        return (BodyPose(1000 * int(data), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         return (b"hello",)
@@ -283,7 +285,7 @@ def test_what_is_wrong_before_anything_is_started(monkeypatch: pytest.MonkeyPatc
         open_source("natnet://127.0.0.1")
     with pytest.raises(ConnectionSpecError, match=r"not in security\.allow"):
         open_source("natnet://127.0.0.1/drone", rules=Rules(allow=("10.0.0.0/8",)))
-    monkeypatch.setattr("uavctl.sources.piped.find_spec", lambda name: None)
+    monkeypatch.setattr("uavctl.io.sources.find_spec", lambda name: None)
     with pytest.raises(ConnectionSpecError, match=r"pip install 'uavctl\[optitrack\]'"):
         open_source("natnet://127.0.0.1/drone")
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from loopback_rig import lockstep
 
-from logs.outputs import spare_recording
-from logs.reader import finished
-from logs.recorder import SyncRecorder
-from logs.segment import MAGIC
+from logs.recording.outputs import spare_recording
+from logs.recording.reader import finished
+from logs.recording.recorder import SyncRecorder
+from logs.recording.segment import MAGIC
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError, UsageError
 

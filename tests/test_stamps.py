@@ -13,8 +13,8 @@ from patience import LIMIT_S
 from signing_rig import OFFSET_NS, STAMP, SignedPeer, make_signing
 
 from uavctl.errors import KeyFileError
-from uavctl.mavlink.signing import NEWEST_STAMP, Refusal
-from uavctl.stamps import AHEAD, LOCK_TRIES, RENEW, StampKeeper, load, save, state_folder
+from uavctl.io.signed_connection import AHEAD, LOCK_TRIES, RENEW, StampKeeper, load, save, state_folder
+from uavctl.mavlink.signing import NEWEST_STAMP, SignatureRefusal
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: p
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("uavctl.stamps.os.fsync", full)
+    monkeypatch.setattr("uavctl.io.signed_connection.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         save(path, STAMP + 1)
     assert load(path) == STAMP
@@ -101,7 +101,7 @@ def test_a_kill_at_any_moment_lets_no_old_frame_in_again(tmp_path: Path) -> None
             again = StampKeeper(path, 0, write=lambda path, stamp: None)
             again.close()
             restarted = make_signing(again.stamps)
-            assert {restarted.verify(frame, at_ns) for frame in taken} == {Refusal.REPLAYED}
+            assert {restarted.verify(frame, at_ns) for frame in taken} == {SignatureRefusal.REPLAYED}
             later = STAMP + (at_ns + 3 * 10**9) // 10_000
             assert restarted.verify(SignedPeer(stamp=later).heartbeat(), at_ns) is None
     finally:
@@ -191,7 +191,7 @@ def test_no_other_user_can_open_the_files_and_what_one_left_half_written_is_not_
 def test_a_lock_that_somebody_holds_keeps_no_daemon_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "key.stamp"
     pauses: list[float] = []
-    monkeypatch.setattr("uavctl.stamps.time.sleep", pauses.append)
+    monkeypatch.setattr("uavctl.io.signed_connection.time.sleep", pauses.append)
     with path.with_suffix(".lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(KeyFileError, match="Resource temporarily unavailable"):

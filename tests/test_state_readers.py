@@ -12,8 +12,8 @@ from mavlink_rig import NO_COVARIANCE, Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
-from sim.mocap import HALF_ROLL, euler, turn
-from uavctl.config.peers import FrameConfig
+from sim.cameras import HALF_ROLL, euler, turn
+from uavctl.config.connections import FrameConfig
 from uavctl.frames import Convention, Frame, Quaternion, from_euler, multiply, rotate, to_euler
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import AutopilotVersion, EstimatorFlags, Message, ParamValue, Position

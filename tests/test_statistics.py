@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from logs.statistics import (
+from logs.report.statistics import (
     LEVEL,
     at_least,
     autocorrelation,

@@ -27,8 +27,8 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, SetpointSource, SolveStatus, VehicleStatus
 from uavctl.flight.mission import Waypoint
+from uavctl.records import ControlMode, SetpointSource, SolveStatus, VehicleStatus
 
 WAIT, TRACK, BRAKE = ControlMode.WAIT, ControlMode.TRACK, ControlMode.BRAKE
 

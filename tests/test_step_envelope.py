@@ -26,11 +26,12 @@ from flight_rig import (
 )
 from msgspec.structs import replace
 
-from uavctl.data import ControlMode, Vec3, VehicleStatus
-from uavctl.flight import samples, step
+from uavctl.flight import gating as samples
+from uavctl.flight import step
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
-from uavctl.flight.fallback import End, Fallback
+from uavctl.flight.fallback import Fallback, FallbackEnd
+from uavctl.records import ControlMode, Vec3, VehicleStatus
 
 MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
 N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
@@ -118,7 +119,7 @@ def test_where_nothing_tells_whether_it_drifts_it_is_not_held_for_long(
 def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit_has_let_them_through(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def taking_back(*arguments: Any) -> samples.Intake:
+    def taking_back(*arguments: Any) -> samples.MeasurementUpdate:
         intake = samples.take(*arguments)
         tick = arguments[4].tick
         return replace(intake, clean_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
@@ -152,8 +153,10 @@ def test_what_is_not_believed_is_told_to_nobody(code: str, for_ns: int | None, s
     assert state.disbelieves == silent
 
 
-@pytest.mark.parametrize(("end", "silent"), [(End.RECOVER, False), (End.BARRED, True), (End.STOP, False)])
-def test_what_jumped_is_told_to_nobody(end: End, silent: bool) -> None:
+@pytest.mark.parametrize(
+    ("end", "silent"), [(FallbackEnd.RECOVER, False), (FallbackEnd.BARRED, True), (FallbackEnd.STOP, False)]
+)
+def test_what_jumped_is_told_to_nobody(end: FallbackEnd, silent: bool) -> None:
     fallback = Fallback(mode=ControlMode.BRAKE, since_ns=START_NS, end=end)
     assert ControlState(fallback=fallback).disbelieves == silent
     outside = Breach(OUTSIDE, "")

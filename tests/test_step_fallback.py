@@ -27,7 +27,7 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.data import ControlMode, SetpointSource, SolveStatus, VehicleStatus
+from uavctl.records import ControlMode, SetpointSource, SolveStatus, VehicleStatus
 
 WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
 

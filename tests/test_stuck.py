@@ -25,10 +25,10 @@ from flight_rig import (
 )
 from numpy.typing import NDArray
 
-from uavctl.data import ControlMode, StepInput, Vec3, VehicleStatus
-from uavctl.flight.reach import GateParameters
+from uavctl.flight.gating import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
-from uavctl.smpc.answer import NOMINAL, Answer, Outlook
+from uavctl.records import ControlMode, StepInput, Vec3, VehicleStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
 Array = NDArray[np.float64]
 Camera = Callable[[int, Vec3], Vec3]  # tick, truth -> what it says
@@ -45,7 +45,7 @@ class Steering(StubSolver):
         super().__init__(small_plant(), HORIZON)
         self.want, self.gain = want, gain
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         answer = super().solve(seq, x, target, outlook)
         u = float(np.clip(self.gain * (self.want(seq) - x[0]) - 1.2 * x[1] - 0.3 * x[2], -1.5, 1.5))
         return replace(answer, inputs=np.full_like(answer.inputs, u))
@@ -180,8 +180,7 @@ def test_row_14_a_world_without_noise_may_come_to_rest() -> None:
 
 @pytest.mark.fault(14)
 @pytest.mark.parametrize(
-    "status",
-    [vehicle(armed=False), msgspec.structs.replace(vehicle(external=False), landed=True)],
+    "status", [vehicle(armed=False), msgspec.structs.replace(vehicle(external=False), landed=True)]
 )
 def test_row_14_a_vehicle_on_the_ground_may_stand_still(status: VehicleStatus) -> None:
     camera = noisy()

@@ -9,11 +9,10 @@ import pytest
 from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sample, small_plant
 from msgspec.structs import replace
 
-from uavctl.data import PositionSample
 from uavctl.flight.estimator import absorb, begin, set_input
+from uavctl.flight.gating import GateParameters, Moved, Watch, Watches, doubtful, observe, stuck
 from uavctl.flight.kalman import Belief, make_kalman
-from uavctl.flight.reach import GateParameters
-from uavctl.flight.stuck import Moved, Watch, Watches, doubtful, observe, stuck
+from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 PLANT = small_plant()
@@ -141,14 +140,7 @@ ALWAYS: Moved = (2**62,) * 3  # it moves all the time
 
 
 @pytest.mark.parametrize(
-    ("moved_ns", "since"),
-    [
-        ((1, 2, 3), 1),
-        ((0, 2, 3), 3),
-        ((0, 9, 2), None),
-        ((0, 0, 9), 3),
-        ((9, 0, 0), 1),
-    ],
+    ("moved_ns", "since"), [((1, 2, 3), 1), ((0, 2, 3), 3), ((0, 9, 2), None), ((0, 0, 9), 3), ((9, 0, 0), 1)]
 )
 def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(moved_ns: Moved, since: int | None) -> None:
     watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))

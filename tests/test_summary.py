@@ -12,10 +12,12 @@ from rich.console import Console
 from synthetic_flight import Item, fly, header
 from synthetic_scene import paper, room
 
-from logs.digits import number, percent_above
-from logs.flight_data import FALLBACK, FlightData
-from logs.summary import FlightSummary, Spread, render, spread, summarise
-from uavctl.data import (
+from logs.recording.flight import FALLBACK, FlightData
+from logs.recording.summary import FlightSummary, Percentiles, render, spread, summarise
+from uavctl.errors import RecordingError
+from uavctl.flight.decision import MISSION_OVER
+from uavctl.labels import number, percent_above
+from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,
     Decision,
@@ -30,8 +32,6 @@ from uavctl.data import (
     Timing,
     Truth,
 )
-from uavctl.errors import RecordingError
-from uavctl.flight.decide import MISSION_OVER
 
 DT_NS = 1_000_000_000
 EMPTY_COV = tuple((0.0,) * 4 for _ in range(4))
@@ -186,8 +186,7 @@ def test_violations_at_and_beyond_a_limit() -> None:
     beyond = 50.0 * (1 + 1e-8)
     states = [50.0, 50.0 * (1 + 1e-10), beyond, -30.0, -30.1, math.nan]
     s = figures(
-        *(decision(k) for k in range(len(states))),
-        *(truth(k, (x, 0.0, 0.0, 0.0)) for k, x in enumerate(states)),
+        *(decision(k) for k in range(len(states))), *(truth(k, (x, 0.0, 0.0, 0.0)) for k, x in enumerate(states))
     )
     assert s.state_violations == 3
     assert s.state_source == "truth"
@@ -243,7 +242,7 @@ def test_decision_times_are_those_of_ticks_that_solved() -> None:
 
 
 def test_spread_of_nothing_is_nothing() -> None:
-    assert spread(np.array([])) == Spread(p50=None, p99=None, max=None)
+    assert spread(np.array([])) == Percentiles(p50=None, p99=None, max=None)
 
 
 def test_one_tick_is_a_flight() -> None:

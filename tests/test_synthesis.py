@@ -12,14 +12,19 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from uavctl.errors import DesignError
-from uavctl.smpc.delayed_loop import DelayedLoop, Weight
-from uavctl.smpc.design import DesignSpec, make_design
-from uavctl.smpc.feasibility import check_schedule
-from uavctl.smpc.gain_search import MOST_FILLED
+from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.exact import check_schedule
+from uavctl.smpc.hahn_stursberg.synthesis import (
+    MOST_FILLED,
+    DelayedLoop,
+    Synthesis,
+    Weight,
+    synthesize,
+    terminal_factors,
+)
+from uavctl.smpc.hahn_stursberg.terminal import make_terminal, stationary_cost
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.synthesis import Synthesis, synthesize, terminal_factors
-from uavctl.smpc.terminal import make_terminal, stationary_cost
 
 Array = NDArray[np.float64]
 INF = np.inf

@@ -10,10 +10,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 from take_off_rig import GOAL, Flight
 
-from logs.replay import replay
-from sim.personality import PERSONALITIES, Role
-from uavctl.data import Command, ControlMode, Decision, Event, Order, Setpoint
-from uavctl.mavlink.mode import State
+from logs.recording.replay import replay
+from sim.autopilot.profile import PERSONALITIES, Role
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.records import Command, ControlMode, Decision, Event, Order, Setpoint
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 CRAFT = pytest.mark.parametrize("plant", ["linear", "quadrotor"])
@@ -30,9 +30,9 @@ def heartbeat(system: int) -> bytes:
 @CRAFT
 def test_the_whole_way(autopilot: str, plant: str) -> None:
     flight = Flight(autopilot, f"sim.plant={plant}").take_off().run(12.0)
-    assert flight.is_in(State.ENGAGED)
+    assert flight.is_in(HandoverState.ENGAGED)
     assert math.dist(flight.peers.vehicle.position_m, GOAL) < 0.3
-    flight.run(20.0, stop=True, until=State.DONE)
+    flight.run(20.0, stop=True, until=HandoverState.DONE)
     assert flight.loop.finished and not flight.loop.failure
     assert not flight.peers.autopilot.pilot.armed and flight.peers.autopilot.craft.landed
     went = ["ready", "asking for the mode", "arming", "climbing", "engaging", "engaged", "landing", "settling", "done"]
@@ -45,7 +45,7 @@ def test_the_whole_way(autopilot: str, plant: str) -> None:
 def test_the_same_flight_replays_identically(autopilot: str) -> None:
     flight = Flight(autopilot).take_off().run(6.0)
     flight.loop.order(Command(order=Order.GOTO, position_m=(0.0, 0.0, -1.0)))
-    flight.run(2.0).run(20.0, stop=True, until=State.DONE)
+    flight.run(2.0).run(20.0, stop=True, until=HandoverState.DONE)
     result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
     assert result.identical, result.first_difference
     assert result.decisions == flight.tick
@@ -53,7 +53,7 @@ def test_the_same_flight_replays_identically(autopilot: str) -> None:
 
 @BOTH
 def test_the_controller_waits_until_the_vehicle_is_handed_over(autopilot: str) -> None:
-    flight = Flight(autopilot).take_off().run(10.0, until=State.ENGAGED)
+    flight = Flight(autopilot).take_off().run(10.0, until=HandoverState.ENGAGED)
     assert {d.mode for d in flight.memory.of(Decision)} == {ControlMode.WAIT}
     assert {s.accel_mps2 for s in flight.memory.of(Setpoint)} == {(0.0, 0.0, 0.0)}
 
@@ -64,7 +64,7 @@ def test_px4_is_flown_before_it_has_climbed_to_its_own_height() -> None:
     for _ in range(160):
         flight.run(0.05)
         highest_m = max(highest_m, -flight.peers.vehicle.position_m[2])
-    assert flight.is_in(State.ENGAGED)
+    assert flight.is_in(HandoverState.ENGAGED)
     assert highest_m < 1.8  # MIS_TAKEOFF_ALT is 2.5 m
 
 
@@ -73,8 +73,10 @@ def test_px4_is_flown_before_it_has_climbed_to_its_own_height() -> None:
 
 @pytest.mark.fault(26)
 def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_own_words() -> None:
-    flight = Flight("px4", "hand_over.ground_s=6.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1").take_off()
-    flight.run(12.0, until=State.FAILED)
+    flight = Flight(
+        "px4", "hand_over.ground_s=6.0", "sim.plant=quadrotor", "sim.vehicle.quadrotor.charge=0.1"
+    ).take_off()
+    flight.run(12.0, until=HandoverState.FAILED)
     assert "low battery" in flight.loop.failure and "TEMPORARILY_REJECTED" in flight.loop.failure
     assert 2 <= flight.commands().count(ARM) <= 6
     assert flight.loop.finished and not flight.peers.autopilot.pilot.armed
@@ -84,7 +86,7 @@ def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_own_words() -> None:
 @BOTH
 def test_nothing_is_armed_without_fresh_positions(autopilot: str) -> None:
     flight = Flight(autopilot, "hand_over.ground_s=4.0", "link.blackout=[[0.0, 100.0]]").take_off()
-    flight.run(6.0, until=State.FAILED)
+    flight.run(6.0, until=HandoverState.FAILED)
     assert not flight.commands() and "position" in flight.loop.failure
 
 
@@ -93,7 +95,7 @@ def test_a_second_vehicle_on_the_link_refuses_arming() -> None:
     flight = Flight("px4").run(0.5)
     flight.loop.receive("vehicle", heartbeat(9), flight.now_ns)
     flight.run(1.2).take_off().run(1.0)
-    assert flight.is_in(State.FAILED) and "another vehicle" in flight.loop.failure
+    assert flight.is_in(HandoverState.FAILED) and "another vehicle" in flight.loop.failure
     assert flight.commands() == []
 
 
@@ -102,16 +104,16 @@ def test_px4_whose_setpoints_do_not_arrive_is_let_go_and_comes_back_by_order_onl
     flight = Flight("px4").take_off().run(6.0)
     setpoint = "SET_POSITION_TARGET_LOCAL_NED"
     flight.hears = lambda data: decode(data)[0].get_type() != setpoint
-    flight.run(4.0, until=State.FAILSAFE)
+    flight.run(4.0, until=HandoverState.FAILSAFE)
     released_ns = flight.now_ns
     flight.hears = lambda data: True
     flight.run(5.0)
-    assert flight.is_in(State.FAILSAFE) and not flight.setpoints_between(released_ns, flight.now_ns)
+    assert flight.is_in(HandoverState.FAILSAFE) and not flight.setpoints_between(released_ns, flight.now_ns)
     assert flight.commands().count(SET_MODE) == 2  # nothing is asked for
     flight.loop.order(Command(order=Order.ENGAGE))
-    flight.run(3.0, until=State.ENGAGED)
+    flight.run(3.0, until=HandoverState.ENGAGED)
     flight.run(4.0)
-    assert flight.is_in(State.ENGAGED) and math.dist(flight.peers.vehicle.position_m, GOAL) < 0.5
+    assert flight.is_in(HandoverState.ENGAGED) and math.dist(flight.peers.vehicle.position_m, GOAL) < 0.5
 
 
 @pytest.mark.fault(25)
@@ -120,10 +122,10 @@ def test_the_pilot_s_stick_ends_streaming_and_is_never_argued_with(autopilot: st
     flight = Flight(autopilot).take_off().run(7.0)
     before = flight.commands()
     flight.stick(mode)
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     released_ns = flight.now_ns
     flight.run(5.0)
-    assert flight.is_in(State.RELEASED) and flight.commands() == before
+    assert flight.is_in(HandoverState.RELEASED) and flight.commands() == before
     assert not flight.setpoints_between(released_ns, flight.now_ns)
     flight.run(2.0, stop=True)
     assert flight.loop.finished and flight.commands() == before  # nor asked to land
@@ -136,18 +138,18 @@ def test_the_vehicle_s_own_failsafe_has_precedence(autopilot: str) -> None:
     pilot = flight.peers.autopilot.pilot
     pilot.fail(PERSONALITIES[autopilot].by_role(Role.LAND), flight.now_ns)
     before = flight.commands()
-    flight.run(2.0, until=State.FAILSAFE)
-    flight.run(20.0, until=State.DONE)
+    flight.run(2.0, until=HandoverState.FAILSAFE)
+    flight.run(20.0, until=HandoverState.DONE)
     assert flight.commands() == before and not pilot.armed
     assert "failsafe" in flight.loop.failure
 
 
 @pytest.mark.fault(34)
 @BOTH
-@pytest.mark.parametrize("state", [State.ARMING, State.CLIMBING, State.ENGAGING])
-def test_a_stop_on_the_way_up_lands(autopilot: str, state: State) -> None:
+@pytest.mark.parametrize("state", [HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING])
+def test_a_stop_on_the_way_up_lands(autopilot: str, state: HandoverState) -> None:
     flight = Flight(autopilot).take_off().run(10.0, until=state)
-    flight.run(25.0, stop=True, until=State.DONE)
+    flight.run(25.0, stop=True, until=HandoverState.DONE)
     assert LAND in flight.commands()
     assert not flight.peers.autopilot.pilot.armed and flight.peers.autopilot.craft.landed
 
@@ -155,7 +157,7 @@ def test_a_stop_on_the_way_up_lands(autopilot: str, state: State) -> None:
 @pytest.mark.fault(34)
 @BOTH
 def test_a_stop_before_the_mode_is_given_asks_for_nothing_more(autopilot: str) -> None:
-    flight = Flight(autopilot).take_off().run(10.0, until=State.MODE)
+    flight = Flight(autopilot).take_off().run(10.0, until=HandoverState.MODE)
     flight.run(5.0, stop=True)
     assert flight.loop.finished and flight.commands() == [SET_MODE]
 
@@ -163,8 +165,8 @@ def test_a_stop_before_the_mode_is_given_asks_for_nothing_more(autopilot: str) -
 @pytest.mark.fault(26)
 def test_a_climb_that_never_ends_is_ended_by_landing() -> None:
     flight = Flight("ardupilot", "hand_over.climb_s=3.0", "link.blackout=[[2.5, 100.0]]").take_off()
-    flight.run(8.0, until=State.LANDING)
-    flight.run(20.0, until=State.DONE)
+    flight.run(8.0, until=HandoverState.LANDING)
+    flight.run(20.0, until=HandoverState.DONE)
     assert "take-off" in flight.loop.failure and not flight.peers.autopilot.pilot.armed
 
 
@@ -176,7 +178,9 @@ def test_a_vehicle_that_starts_anew_is_not_flown_on() -> None:
         young = bytes(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0).pack(mav))
         flight.loop.receive("vehicle", young, flight.now_ns)
     flight.run(0.1)
-    assert flight.is_in(State.RELEASED) and "vehicle-reboot" in {event.code for event in flight.memory.of(Event)}
+    assert flight.is_in(HandoverState.RELEASED) and "vehicle-reboot" in {
+        event.code for event in flight.memory.of(Event)
+    }
 
 
 def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_is_not() -> None:
@@ -187,7 +191,7 @@ def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_
     flight = Flight("ardupilot", *relayed)
     for name, value in ARDUPILOT_EXTERNAL.items():
         flight.peers.autopilot.parameters.set(name, value)
-    flight.take_off().run(20.0, until=State.ENGAGED)  # by the positions that we relay to it
+    flight.take_off().run(20.0, until=HandoverState.ENGAGED)  # by the positions that we relay to it
     told = flight.sent("SET_GPS_GLOBAL_ORIGIN")
     assert len(told) == 1 and flight.peers.autopilot.estimator.origin
     assert (told[0][1].latitude, told[0][1].altitude) == (473977420, 488000)

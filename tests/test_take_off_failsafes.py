@@ -11,10 +11,10 @@ from sim_rig import decode
 from soak_take_off import flown, outcome, troubled
 from take_off_rig import RELAYED, Flight
 
-from logs.replay import replay
+from logs.recording.replay import replay
 from uavctl.cli.flying import tell_notices
-from uavctl.data import ControlMode, Order, Severity
-from uavctl.mavlink.mode import State
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.records import ControlMode, Order, Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SEEDS = 10
@@ -34,7 +34,11 @@ def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilo
 
 @pytest.mark.fault(61)
 def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
-    more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
+    more = [
+        "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]",
+        "sim.autopilot.autopilot.clears=true",
+        "sim.autopilot.autopilot.flicker_s=1.0",
+    ]
     flight = Flight("px4", *RELAYED, *more).relayed()
     assert flown(flight) == "engaged" and not flight.loop.failure
     assert "failsafe" in flight.states and flight.loop.decision is not None
@@ -47,11 +51,15 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
 
 @pytest.mark.fault(61)
 def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
-    flight = Flight("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
-    flight.run(30.0, until=State.FAILSAFE)
+    flight = (
+        Flight("px4", *RELAYED, "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]", "sim.autopilot.autopilot.clears=true")
+        .relayed()
+        .take_off()
+    )
+    flight.run(30.0, until=HandoverState.FAILSAFE)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     said = io.StringIO()
     tell_notices(flight.loop, Console(file=said, width=200))
     lines = said.getvalue().splitlines()
@@ -69,9 +77,11 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
 def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_ground(
     autopilot: str, after_s: float
 ) -> None:
-    more = ["sim.checks.invalid=[[0.4, 2.0]]"] + (["sim.checks.clears=true"] if autopilot == "px4" else [])
+    more = ["sim.autopilot.autopilot.invalid=[[0.4, 2.0]]"] + (
+        ["sim.autopilot.autopilot.clears=true"] if autopilot == "px4" else []
+    )
     flight = Flight(autopilot, *RELAYED, *more).relayed().take_off()
-    flight.run(30.0, until=State.CLIMBING)
+    flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(after_s)
     for _ in range(70):
         if flight.loop.finished:
@@ -85,16 +95,16 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
 @pytest.mark.fault(25, 63)
 def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
     flight = Flight("px4", *RELAYED).relayed().take_off()
-    flight.run(30.0, until=State.CLIMBING)
+    flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     assert [event.severity for event in flight.loop.notices] == [Severity.WARNING]
     before = flight.commands()
     flight.run(10.0, stop=True)
     assert not flight.loop.finished and flight.commands() == before
     flight.stick("AUTO.LAND")
-    flight.run(30.0, stop=True, until=State.DONE)
+    flight.run(30.0, stop=True, until=HandoverState.DONE)
     assert flight.loop.finished and flight.commands() == before
 
 
@@ -105,12 +115,12 @@ def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot
     moves = (Order.GOTO, Order.HOLD, Order.RESUME)
     assert all(flight.loop.against(order) for order in moves)
     flight.run(1.0).take_off()
-    flight.run(10.0, until=State.CLIMBING)
+    flight.run(10.0, until=HandoverState.CLIMBING)
     assert all("on its way up" in flight.loop.against(order) for order in moves)
-    flight.run(10.0, until=State.ENGAGED)
+    flight.run(10.0, until=HandoverState.ENGAGED)
     assert not any(flight.loop.against(order) for order in Order)
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
-    flight.run(3.0, until=State.RELEASED)
+    flight.run(3.0, until=HandoverState.RELEASED)
     assert all("uavctl ctl engage" in flight.loop.against(order) for order in moves)
     assert not flight.loop.against(Order.ENGAGE) and not flight.loop.against(Order.LAND)
 
@@ -122,7 +132,7 @@ SET_MODE = 176
 @pytest.mark.parametrize("after", range(1, 26))
 def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switch(after: int) -> None:
     """Heartbeats show a mode up to a second late: a repetition meanwhile would take it from the pilot."""
-    flight = Flight("px4").take_off().run(10.0, until=State.CLIMBING)
+    flight = Flight("px4").take_off().run(10.0, until=HandoverState.CLIMBING)
     lost: list[bytes] = []
 
     def hears(data: bytes) -> bool:
@@ -137,7 +147,7 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
     before = flight.commands()
     flight.stick("POSCTL")
     flight.run(4.0)
-    assert flight.is_in(State.RELEASED) and flight.commands() == before
+    assert flight.is_in(HandoverState.RELEASED) and flight.commands() == before
     assert flight.peers.autopilot.mode_name == "POSCTL"
 
 
@@ -146,7 +156,7 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
 def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(deaf_s: float, lands: bool) -> None:
     flight = Flight("px4", *RELAYED, "sim.streams=onboard").relayed()
     flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 1.2)
-    flight.take_off().run(30.0, until=State.CLIMBING)
+    flight.take_off().run(30.0, until=HandoverState.CLIMBING)
     deaf_until_ns = flight.now_ns + round(deaf_s * 1e9)
 
     def hears(data: bytes) -> bool:
@@ -155,11 +165,11 @@ def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(de
 
     flight.hears = hears
     flight.run(8.7)
-    assert flight.is_in(State.ENGAGING) and flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
+    assert flight.is_in(HandoverState.ENGAGING) and flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
     assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.15)
     if lands:
-        flight.run(50.0, until=State.DONE)
+        flight.run(50.0, until=HandoverState.DONE)
         assert outcome(flight) == "landed" and "landing" in flight.states and flight.loop.failure
     else:
-        flight.run(20.0, until=State.ENGAGED).run(3.0)
+        flight.run(20.0, until=HandoverState.ENGAGED).run(3.0)
         assert outcome(flight) == "engaged" and not flight.loop.failure

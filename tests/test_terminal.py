@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from uavctl.errors import DesignError
-from uavctl.smpc.assumptions import AssumptionCheck, check_assumptions
+from uavctl.smpc.hahn_stursberg.terminal import (
+    AssumptionCheck,
+    Terminal,
+    check_assumptions,
+    lyapunov_residual,
+    make_terminal,
+    stationary_cost,
+)
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-from uavctl.smpc.terminal import Terminal, lyapunov_residual, make_terminal, stationary_cost
 
 Array = NDArray[np.float64]
 K_AXIS = np.array([[-0.058, -1.172]])

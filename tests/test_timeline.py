@@ -9,10 +9,10 @@ import pytest
 from synthetic_flight import fly
 from synthetic_scene import paper, room
 
-from logs.flight_data import FlightData
-from logs.path3d import grid_m, outline, path_3d, shown
-from logs.timeline import lanes, timeline
-from uavctl.data import Command, Event, Order, Severity, StepInput, VehicleStatus
+from logs.recording.flight import FlightData
+from logs.report.plots import grid_m, outline, path_3d, shown
+from logs.report.timeline import lanes, timeline
+from uavctl.records import Command, Event, Order, Severity, StepInput, VehicleStatus
 
 
 @pytest.fixture(scope="module")

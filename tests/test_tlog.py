@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.tlog import read_tlog
+from logs.recording.tlog import read_tlog
 from uavctl.errors import RecordingError
 
 EPOCH_US = 1_780_000_000_000_000

@@ -5,10 +5,10 @@ import json
 import msgspec
 import pytest
 
-from logs.topics import TOPICS, definition, is_view, raw_link, record_type, topics_page
-from logs.view_topics import PLOTS, VIEWS
-from uavctl import data
-from uavctl.data import Datagram, Decision, Record, raw_topic
+from logs.recording.derived_topics import PLOTS, VIEWS
+from logs.recording.topics import TOPICS, definition, is_view, raw_link, record_type, topics_page
+from uavctl import records as data
+from uavctl.records import Datagram, Decision, Record, raw_topic
 
 
 def test_every_recorded_type_has_one_topic() -> None:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from uavctl.build import build_controller, build_plant
+from uavctl.build.controller import build_controller, build_plant
 from uavctl.config import Config, load_config
-from uavctl.flight.mission import MissionState, ask_for, wanted
-from uavctl.flight.trajectory import along, follow
+from uavctl.flight.mission import MissionState, along, ask_for, follow, wanted
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ import pytest
 from patience import LIMIT_S
 
 from uavctl.errors import ConnectionSpecError
-from uavctl.transport import PEER_SILENCE_NS, Connection, open_connection, wait
+from uavctl.io.base import Connection
+from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
 
 FRAME = b"\xfd\x01\x02"
 LIMIT_NS = round(LIMIT_S * 1e9)  # longest wait of a test

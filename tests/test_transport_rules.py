@@ -15,10 +15,8 @@ from mavlink_rig import Peer
 from patience import LIMIT_S
 from test_transport import FRAME, LIMIT_NS, Clock, port_of
 
-from logs.tlog import read_tlog
-from uavctl.mavlink import framing
-from uavctl.transport import PEER_SILENCE_NS, Connection, Rules, open_connection, wait
-from uavctl.transport.rules import (
+from logs.recording.tlog import read_tlog
+from uavctl.io.admission import (
     FIRST_BURST,
     MAX_KNOWN,
     MAX_SENDERS,
@@ -29,8 +27,12 @@ from uavctl.transport.rules import (
     Address,
     AllowList,
     Budgets,
+    Rules,
     frames_in,
 )
+from uavctl.io.base import Connection
+from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
+from uavctl.mavlink import framing
 
 SECOND = 1_000_000_000
 DATA = Path(__file__).parent / "data"
@@ -310,11 +312,7 @@ def test_a_flood_is_cut_and_counted_and_the_other_sender_is_heard() -> None:
 @pytest.mark.fault(39)
 def test_a_second_address_draws_no_setpoints_while_the_first_one_speaks() -> None:
     clock = Clock()
-    with (
-        closing(open_connection("udpin://127.0.0.1:0", clock)) as connection,
-        peer() as vehicle,
-        peer() as thief,
-    ):
+    with closing(open_connection("udpin://127.0.0.1:0", clock)) as connection, peer() as vehicle, peer() as thief:
         to = ("127.0.0.1", port_of(connection))
 
         def hears(who: socket.socket) -> None:
@@ -341,11 +339,7 @@ def test_a_second_address_draws_no_setpoints_while_the_first_one_speaks() -> Non
 def test_noise_does_not_keep_the_place_of_a_vehicle() -> None:
     """Who once passed for the vehicle, with a frame held back, and then says nothing genuine loses the setpoints."""
     clock = Clock()
-    with (
-        closing(open_connection("udpin://127.0.0.1:0", clock)) as connection,
-        peer() as thief,
-        peer() as vehicle,
-    ):
+    with closing(open_connection("udpin://127.0.0.1:0", clock)) as connection, peer() as thief, peer() as vehicle:
         to = ("127.0.0.1", port_of(connection))
         thief.sendto(FRAME, to)
         assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
@@ -406,7 +400,7 @@ def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
 
 @pytest.mark.fault(39)
 def test_what_the_system_dropped_of_the_vehicle_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.transport.udp.OWN_BUFFER_BYTES", 4096)
+    monkeypatch.setattr("uavctl.io.transport.OWN_BUFFER_BYTES", 4096)
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
         known(connection, vehicle)
         for _ in range(1000):
@@ -456,7 +450,7 @@ def test_the_port_stays_ours_and_one_who_is_silent_gives_up_the_own_socket() -> 
 
 
 def test_where_the_system_does_not_tell_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.transport.udp._SO_MEMINFO", 9999)
+    monkeypatch.setattr("uavctl.io.transport._SO_MEMINFO", 9999)
     monkeypatch.delattr("socket.SO_REUSEPORT")
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
         known(connection, vehicle)

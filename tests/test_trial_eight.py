@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.trial.eight import CENTRE_M, HALF_M, LARGEST_MPS, MEAN_MPS, ROUNDS, WIDTH_M, eight, motion
-from uavctl.trial.fly import path_of
+from uavctl.lab.trial import CENTRE_M, HALF_M, LARGEST_MPS, MEAN_MPS, ROUNDS, WIDTH_M, eight, motion, path_of
 
 
 def test_its_mean_and_largest_speeds_are_those_of_the_paper() -> None:

@@ -15,12 +15,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools"))
 
 import trials
 
-from uavctl.data import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
-from uavctl.trial.case import AUTOPILOTS, AutopilotName, TrialCell, TrialPilot, believed, blackout_s, flown, length_s
-from uavctl.trial.eight import eight
-from uavctl.trial.fly import FlightTally, fly
-from uavctl.trial.own_loop import OwnTuning
-from uavctl.trial.room import room_of
+from uavctl.lab.own_loop import OwnTuning
+from uavctl.lab.trial import (
+    AUTOPILOTS,
+    AutopilotName,
+    FlightTally,
+    TrialCell,
+    TrialPilot,
+    believed,
+    blackout_s,
+    eight,
+    flown,
+    fly,
+    length_s,
+    room_of,
+)
+from uavctl.records import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
 
 OWN = TrialCell(TrialPilot("own", own=OwnTuning()), "hold", "ardupilot", 20.0, "30 %", ("link.loss=0.3",), "gusts")
 LOSES = ("link.loss=0.6",)

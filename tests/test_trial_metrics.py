@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from uavctl.trial.metrics import beyond_m, distances_m, largest, mean, rms_m, settled_s
+from uavctl.lab.trial import beyond_m, distances_m, largest, mean, rms_m, settled_s
 
 TIMES = np.arange(0.0, 20.0, 0.01)
 

@@ -10,14 +10,22 @@ import numpy as np
 import pytest
 from mavlink_rig import read
 
-from sim.peers import VEHICLE, Peers
-from sim.world import World
+from sim.simulation import VEHICLE, Peers, World
 from uavctl.config import Config
-from uavctl.data import Outgoing, PositionSample, Record, StepInput
+from uavctl.lab.own_loop import DELAY, OwnLoop, OwnTuning
+from uavctl.lab.trial import (
+    AutopilotName,
+    Scenario,
+    TrialCell,
+    TrialPilot,
+    believed,
+    controller_of,
+    flown,
+    fly,
+    own_loop,
+)
 from uavctl.loop import ControlLoop
-from uavctl.trial.case import AutopilotName, Scenario, TrialCell, TrialPilot, believed, flown
-from uavctl.trial.fly import controller_of, fly, own_loop
-from uavctl.trial.own_loop import DELAY, OwnLoop, OwnTuning
+from uavctl.records import Outgoing, PositionSample, Record, StepInput
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SECONDS = 12.0

@@ -11,18 +11,16 @@ import numpy as np
 import pytest
 from loopback_rig import lockstep
 
-from logs.flight_data import FlightData
-from uavctl.build import design_of
+from logs.recording.flight import FlightData
+from uavctl.build.controller import design_of
 from uavctl.config import Config, load_config
 from uavctl.errors import UsageError
-from uavctl.identify.axis_model import DragLagAxis, places
-from uavctl.identify.recorded import from_records
-from uavctl.identify.result import Identification, identify
-from uavctl.tune.change import MOST_DEAD_RANGE_S, Change, TunedResult, check_tunable, tuned
-from uavctl.tune.comparison import figures_of, plan_errors_m
-from uavctl.tune.excitation import LEAST_WAY_M, SafeBox, check_start, excited, parse_box
-from uavctl.tune.response import PinnedAxis
-from uavctl.tune.run_folder import STATE, TuneAsked, TuneFolder
+from uavctl.lab.identify.history import from_records
+from uavctl.lab.identify.response import DragLagAxis, places
+from uavctl.lab.identify.result import Identification, identify
+from uavctl.lab.tune.change import MOST_DEAD_RANGE_S, Change, PinnedAxis, TunedResult, check_tunable, tuned
+from uavctl.lab.tune.excitation import LEAST_WAY_M, SafeBox, check_start, excited, parse_box
+from uavctl.lab.tune.run_folder import STATE, TuneAsked, TuneFolder, figures_of, plan_errors_m
 
 BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
 ASKED = TuneAsked(box="b", flight="", simulated=True, take_off_m=None)

@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 from tune_rig import BOX, START, short_flights, typed, words
 
-from logs.reader import header, segment_files
-from uavctl.cli import loopback_cmd, tune_cmd
+from logs.recording.reader import header, segment_files
+from uavctl.cli import loopback as loopback_cmd
+from uavctl.cli import tune as tune_cmd
 from uavctl.cli.app import run
-from uavctl.cli.tune_flight import left_whole
+from uavctl.cli.tune import left_whole
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.tune.excitation import parse_box
-from uavctl.tune.run_folder import (
+from uavctl.lab.tune.excitation import parse_box
+from uavctl.lab.tune.run_folder import (
     AFTER,
     BEFORE,
     FIT_PAGE,
@@ -338,7 +339,7 @@ def test_corners_in_any_order_are_one_box() -> None:
 def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     with short_flights(steps=1, hold_s=7.5):
-        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot=ardupilot", "--json"))
+        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot.autopilot=ardupilot", "--json"))
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
     comparison = document["comparison"]

@@ -9,15 +9,16 @@ import pytest
 from endings_rig import Endings, interrupt
 from tune_rig import Tuned, fly_real, real_rig
 
-from logs.reader import header
-from uavctl.cli import tune_cmd, tune_flight
+from logs.recording.reader import header
+from uavctl.cli import tune as tune_cmd
+from uavctl.cli import tune as tune_flight
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.ending import Cause
+from uavctl.daemon.lock import sole_daemon
 from uavctl.errors import NotReachedError, VehicleTakenError
-from uavctl.lock import sole_daemon
-from uavctl.mavlink.mode import State
-from uavctl.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
+from uavctl.lab.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.outcome import Cause
 
 STICK = "POSCTL"
 
@@ -27,12 +28,12 @@ def land(rig: Endings) -> None:
     rig.stick("AUTO.LAND")
 
 
-def taken(state: State, after_s: float, folder: Path, *, lands: bool) -> tuple[Tuned, int]:
+def taken(state: HandoverState, after_s: float, folder: Path, *, lands: bool) -> tuple[Tuned, int]:
     """A call in which the pilot takes over, and lands or leaves the end to the operator; and when we had heard it."""
     released_ns: list[int] = []
     rig = real_rig().at(state, lambda one: one.stick(STICK), after_s=after_s)
-    rig.at(State.RELEASED, lambda one: released_ns.append(one.now_ns))
-    rig.at(State.RELEASED, land if lands else interrupt, after_s=2.0)
+    rig.at(HandoverState.RELEASED, lambda one: released_ns.append(one.now_ns))
+    rig.at(HandoverState.RELEASED, land if lands else interrupt, after_s=2.0)
     result = fly_real(rig, folder, enter="\n")
     return result, released_ns[0]
 
@@ -44,12 +45,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def in_the_climb(folder: Path) -> tuple[Tuned, int]:
-    return taken(State.CLIMBING, 0.6, folder, lands=False)
+    return taken(HandoverState.CLIMBING, 0.6, folder, lands=False)
 
 
 @pytest.fixture(scope="module")
 def under_way(folder: Path, in_the_climb: tuple[Tuned, int]) -> tuple[Tuned, int]:
-    return taken(State.ENGAGED, 8.0, folder, lands=True)
+    return taken(HandoverState.ENGAGED, 8.0, folder, lands=True)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def not_agreed(folder: Path, under_way: tuple[Tuned, int]) -> Tuned:
 
 @pytest.fixture(scope="module")
 def in_the_second(folder: Path, not_agreed: Tuned) -> tuple[Tuned, int]:
-    return taken(State.ENGAGED, 5.0, folder, lands=True)
+    return taken(HandoverState.ENGAGED, 5.0, folder, lands=True)
 
 
 @pytest.fixture(scope="module")

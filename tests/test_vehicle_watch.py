@@ -9,19 +9,19 @@ import pytest
 from mavlink_rig import OFFBOARD, SECOND, Peer, events, make_link, packets, read, statuses
 from scipy.spatial.transform import Rotation
 
-from uavctl.config.peers import DaemonConfig
+from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.data import InertialSample, VehicleStatus
-from uavctl.mavlink.link import Link
+from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS, Punctual
+from uavctl.records import InertialSample, VehicleStatus
 
 NOW = 1000 * SECOND
 MS = 1_000_000
 WRAP_MS = 2**32
 
 
-def heard(boot_ms: int = 60_000, inertial_std_mps2: float = 0.0) -> tuple[Link, Peer]:
+def heard(boot_ms: int = 60_000, inertial_std_mps2: float = 0.0) -> tuple[MavlinkConnection, Peer]:
     estimator = EstimatorConfig(position_std_m=0.005, inertial_std_mps2=inertial_std_mps2)
     link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05), estimator=estimator), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)
@@ -30,7 +30,7 @@ def heard(boot_ms: int = 60_000, inertial_std_mps2: float = 0.0) -> tuple[Link, 
     return link, vehicle
 
 
-def newest(link: Link, vehicle: Peer, at_ns: int = NOW + SECOND) -> VehicleStatus:
+def newest(link: MavlinkConnection, vehicle: Peer, at_ns: int = NOW + SECOND) -> VehicleStatus:
     return statuses(link.receive(vehicle.heartbeat(), at_ns))[-1]
 
 
@@ -203,7 +203,9 @@ def test_a_vehicle_that_is_gone_from_the_ground_gives_its_place_and_one_in_the_a
 PX4, ARDUPILOT = 12, 3
 
 
-def felt(link: Link, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw: bool = False) -> list[InertialSample]:
+def felt(
+    link: MavlinkConnection, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw: bool = False
+) -> list[InertialSample]:
     name, rest = ("raw_imu", (0,) * 6) if raw else ("highres_imu", (*(0.0,) * 10, 0))
     items = link.receive(vehicle.send(name, at_ns // 1000, *force, *rest), at_ns)
     return [item for item in items if isinstance(item, InertialSample)]

@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from quadrotor_rig import S, quadrotor, steady
 from scipy.integrate import solve_ivp
 
-from sim.vehicle import linear_model
+from sim.vehicle.linear import linear_model
 from sim.wind import Wind
-from uavctl.build import build_plant
+from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.errors import ConfigError, DesignError
-from uavctl.naming import names_of
-from uavctl.smpc.lqg_bound import lqr
-from uavctl.smpc.plant import Plant, steps_to_reach
-from uavctl.smpc.velocity_reference import STATES, HeldAxis, velocity_reference
+from uavctl.labels import names_of
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.plant import STATES, HeldAxis, Plant, steps_to_reach, velocity_reference
 
 Array = NDArray[np.float64]
 
@@ -249,8 +248,7 @@ def test_the_simulated_ardupilot_holds_against_wind_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "key"),
-    [({name: 0.0}, name) for name in ("lag_s", "position_1ps", "velocity_1ps", "integral_1ps2")],
+    ("changes", "key"), [({name: 0.0}, name) for name in ("lag_s", "position_1ps", "velocity_1ps", "integral_1ps2")]
 )
 def test_numbers_that_make_no_such_plant_are_refused(changes: dict[str, float], key: str) -> None:
     with pytest.raises(DesignError, match=rf"plant\.{key}"):

@@ -8,12 +8,18 @@ import pytest
 from loopback_rig import lockstep
 from numpy.typing import NDArray
 
-from logs.filtered import Innovations
-from logs.flight_data import FlightData
-from logs.report_verdicts import verdict_rows
-from logs.verdict_model import ModelOutcome, ModelVerdict, judge_innovations
-from logs.verdict_spectrum import BANDS, band_powers, power_bounds
-from logs.verdicts import judge
+from logs.recording.flight import FlightData
+from logs.report.flight_page import verdict_rows
+from logs.report.verdict_model import (
+    BANDS,
+    InnovationSamples,
+    ModelOutcome,
+    ModelVerdict,
+    band_powers,
+    judge_innovations,
+    power_bounds,
+)
+from logs.report.verdicts import judge
 
 Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
@@ -32,7 +38,7 @@ def autoregressive(seed: int, n: int, scale: float, r: float) -> Array:
 def judged(values: Array) -> ModelVerdict:
     """The verdict on errors whose foretold deviation is one."""
     nothing = np.array([], dtype=np.int64)
-    found = Innovations(np.arange(float(len(values))), values, np.ones_like(values), nothing, np.array([]))
+    found = InnovationSamples(np.arange(float(len(values))), values, np.ones_like(values), nothing, np.array([]))
     return judge_innovations(found, AXES, 0.2)
 
 
@@ -96,7 +102,7 @@ def test_ellipsoids_that_hold_more_than_promised_are_caution_and_fewer_are_not()
     white = autoregressive(6, 100, 1.0, 0.0)
     for distance, outcome in ((1.0, ModelOutcome.CAUTIOUS), (9.0, ModelOutcome.REFUTED)):
         lead, distances = np.full(400, 2), np.full(400, distance)
-        found = Innovations(np.arange(100.0), white, np.ones_like(white), lead, distances)
+        found = InnovationSamples(np.arange(100.0), white, np.ones_like(white), lead, distances)
         verdict = judge_innovations(found, AXES, 0.2)
         assert verdict.outcome is outcome
         assert "nothing speaks against" not in verdict.text

@@ -11,23 +11,22 @@ from loopback_rig import lockstep
 from numpy.typing import NDArray
 from verdict_rig import as_modelled, room
 
-from logs.filtered import Innovations, Track, innovations
-from logs.flight_data import FlightData
-from logs.verdict_model import FEWEST, LAGS, judge_innovations
-from logs.verdicts import judge
-from uavctl.build import build_estimator, build_plant
+from logs.recording.flight import FlightData
+from logs.report.verdict_model import FEWEST, LAGS, InnovationSamples, Track, innovations, judge_innovations
+from logs.report.verdicts import judge
+from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
-from uavctl.data import ControlMode
 from uavctl.flight.kalman import make_kalman
+from uavctl.records import ControlMode
 
 Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
 
 
-def errors(values: Array) -> Innovations:
+def errors(values: Array) -> InnovationSamples:
     """Errors of one metre's deviation (n, 3), nothing ahead."""
     nothing = np.array([], dtype=np.int64)
-    return Innovations(np.arange(float(len(values))), values, np.ones_like(values), nothing, np.array([]))
+    return InnovationSamples(np.arange(float(len(values))), values, np.ones_like(values), nothing, np.array([]))
 
 
 def ar1(rng: np.random.Generator, n: int, r: float) -> Array:
@@ -89,7 +88,9 @@ def test_ellipsoids_are_counted_by_the_time_ahead() -> None:
     lead = np.array([1] * 400 + [3] * 400)
     inside = np.concatenate([np.where(np.arange(400) < 380, 7.0, 8.0), np.where(np.arange(400) < 300, 7.0, 8.0)])
     few = np.random.default_rng(4).standard_normal((100, 3))
-    found = Innovations(np.arange(100.0), few, np.ones_like(few), lead, inside)  # the 95 % quantile of χ²₃ is 7.81
+    found = InnovationSamples(
+        np.arange(100.0), few, np.ones_like(few), lead, inside
+    )  # the 95 % quantile of χ²₃ is 7.81
     near, far = judge_innovations(found, AXES, 0.2).leads
     assert (near.inside.hits, near.inside.trials, near.refuted, near.lead_s) == (380, 400, False, 0.2)
     assert (far.inside.hits, far.refuted) == (300, True)

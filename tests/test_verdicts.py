@@ -12,14 +12,20 @@ from synthetic_scene import room
 from verdict_rig import as_modelled
 from verdict_rig import room as room_config
 
-from logs.flight_data import FlightData
-from logs.statistics import share
-from logs.verdict_clock import judge_clocks, judge_stamps, offsets
-from logs.verdict_link import judge_link
-from logs.verdict_risk import judge_risk
-from logs.verdicts import Verdicts, flown_config, judge
+from logs.recording.flight import FlightData
+from logs.report.statistics import share
+from logs.report.verdicts import (
+    Verdicts,
+    flown_config,
+    judge,
+    judge_clocks,
+    judge_link,
+    judge_risk,
+    judge_stamps,
+    offsets,
+)
 from uavctl.config import Config
-from uavctl.data import Decision, Event, LinkStats, Plan, PositionSample, Record, Severity, StepInput, Truth
+from uavctl.records import Decision, Event, LinkStats, Plan, PositionSample, Record, Severity, StepInput, Truth
 
 
 def flight(duration_s: float = 40.0, **changes: object) -> FlightData:

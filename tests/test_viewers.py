@@ -16,12 +16,12 @@ from report_rig import unpaged
 from rerun.chunk import McapReader
 from view_rig import protobuf
 
-from logs.info import info
-from logs.reader import read
-from logs.topics import TOPICS, definition
-from logs.view_topics import VIEWS
+from logs.recording.derived_topics import VIEWS
+from logs.recording.info import info
+from logs.recording.reader import read
+from logs.recording.topics import TOPICS, definition
 from uavctl.cli.app import run
-from uavctl.data import Decision, Estimate, Plan
+from uavctl.records import Decision, Estimate, Plan
 
 # What a flight without trouble never says.
 SILENT = {"/uavctl/relay", "/uavctl/check", "/uavctl/refused"}

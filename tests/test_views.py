@@ -12,11 +12,12 @@ import pytest
 from loopback_rig import lockstep
 from view_rig import flown
 
-from logs.design_view import DesignView, design_view
-from logs.scene import STD_95, plan_scene, room_scene
-from logs.view_topics import VIEWS
-from logs.views import STILL_NS, Views
-from uavctl.data import (
+from logs.recording.derived_topics import VIEWS
+from logs.recording.design_view import DesignView, design_view
+from logs.recording.views import STD_95, STILL_NS, Views, plan_scene, room_scene
+from uavctl.errors import RecordingError
+from uavctl.frames import Frame, rotate
+from uavctl.records import (
     ControlMode,
     Decision,
     Estimate,
@@ -30,8 +31,6 @@ from uavctl.data import (
     Truth,
     Vec3,
 )
-from uavctl.errors import RecordingError
-from uavctl.frames import Frame, rotate
 
 KINDS = {view.name: view.message for view in VIEWS}
 Found = dict[str, list[tuple[int, Any]]]

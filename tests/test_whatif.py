@@ -8,16 +8,13 @@ import pytest
 from loopback_rig import Memory, flight, header
 from whatif_rig import EXACT, PAPER, QUADROTOR, ROOM, WIRE, Case, again, config_of, far, flown, history, stripped
 
-from logs.encoding import encode
-from sim.vehicle import Vehicle, linear_model
-from uavctl.build import build_controller, build_design
-from uavctl.data import Datagram, Decision, Plan, PositionSample, Record, Setpoint, StepInput, Truth
+from logs.recording.topics import encode
+from sim.vehicle.linear import LinearVehicle, linear_model
+from uavctl.build.controller import build_controller, build_design
 from uavctl.errors import RecordingError
-from uavctl.whatif.compare import departure_m, model_fit, reproduction, until
-from uavctl.whatif.departure import Departure, Response
-from uavctl.whatif.fly import fly
-from uavctl.whatif.history import Entry, history_of, response_of
-from uavctl.whatif.other_link import Relinked, captures
+from uavctl.lab.whatif.comparison import departure_m, model_fit, reproduction, until
+from uavctl.lab.whatif.flight import Departure, Entry, Relinked, Response, captures, fly, history_of, response_of
+from uavctl.records import Datagram, Decision, Plan, PositionSample, Record, Setpoint, StepInput, Truth
 
 
 @pytest.mark.parametrize("case", [PAPER, ROOM, QUADROTOR], ids=["paper", "room", "quadrotor"])
@@ -112,7 +109,7 @@ def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
 
 def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     config = config_of(ROOM)
-    one, other = (Vehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
+    one, other = (LinearVehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
     departure = Departure(Response(one.model))
     assert departure.begun_ns is None
     rng = np.random.default_rng(1)

@@ -9,14 +9,12 @@ import pytest
 from loopback_rig import Memory
 from whatif_rig import PAPER, config_of, far, flown, history
 
-from uavctl.build import build_controller, build_problem
-from uavctl.campaign.controllers import build, recipe_for
-from uavctl.campaign.spec import CampaignSpec, ControllerSpec, Kind
-from uavctl.data import Plan, Truth
+from uavctl.build.controller import build_controller, build_problem
+from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, Kind
+from uavctl.lab.whatif.flight import fly, response_of
+from uavctl.records import Plan, Truth
 from uavctl.smpc.batch import News
-from uavctl.whatif.baseline import BaselineSolver
-from uavctl.whatif.fly import fly
-from uavctl.whatif.history import response_of
 
 
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])

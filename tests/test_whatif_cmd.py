@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from report_rig import unpaged, unwritten
 
-from logs.reader import header
+from logs.recording.reader import header
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.load import dump_config

@@ -16,19 +16,16 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from whatif_rig import Case, again, config_of, flown, history
 
-from logs.encoding import encode
-from uavctl.build import build_controller
-from uavctl.data import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
+from logs.recording.topics import encode
+from uavctl.build.controller import build_controller
 from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.lab.whatif.comparison import model_fit
+from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, response_of
+from uavctl.lab.whatif.rewrite import InertialFrames, shifted
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan
 from uavctl.mavlink.vehicle import VehicleWatch
-from uavctl.whatif.compare import model_fit
-from uavctl.whatif.departure import Response
-from uavctl.whatif.fly import fly
-from uavctl.whatif.history import history_of, response_of
-from uavctl.whatif.inertial import InertialFrames, shifted
-from uavctl.whatif.other_link import Relinked
+from uavctl.records import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
 
 MILLI_G_MPS2 = 9.80665e-3
 BY: Vec3 = (0.7, -1.3, 0.4)
@@ -37,7 +34,7 @@ HOLDS_FROM_NS = 10_000_000_000
 PX4: Case = ("room-px4", 20.0, ())
 ARDUPILOT: Case = ("room-ardupilot", 20.0, ())
 LINEAR: Case = ("room", 10.0, ())
-LINEAR_ARDUPILOT: Case = ("room", 10.0, ("sim.autopilot=ardupilot",))
+LINEAR_ARDUPILOT: Case = ("room", 10.0, ("sim.autopilot.autopilot=ardupilot",))
 TARGET: Vec3 = (0.5, 0.5, -1.0)
 ELSEWHERE = "target.position_m=[0.5, 0.5, -1.0]"
 
@@ -86,8 +83,7 @@ def force_of(frame: bytes) -> Vec3:
 
 @pytest.mark.parametrize("first_version", [False, True])
 @pytest.mark.parametrize(
-    ("kind", "resolution"),
-    [("highres_imu", 2e-6), ("raw_imu", MILLI_G_MPS2 / 2), ("scaled_imu2", MILLI_G_MPS2 / 2)],
+    ("kind", "resolution"), [("highres_imu", 2e-6), ("raw_imu", MILLI_G_MPS2 / 2), ("scaled_imu2", MILLI_G_MPS2 / 2)]
 )
 def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution: float, first_version: bool) -> None:
     speaker, attitude = Speaker(number=200), turn(LEANING)

@@ -13,11 +13,10 @@ from report_rig import data
 from synthetic_scene import room
 from test_report_figures import drawn
 
-from logs.flight_data import FlightData
-from logs.summary import FlightSummary, summarise
-from logs.svg import colour
-from uavctl.whatif.compare import ModelFit, Reproduction, WhatIf
-from uavctl.whatif.page import story, write_page
+from logs.recording.flight import FlightData
+from logs.recording.summary import FlightSummary, summarise
+from logs.report.svg import colour
+from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, story, write_page
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.mocap import Cameras
+from sim.cameras import Cameras
 from uavctl.config import load_config
-from uavctl.config.peers import FrameConfig
+from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
-from uavctl.data import Vec3
 from uavctl.frames import Quaternion
-from uavctl.whatif.rewrite import Axes
+from uavctl.lab.whatif.rewrite import SourceFrames
+from uavctl.records import Vec3
 
 FRAMES = [
     FrameConfig(),
@@ -42,7 +42,7 @@ def camera_of(message: str) -> CameraConfig:
 @pytest.mark.parametrize("frame", FRAMES, ids=["ned", "enu", "enu-turned", "ned-turned"])
 @pytest.mark.parametrize("message", ["vision", "vicon", "mocap", "odometry"])
 def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
-    camera, axes = camera_of(message), Axes(frame)
+    camera, axes = camera_of(message), SourceFrames(frame)
     (seen,) = axes.seen(said(camera, frame, HERE))
     np.testing.assert_allclose(seen.position_m, HERE[0], atol=1e-6)
     moved = axes.moved(seen, *BY)
@@ -58,7 +58,7 @@ def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
 
 @pytest.mark.parametrize("message", ["vision", "odometry"])
 def test_a_stamp_is_replaced(message: str) -> None:
-    axes = Axes(FrameConfig())
+    axes = SourceFrames(FrameConfig())
     (seen,) = axes.seen(said(camera_of(message), FrameConfig(), HERE))
     moved = axes.moved(seen, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
     (again,) = axes.seen(moved)
@@ -70,7 +70,7 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
     mav.seq = 77
     frame = FRAMES[2]
     message = mavlink.MAVLink_local_position_ned_message(5000, 1.0, 2.0, -3.0, 0.5, 0.0, 0.0)
-    axes = Axes(frame)
+    axes = SourceFrames(frame)
     (seen,) = axes.seen(bytes(message.pack(mav, force_mavlink1=True)))
     moved = axes.moved(seen, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
     assert moved[0] == 0xFE and moved[2] == 77
@@ -80,4 +80,4 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
 
 def test_what_is_no_position_is_not_seen() -> None:
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
-    assert list(Axes(FrameConfig()).seen(bytes(beat) + b"\xfd\x00garbage")) == []
+    assert list(SourceFrames(FrameConfig()).seen(bytes(beat) + b"\xfd\x00garbage")) == []

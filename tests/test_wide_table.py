@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from uavctl.build import build_design
-from uavctl.cli.solve_cmd import plan_table
-from uavctl.cli.wide_table import Column, WideTable
+from uavctl.build.controller import build_design
+from uavctl.cli.common import Column, WideTable
+from uavctl.cli.solve import plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.design import Design
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 
 
 def printed(renderable: RenderableType, width: int) -> list[str]:

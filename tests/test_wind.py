@@ -9,7 +9,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
 from sim.wind import CALM, FOOT_M, Wind, _Across, dryden
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
 

@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 from mavlink_rig import DATA, packets
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Setpoint, SetpointSource
 from uavctl.frames import to_euler
-from uavctl.mavlink.encoder import Encoder
-from uavctl.mavlink.framing import with_checksum
+from uavctl.mavlink.codec import Encoder
+from uavctl.mavlink.framing import MessageLayout, text_of, with_checksum
 from uavctl.mavlink.relay import Pose
-from uavctl.mavlink.wire import Layout, text_of
+from uavctl.records import Setpoint, SetpointSource
 
-LAYOUTS = {number: Layout(kind) for number, kind in mavlink.mavlink_map.items()}
+LAYOUTS = {number: MessageLayout(kind) for number, kind in mavlink.mavlink_map.items()}
 UNDERSTOOD = (0, 1, 22, 30, 32, 49, 77, 102, 104, 111, 138, 147, 148, 193, 230, 245, 253, 331)
 ADDRESS = (245, 25)
 BYTES = st.integers(0, 255)
@@ -84,13 +83,13 @@ def test_every_kind_is_read_and_written_alike(kind: Any) -> None:
 
 def test_numbers_that_are_not_given_at_the_end_are_zero() -> None:
     whole = mavlink.MAVLink_set_gps_global_origin_message(1, 2, 3, 4, 0).pack(mavlink.MAVLink(None, *ADDRESS))
-    layout = Layout(mavlink.MAVLink_set_gps_global_origin_message)
+    layout = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
     assert layout.frame(ADDRESS, 0, 1, 2, 3, 4) == whole
 
 
 def test_a_number_that_does_not_fit_is_refused() -> None:
     with pytest.raises(struct.error):
-        Layout(mavlink.MAVLink_timesync_message).frame(ADDRESS, 0, 2**63, 0)
+        MessageLayout(mavlink.MAVLink_timesync_message).frame(ADDRESS, 0, 2**63, 0)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in DATA.glob("*.tlog")))

@@ -16,8 +16,8 @@ from endings_rig import ON_THE_FLOOR, TAKE_OFF, Endings, in_virtual_time
 from sim_rig import decode
 
 from uavctl.cli.app import run
-from uavctl.lock import lock_paths
-from uavctl.tune import excitation
+from uavctl.daemon.lock import lock_paths
+from uavctl.lab.tune import excitation
 
 BOX = "--box=-1.2,-1.1,-2,1.2,1.1,-0.4"
 START = "sim.start_position_m=[0.0,0.0,-1.2]"

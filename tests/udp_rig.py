@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from patience import LIMIT_S, until
 
-from logs.reader import records
-from uavctl.data import ControlMode, Decision, Setpoint, Truth
+from logs.recording.reader import records
+from uavctl.records import ControlMode, Decision, Setpoint, Truth
 
 # The machine may stand still for a while: that is no failsafe of the vehicle's.
 PATIENT = ("--set", "sim.setpoint_timeout_s=600.0")

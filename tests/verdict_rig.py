@@ -8,11 +8,11 @@ import numpy as np
 from loopback_rig import header
 from numpy.typing import NDArray
 
-from logs.flight_data import FlightData
-from uavctl.build import build_design, build_estimator, build_plant
+from logs.recording.flight import FlightData
+from uavctl.build.controller import build_design, build_estimator, build_plant
 from uavctl.config import Config, load_config
-from uavctl.data import ControlMode, Decision, PositionSample, Record, StepInput, VehicleStatus
 from uavctl.flight.kalman import make_kalman
+from uavctl.records import ControlMode, Decision, PositionSample, Record, StepInput, VehicleStatus
 
 Array = NDArray[np.float64]
 VEHICLE = VehicleStatus(at_ns=0, autopilot="px4", armed=True, mode="OFFBOARD", external=True)

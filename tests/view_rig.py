@@ -11,10 +11,9 @@ from loopback_rig import Memory, lockstep
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from logs.onlookers import Onlookers
-from logs.recorder import SyncRecorder
-from logs.views import Views
-from uavctl.data import Decision, Timing
+from logs.recording.recorder import DerivedTopics, SyncRecorder
+from logs.recording.views import Views
+from uavctl.records import Decision, Timing
 
 SECONDS = 6.0
 
@@ -32,7 +31,7 @@ def flown() -> Memory:
 
 def record(path: Path) -> Path:
     """The flight's file."""
-    recorder = SyncRecorder(path, onlookers=Onlookers(Views()))
+    recorder = SyncRecorder(path, onlookers=DerivedTopics(Views()))
     for entry in flown().entries:
         recorder.put(*entry)
     status = recorder.close()

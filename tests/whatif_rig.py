@@ -8,9 +8,8 @@ import numpy as np
 from loopback_rig import Memory, header, lockstep, shared
 
 from uavctl.config import Config, load_config
-from uavctl.data import Record, Truth
-from uavctl.whatif.fly import Course, OtherLink, fly
-from uavctl.whatif.history import Entry, History, history_of, response_of
+from uavctl.lab.whatif.flight import Entry, FlownCourse, OtherLink, RecordedFlight, fly, history_of, response_of
+from uavctl.records import Record, Truth
 
 EXACT = ("solver.method=exact",)
 PAPER = ("paper", 20.0, EXACT)
@@ -34,11 +33,11 @@ def flown(case: Case, *changes: str) -> Memory:
 
 
 @cache
-def history(case: Case) -> History:
+def history(case: Case) -> RecordedFlight:
     return history_of(flown(case).entries, config_of(case), "recording")
 
 
-def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, Course]:
+def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, FlownCourse]:
     config, memory = config_of(case, *changes), Memory()
     design, controller = shared(config)
     memory.put("/uavctl/header", 0, header(config, design))

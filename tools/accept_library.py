@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from uavctl.config import load_config, presets
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conic import ConicSolver
-from uavctl.smpc.library_solver import LibrarySolver
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.smpc.hahn_stursberg.library import LibrarySolver
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 

@@ -15,10 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from logs.topics import topics_page
-from uavctl.campaign.reference import campaign_page
+from logs.recording.topics import topics_page
 from uavctl.config.reference import render
-from uavctl.mavlink.mode import page as hand_over_page
+from uavctl.lab.campaign.trials import campaign_page
+from uavctl.mavlink.handover_guards import page as hand_over_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.tlog import TlogPacket, read_tlog
+from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.errors import UavctlError
 from uavctl.mavlink.framing import scan
 

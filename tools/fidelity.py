@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.tlog import read_tlog
-from sim.peers import Peers
-from uavctl.build import build_controller, design_of
+from logs.recording.tlog import read_tlog
+from sim.simulation import Peers
+from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, load_config
-from uavctl.data import Command, Datagram, Order, Record
 from uavctl.errors import UavctlError
-from uavctl.identify.recorded import History, from_records, from_tlog
-from uavctl.identify.result import Identified, identify
+from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
+from uavctl.lab.identify.result import Identified, identify
+from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import VEHICLE, ControlLoop
-from uavctl.mavlink.mode import State
-from uavctl.trial.own_loop import EXTERNAL_ONLY
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.records import Command, Datagram, Order, Record
 
 DOCS = Path(__file__).parents[1] / "docs" / "autopilots.md"
 BEGIN, END = "<!-- fidelity: written by tools/fidelity.py -->\n", "<!-- end of fidelity -->\n"
@@ -65,8 +65,8 @@ AS_RECORDED = (
 )
 # What goes wrong in the second flight: PX4's failsafe that clears itself in the climb, ArduPilot's that does not.
 TROUBLED = {
-    "px4": ("sim.checks.invalid=[[0.2,1.4]]", "sim.checks.clears=true"),
-    "ardupilot": ("sim.checks.invalid=[[12.0,1000.0]]",),
+    "px4": ("sim.autopilot.autopilot.invalid=[[0.2,1.4]]", "sim.autopilot.autopilot.clears=true"),
+    "ardupilot": ("sim.autopilot.autopilot.invalid=[[12.0,1000.0]]",),
 }
 Array = NDArray[np.float64]
 
@@ -193,7 +193,7 @@ def recorded(folder: Path, name: str, beside: str) -> Watched:
 
 def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Watched:
     """The same, of the simulator."""
-    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot={autopilot}", *overrides])
+    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot.autopilot={autopilot}", *overrides])
     sink, truth = _Sink(), []
     loop = ControlLoop(config, build_controller(config, design_of(config)), sink, lambda: 0)
     peers = Peers(config, 0, airborne=False)
@@ -211,7 +211,7 @@ def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Wat
         for one in loop.tick(tick, at_ns, stop=tick >= land):
             peers.receive(one.link, one.data, at_ns)
         truth.append((at_ns * S, -peers.vehicle.position_m[2]))
-        if loop.who_flies is State.DONE:
+        if loop.who_flies is HandoverState.DONE:
             break
     for arrival_ns, link, data in peers.advance(peers.now_ns + AFTER_NS):
         sink.put("", arrival_ns, Datagram(at_ns=arrival_ns, link=link, outgoing=False, data=data))
@@ -224,7 +224,7 @@ def _texts(heard: Iterable[tuple[float, Any]]) -> list[tuple[float, str]]:
     return [(at_s, one.text) for at_s, one in heard if one.get_type() == "STATUSTEXT"]
 
 
-def _identified(history: Callable[[], History], config: Config) -> Identified | None:
+def _identified(history: Callable[[], FlightHistory], config: Config) -> Identified | None:
     """The response; none of a flight in which nothing was asked for, or too little to tell."""
     try:
         return identify(history(), config, lambda: None).result
@@ -323,7 +323,7 @@ def _requests(folder: Path, recordings: Sequence[tuple[str, str, str]], real: Ma
         sent = [one.data for one in read_tlog(folder / f"{name}.tlog").packets if one.outgoing]
         asked = [one for _, one in _heard(((0.0, data) for data in sent), system=0) if _is_request(one)]
         last = {int(one.param1): one.param2 for one in asked}
-        peers = Peers(load_config("room-ardupilot", ["sim.autopilot=ardupilot"]), 0, airborne=True)
+        peers = Peers(load_config("room-ardupilot", ["sim.autopilot.autopilot=ardupilot"]), 0, airborne=True)
         mav = mavlink.MAVLink(None, 255, 0)
         for number, interval_us in last.items():
             order = mavlink.MAVLink_command_long_message(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)

@@ -212,9 +212,9 @@ def _import_all() -> None:
 
     for path, _ in app._COMMANDS.values():
         importlib.import_module(f"uavctl.cli.{path.partition(':')[0]}")
-    import uavctl.cli.replay_cmd
-    import uavctl.cli.report_cmd
-    import uavctl.cli.whatif_cmd  # noqa: F401
+    import uavctl.cli.log_report
+    import uavctl.cli.replay
+    import uavctl.cli.whatif  # noqa: F401
 
 
 def _record(top: Path) -> str:

@@ -17,11 +17,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from uavctl.campaign.cells import Cell, cells_of
-from uavctl.campaign.compose import compose
-from uavctl.campaign.read import read_campaign
-from uavctl.campaign.spec import CampaignSpec, ControllerSpec
-from uavctl.campaign.tasks import Task, flown
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, compose, read_campaign
+from uavctl.lab.campaign.tasks import Cell, Task, cells_of, flown
 
 SIMPLE = ("mean-qp", "governor")
 LEAST, MOST, HALVINGS = 0.5, 4.5, 6

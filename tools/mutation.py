@@ -46,9 +46,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "uavctl/flight/fallback.py": ("tests/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/test_limits.py",),
-    "uavctl/flight/reach.py": ("tests/test_reach_rules.py",),
-    "uavctl/flight/stuck.py": ("tests/test_stuck_rules.py",),
-    "uavctl/mavlink/mode.py": ("tests/test_mode.py",),
+    "uavctl/flight/gating.py": ("tests/test_reach_rules.py", "tests/test_stuck_rules.py"),
+    "uavctl/mavlink/handover_guards.py": ("tests/test_mode.py",),
     "uavctl/mavlink/signing.py": ("tests/test_signing.py",),
 }
 CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless

@@ -14,13 +14,16 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from logs import plots, plots_control, plots_link, plots_verdicts
-from logs.flight_data import FlightData
-from logs.path3d import path_3d
-from logs.reader import read
-from logs.svg import Drawing, standalone
-from logs.timeline import timeline
-from logs.verdicts import judge
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+from logs.report import figures as plots_control
+from logs.report import figures as plots_link
+from logs.report import figures as plots_verdicts
+from logs.report import plots
+from logs.report.plots import path_3d
+from logs.report.svg import Drawing, standalone
+from logs.report.timeline import timeline
+from logs.report.verdicts import judge
 
 OUT = Path(__file__).parents[1] / "docs" / "img"
 WIDTH = 92

@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uavctl.campaign.intervals import paired_ratio
-from uavctl.campaign.results import Results, read_results
-from uavctl.campaign.statistics import CellSummary, cell_summary
-from uavctl.campaign.verdict import grouped
+from uavctl.lab.campaign.intervals import paired_ratio
+from uavctl.lab.campaign.results import CellSummary, Results, cell_summary, grouped, read_results
 
 COLUMNS = ("cost", "settled_cost")
 

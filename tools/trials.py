@@ -32,10 +32,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from uavctl.errors import UavctlError
-from uavctl.trial.case import AIRS, AUTOPILOTS, SCENARIOS, Scenario, TrialCell, TrialPilot
-from uavctl.trial.figures import SHOWN
-from uavctl.trial.fly import TrialFlight, fly
-from uavctl.trial.own_loop import TUNED, OwnTuning
+from uavctl.lab.own_loop import TUNED, OwnTuning
+from uavctl.lab.trial import AIRS, AUTOPILOTS, SCENARIOS, SHOWN, Scenario, TrialCell, TrialFlight, TrialPilot, fly
 
 SCHEMES = ("hahn-stursberg", "age-conditioned")
 PILOTS = ("configured", *SCHEMES, "own", "own-tuned")

@@ -27,7 +27,6 @@ class Ticker:
     ones before it are counted as missed and never made up.
 
     Args:
-        period_ns: time between ticks.
         align_ns: the grid's origin is a multiple of it; itself a multiple of `period_ns`.
         now: the clock [ns].
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 Convention = Literal["ned", "enu", "flu"]
 Quaternion = tuple[float, float, float, float]
@@ -36,10 +36,7 @@ _UNIT_TOLERANCE = 0.1
 
 Up = Literal["y", "z"]
 # A right-handed camera frame whose first axis lies level, to (first axis, its right-hand side, down).
-_LEVEL: dict[Up, Callable[[Vec3], Vec3]] = {
-    "y": lambda v: (v[0], v[2], -v[1]),
-    "z": _SWAP["flu"],
-}
+_LEVEL: dict[Up, Callable[[Vec3], Vec3]] = {"y": lambda v: (v[0], v[2], -v[1]), "z": _SWAP["flu"]}
 
 
 def _cos_sin(yaw_deg: float) -> tuple[float, float]:
@@ -52,18 +49,13 @@ def _cos_sin(yaw_deg: float) -> tuple[float, float]:
 class Frame:
     """A frame fixed in the room, and its place in local NED.
 
-    Attributes:
-        convention: its axes: `ned` (or forward, right, down), `enu`, `flu` (forward, left, up).
-        origin_m: position of its origin in local NED [m].
-        yaw_deg: heading of its first axis after conversion to down-pointing axes, clockwise seen
-            from above [deg].
-
     Raises:
         ValueError: an unknown convention, or a number that is not finite.
     """
 
-    convention: Convention = "ned"
-    origin_m: Vec3 = (0.0, 0.0, 0.0)
+    convention: Convention = "ned"  # its axes: `ned` (or forward, right, down), `enu`, `flu` (forward, left, up)
+    origin_m: Vec3 = (0.0, 0.0, 0.0)  # position of its origin in local NED [m]
+    # heading of its first axis after conversion to down-pointing axes, clockwise seen from above [deg]
     yaw_deg: float = 0.0
     _rotation: tuple[float, float] = field(init=False, repr=False, compare=False)
 
@@ -118,7 +110,6 @@ def levelled(position_m: Vec3, attitude: Quaternion, up: Up) -> tuple[Vec3, Quat
     Args:
         position_m: in the room's axes, right-handed [m].
         attitude: the body's axes to the room's (w, x, y, z); a body that it does not turn has the room's axes.
-        up: which axis of both points up.
 
     Returns:
         Position [m] and attitude; forward is the first axis.
@@ -138,7 +129,6 @@ def rotate(q: Quaternion, vector: Vec3) -> Vec3 | None:
 
     Args:
         q: quaternion; its length is normalised.
-        vector: vector in body axes.
 
     Returns:
         The vector in reference axes, or None if q is no rotation (not finite, or its length is not near 1).
@@ -151,11 +141,7 @@ def rotate(q: Quaternion, vector: Vec3) -> Vec3 | None:
     a, b, c = vector
     # v + 2 w (u × v) + 2 u × (u × v), u = (x, y, z)
     tx, ty, tz = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return (
-        a + w * tx + y * tz - z * ty,
-        b + w * ty + z * tx - x * tz,
-        c + w * tz + x * ty - y * tx,
-    )
+    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
 
 
 def unit(q: tuple[float, ...]) -> Quaternion | None:

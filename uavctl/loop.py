@@ -13,7 +13,15 @@ from traceback import extract_tb
 from msgspec.structs import replace
 
 from uavctl.config import Config
-from uavctl.data import (
+from uavctl.flight.controller import Controller
+from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, initial_state, step
+from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
+from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver
+from uavctl.mavlink.handover_guards import LEAVES_NONE, HandoverState, HandoverView, Sending, against_moving
+from uavctl.mavlink.messages import Ack, Message, Text
+from uavctl.mavlink.relay import Relay
+from uavctl.outcome import Cause, FlightCourse
+from uavctl.records import (
     ORDER_ACCEPTED,
     ORDER_REFUSED,
     Command,
@@ -39,15 +47,6 @@ from uavctl.data import (
     VehicleStatus,
     raw_topic,
 )
-from uavctl.ending import Cause, FlightCourse
-from uavctl.flight.bias_bound import BIAS_AT_BOUND, BIAS_FREE
-from uavctl.flight.step import Controller, StepOutput, initial_state, step
-from uavctl.mavlink.hand_over import HAND_OVER_ORDERS, HandOver
-from uavctl.mavlink.link import OVERRUN, Link
-from uavctl.mavlink.messages import Ack, Message, Text
-from uavctl.mavlink.mode import LEAVES_NONE, Sending, State
-from uavctl.mavlink.relay import Relay
-from uavctl.mavlink.sight import View, against_moving
 from uavctl.smpc.plant import Plant
 
 Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | Text
@@ -64,17 +63,16 @@ MAX_NOTICES = 100  # that wait for the console
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
-def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, Link]:
+def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, MavlinkConnection]:
     """The connections' protocol states: one for both roles when the two URLs are the same.
 
     Args:
-        config: the configuration.
         listen: hears every message of others that is understood.
     """
     shared = config.daemon.vehicle == config.daemon.mocap
     names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
     return {
-        name: Link(
+        name: MavlinkConnection(
             name,
             roles=frozenset(roles),
             daemon=config.daemon,
@@ -89,7 +87,7 @@ def make_links(config: Config, listen: Callable[[Message, int], None] | None = N
 
 
 class ControlLoop:
-    """One vehicle's controller with its MAVLink links; implements `uavctl.data.Flyer`.
+    """One vehicle's controller with its MAVLink links; implements `uavctl.records.Flyer`.
 
     `stopwatch` gives nanoseconds for the timing records only; no decision depends on it.
     """
@@ -183,14 +181,14 @@ class ControlLoop:
         return "" if self._state.breach is None else self._state.breach.text
 
     @property
-    def who_flies(self) -> State:
+    def who_flies(self) -> HandoverState:
         """Where the hand-over stands."""
         return self._hand_over.state
 
     @property
     def leaves_vehicle(self) -> bool | None:
         """Whether a vehicle would be left behind that has flown on our setpoints; None before one is heard."""
-        return None if self.who_flies is State.WAITING else self.who_flies not in LEAVES_NONE
+        return None if self.who_flies is HandoverState.WAITING else self.who_flies not in LEAVES_NONE
 
     def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
         """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing.
@@ -378,7 +376,7 @@ class ControlLoop:
             else:
                 waiting.append((received_ns, item))
         self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
-        flown = self._hand_over.state is State.ENGAGED
+        flown = self._hand_over.state is HandoverState.ENGAGED
         left = [status for status in heard if flown and self._hand_over.has_left(status)]
         self.vehicle = next(iter(left or heard[::-1]), self.vehicle)
         if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
@@ -421,7 +419,11 @@ class ControlLoop:
             yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
         if sure and told.ask is not None:
             yield self._send(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns)
-        if self._hand_over.ours and self._hand_over.state in (State.READY, State.MODE, State.ARMING):
+        if self._hand_over.ours and self._hand_over.state in (
+            HandoverState.READY,
+            HandoverState.MODE,
+            HandoverState.ARMING,
+        ):
             for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
                 yield self._send(VEHICLE, data, at_ns)
 
@@ -430,11 +432,13 @@ class ControlLoop:
     ) -> Iterator[tuple[Command, Event]]:
         """Each order with its answer; a landing that the core does not fly, and the hand-over asks for, is accepted."""
         for command, event in _answered(commands, core, hand_over):
-            landing = command.order is Order.LAND and event.code == ORDER_REFUSED and self.who_flies is State.LANDING
+            landing = (
+                command.order is Order.LAND and event.code == ORDER_REFUSED and self.who_flies is HandoverState.LANDING
+            )
             text = "land: the vehicle is asked for it"
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
-    def _view(self, inp: StepInput, out: StepOutput) -> View:
+    def _view(self, inp: StepInput, out: StepOutput) -> HandoverView:
         """What the hand-over may know."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
@@ -446,7 +450,7 @@ class ControlLoop:
             unfit = "the controller has no estimate of the position"
         elif estimate.age_s > self._config.fresh_s:
             unfit = f"the newest position is {estimate.age_s:.1f} s old"
-        return View(
+        return HandoverView(
             at_ns=inp.at_ns,
             vehicle=self.vehicle,
             up_s=self._links[VEHICLE].vehicle_up_s(inp.at_ns),

@@ -1,19 +1,129 @@
-"""Items of the frame: do the cameras' axes, unit and handedness agree with what the vehicle knows of itself."""
+"""Axes of the cameras: fit of a rotation."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from uavctl.check.fit import Evidence, Mistake, explain, misfit, possible, yaw_deg
-from uavctl.check.item import Item, State, item
+from uavctl.check.findings import AIDED, HORIZONTAL, Heard, Item, ItemState, item
 from uavctl.check.positions import CAMERA_AXES, from_cameras, spread_m
-from uavctl.check.seen import AIDED, HORIZONTAL, Seen
 from uavctl.config.types import Config
-from uavctl.data import Vec3
 from uavctl.frames import Quaternion, from_euler, multiply, to_euler
+from uavctl.records import Vec3
+
+# What turns the vehicle's axes into the cameras': right, or which of the usual mistakes; least squares on pairs.
+#
+# Every pair (v, e) is a vector as the vehicle knows it and as the cameras see it after `[frame]`. A set-up is a matrix
+# M with e = M v; the right one is I. A mistake is *excluded* by pairs that it does not fit; what no pair excludes
+# stays undetermined.
+
+
+Array = NDArray[np.float64]
+_FLAT = 0.05  # a movement whose third extent is below this part of its largest shows no handedness
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A way in which a camera set-up is commonly wrong: what it is, and its matrix."""
+
+    name: str
+    matrix: Array
+    turns_only: bool = False  # about the vertical: a compared heading shows it too
+
+
+def _signed(*rows: tuple[int, int, int]) -> Array:
+    return np.array(rows, dtype=np.float64)
+
+
+_N, _E, _D = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+MISTAKES = (
+    Mistake("millimetres are taken for metres", 1000.0 * np.eye(3)),
+    Mistake("centimetres are taken for metres", 100.0 * np.eye(3)),
+    Mistake("metres are divided by 1000", 0.001 * np.eye(3)),
+    Mistake("metres are divided by 100", 0.01 * np.eye(3)),
+    Mistake("ENU and NED are swapped (frame.convention)", _signed(_E, _N, (0, 0, -1))),
+    Mistake("up is taken for down (mirrored)", _signed(_N, _E, (0, 0, -1))),
+    Mistake("north is mirrored", _signed((-1, 0, 0), _E, _D)),
+    Mistake("east is mirrored", _signed(_N, (0, -1, 0), _D)),
+    Mistake("north and east are swapped (mirrored)", _signed(_E, _N, _D)),
+    Mistake("axes forward, left, up are taken for NED", _signed(_N, (0, -1, 0), (0, 0, -1))),
+    Mistake("the cameras' second axis points up (y-up)", _signed(_N, (0, 0, -1), _E)),
+    Mistake("turned by 180 deg (frame.yaw_deg)", _signed((-1, 0, 0), (0, -1, 0), _D), True),
+    Mistake("turned by 90 deg (frame.yaw_deg)", _signed((0, -1, 0), _N, _D), True),
+    Mistake("turned by -90 deg (frame.yaw_deg)", _signed(_E, (-1, 0, 0), _D), True),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Pairs that belong together."""
+
+    own: Array  # v (k, 3), vectors as the vehicle knows them [m]
+    seen: Array  # e (k, 3), the same as the cameras see them [m]
+    tolerance_m: float  # root of the mean square of e - v that a right set-up keeps
+
+    def misfit(self, matrix: Array) -> float:
+        """How badly e = M v holds, in tolerances; up to 1 it may be so."""
+        off = self.seen - self.own @ matrix.T
+        # What the vehicle does not know of v counts as often as the set-up multiplies it.
+        scale = max(1.0, float(np.cbrt(abs(np.linalg.det(matrix)))))
+        return math.sqrt(float(np.mean(np.sum(off * off, axis=1)))) / (self.tolerance_m * scale)
+
+
+def misfit(evidence: Sequence[Evidence], matrix: Array) -> float:
+    """The worst misfit of all evidence; 0 without any."""
+    return max((one.misfit(matrix) for one in evidence), default=0.0)
+
+
+def possible(evidence: Sequence[Evidence]) -> list[Mistake]:
+    """The mistakes that no evidence excludes."""
+    return [one for one in MISTAKES if misfit(evidence, one.matrix) <= 1.0]
+
+
+def yaw_deg(evidence: Sequence[Evidence]) -> float:
+    """Least-squares turn about the vertical from the vehicle's axes to the cameras', clockwise from above [deg]."""
+    sine = sum(float(np.sum(one.own[:, 0] * one.seen[:, 1] - one.own[:, 1] * one.seen[:, 0])) for one in evidence)
+    cosine = sum(float(np.sum(one.own[:, :2] * one.seen[:, :2])) for one in evidence)
+    return math.degrees(math.atan2(sine, cosine))
+
+
+def turn(angle_deg: float) -> Array:
+    """Matrix of a turn about the vertical."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def explain(evidence: Sequence[Evidence]) -> str:
+    """What is wrong, for evidence that does not fit I: a usual mistake, a turn, or what the best similarity shows."""
+    usual = possible(evidence)
+    angle = yaw_deg(evidence)
+    if len(usual) > 1:
+        return "one of: " + "; ".join(one.name for one in usual)
+    if usual:
+        return usual[0].name
+    if misfit(evidence, turn(angle)) <= 1.0:
+        return f"turned by {angle:.0f} deg about the vertical (frame.yaw_deg is {angle:.0f} deg too large)"
+    return _similarity(evidence)
+
+
+def _similarity(evidence: Sequence[Evidence]) -> str:
+    """Scale, and handedness where it is determined, of the best similarity of the longest evidence (Umeyama 1991)."""
+    longest = max(evidence, key=lambda one: len(one.own))
+    own, seen = (float(np.sqrt(np.mean(np.sum(a * a, axis=1)))) for a in (longest.own, longest.seen))
+    u, extents, vt = np.linalg.svd(longest.seen.T @ longest.own)
+    words = [f"{own:.2g} m for the vehicle are {seen:.2g} m for the cameras"]
+    if extents[2] > _FLAT**2 * extents[0] and float(np.linalg.det(u @ vt)) < 0.0:
+        words.append("and they are mirrored")
+    return " ".join(words)
+
+
+# Items of the frame: do the cameras' axes, unit and handedness agree with what the vehicle knows of itself.
+
 
 ENOUGH = 5  # pairs
 _OWN = ("LOCAL_POSITION_NED",)
@@ -26,16 +136,14 @@ _WANT = "the same axes, unit and handedness as the vehicle's own"
 _MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
 
 
-def axis_items(seen: Seen, config: Config, asked: list[tuple[Vec3, Vec3]]) -> list[Item]:
+def axis_items(seen: Heard, config: Config, asked: list[tuple[Vec3, Vec3]]) -> list[Item]:
     """Items of own position, axes and heading.
 
     Args:
-        seen: what was heard.
-        config: the configuration.
         asked: (movement that was asked for, movement that the cameras saw), local NED [m].
     """
     if config.source.messages == _OWN:
-        return [item("axes", State.GOOD, "the positions are the vehicle's own", _WANT)]
+        return [item("axes", ItemState.GOOD, "the positions are the vehicle's own", _WANT)]
     if len(seen.samples) < ENOUGH:
         return []
     pairs = seen.pairs() if _has_position(seen) else []
@@ -43,12 +151,12 @@ def axis_items(seen: Seen, config: Config, asked: list[tuple[Vec3, Vec3]]) -> li
     return [_own(seen, pairs), _axes(seen, config, pairs, asked, heading_agrees=agrees), heading]
 
 
-def compared(seen: Seen) -> bool:
+def compared(seen: Heard) -> bool:
     """Whether there are positions of the vehicle's own to compare the cameras' with."""
     return _has_position(seen) and len(seen.pairs()) >= ENOUGH
 
 
-def _has_position(seen: Seen) -> bool:
+def _has_position(seen: Heard) -> bool:
     flags = seen.estimator
     if flags is None:
         return True
@@ -56,16 +164,16 @@ def _has_position(seen: Seen) -> bool:
     return bool(flags & HORIZONTAL and not stands)
 
 
-def _own(seen: Seen, pairs: list[tuple[Vec3, Vec3]]) -> Item:
+def _own(seen: Heard, pairs: list[tuple[Vec3, Vec3]]) -> Item:
     name, want = "own position", "the vehicle's own position, to compare"
     if len(pairs) >= ENOUGH:
         away = np.linalg.norm(np.median([np.subtract(e, v) for e, v in pairs], axis=0))
-        return item(name, State.GOOD, f"{len(pairs)} pairs, {away:.2f} m from the cameras'", want)
+        return item(name, ItemState.GOOD, f"{len(pairs)} pairs, {away:.2f} m from the cameras'", want)
     flags = "not told" if seen.estimator is None else f"flags 0x{seen.estimator:x}"
     hint = (
         "give its estimator positions (the vehicle's parameters, [relay]); meanwhile `uavctl check --move` shows axes"
     )
-    return item(name, State.UNDETERMINED, f"none (estimator: {flags})", want, hint)
+    return item(name, ItemState.UNDETERMINED, f"none (estimator: {flags})", want, hint)
 
 
 def evidence_of(
@@ -95,32 +203,27 @@ def _extent(places: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
 
 
 def _axes(
-    seen: Seen,
-    config: Config,
-    pairs: list[tuple[Vec3, Vec3]],
-    asked: list[tuple[Vec3, Vec3]],
-    *,
-    heading_agrees: bool,
+    seen: Heard, config: Config, pairs: list[tuple[Vec3, Vec3]], asked: list[tuple[Vec3, Vec3]], *, heading_agrees: bool
 ) -> Item:
     evidence, moved = evidence_of(pairs, asked, config)
     if misfit(evidence, np.eye(3)) > 1.0:
-        return item("axes", State.BAD, explain(evidence) + _where(evidence), _WANT, _hint(evidence, config))
+        return item("axes", ItemState.BAD, explain(evidence) + _where(evidence), _WANT, _hint(evidence, config))
     if moved is not None and float(np.sqrt(np.mean(np.sum(moved.own[:, :2] ** 2, axis=1)))) >= config.check.move_m / 3:
         angle = yaw_deg([moved])
         if abs(angle) > config.check.yaw_deg:
             hint = f"frame.yaw_deg is {angle:.0f} deg too large, if the vehicle's heading is right"
-            return item("axes", State.BAD, f"turned by {angle:.0f} deg about the vertical", _WANT, hint)
+            return item("axes", ItemState.BAD, f"turned by {angle:.0f} deg about the vertical", _WANT, hint)
     # What the vehicle believes because these very positions told it shows nothing.
     shown = evidence_of([], asked, config)[0] if config.relay.enabled else evidence
     left = _left(possible(shown), seen, config, heading_agrees=heading_agrees and not config.relay.enabled)
     how = ", ".join(word for word, there in (("at rest", not moved and not asked), ("moved", moved or asked)) if there)
     if left:
         value = f"nothing contradicts ({how}), not excluded: " + "; ".join(one.name for one in left)
-        return item("axes", State.UNDETERMINED, value, _WANT, _MOVE)
-    return item("axes", State.GOOD, f"the same ({how})", _WANT)
+        return item("axes", ItemState.UNDETERMINED, value, _WANT, _MOVE)
+    return item("axes", ItemState.GOOD, f"the same ({how})", _WANT)
 
 
-def _left(mistakes: list[Mistake], seen: Seen, config: Config, *, heading_agrees: bool) -> list[Mistake]:
+def _left(mistakes: list[Mistake], seen: Heard, config: Config, *, heading_agrees: bool) -> list[Mistake]:
     """Mistakes that neither a heading nor the size of the noise excludes."""
     believed_m, worst_m = config.estimator.position_std_m, max(spread_m(seen.samples))
     left = [one for one in mistakes if not (heading_agrees and one.turns_only)]
@@ -147,7 +250,7 @@ def _hint(evidence: list[Evidence], config: Config) -> str:
     return hint + ("; does the vehicle count from another origin? Then check.same_origin = false" if alone else "")
 
 
-def _heading(seen: Seen, config: Config) -> tuple[Item, bool]:
+def _heading(seen: Heard, config: Config) -> tuple[Item, bool]:
     """The cameras' attitude beside the vehicle's own, and whether they agree."""
     name, limit_deg = "heading", config.check.yaw_deg
     want = f"the cameras' attitude within {limit_deg:g} deg of the vehicle's own"
@@ -157,7 +260,7 @@ def _heading(seen: Seen, config: Config) -> tuple[Item, bool]:
         hint = "let the source send the body's attitude: it shows a turned frame at rest"
         if _told(seen):
             told, hint = "the vehicle tells none", "let the vehicle stream ATTITUDE on this link"
-        return item(name, State.UNDETERMINED, told, want, hint), False
+        return item(name, ItemState.UNDETERMINED, told, want, hint), False
     yaws = [to_euler(q)[2] for q in turns]
     # Mean of directions: angles near 180 deg must not average to 0.
     yaw = math.degrees(math.atan2(sum(map(math.sin, yaws)), sum(map(math.cos, yaws))))
@@ -165,21 +268,21 @@ def _heading(seen: Seen, config: Config) -> tuple[Item, bool]:
     value = f"{yaw:.1f} deg apart about the vertical, {tilt:.1f} deg in tilt"
     if tilt > _TILT_DEG:
         hint = "the cameras' axes point up where [frame] says down, or the body was defined lying otherwise"
-        return item(name, State.BAD, value, want, hint), False
+        return item(name, ItemState.BAD, value, want, hint), False
     if abs(yaw) > limit_deg:
         hint = (
             f"turn the frame (frame.yaw_deg {yaw:.0f} deg too large, or frame.convention), turn the body's own axes in "
             "the cameras' software with its nose along their first axis, or see to the vehicle's compass"
         )
-        return item(name, State.BAD, value, want, hint), False
-    return item(name, State.GOOD, value, want), True
+        return item(name, ItemState.BAD, value, want, hint), False
+    return item(name, ItemState.GOOD, value, want), True
 
 
-def _told(seen: Seen) -> bool:
+def _told(seen: Heard) -> bool:
     return seen.attitude_told or seen.fuses_attitude
 
 
-def _relative(seen: Seen) -> list[Quaternion]:
+def _relative(seen: Heard) -> list[Quaternion]:
     """Turns from the vehicle's attitude to the cameras', one for each sample that has both."""
     if not _told(seen) or not seen.angles_rad:
         return []

@@ -7,13 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from uavctl.check.item import Item, State, item, judged
-from uavctl.check.seen import Sample, Seen
-from uavctl.config.mission_checks import position_index
-from uavctl.config.peers import CAMERAS
+from uavctl.check.findings import Heard, Item, ItemState, Sample, item, judged
+from uavctl.config.checks import position_index
+from uavctl.config.connections import CAMERAS
 from uavctl.config.types import Config
-from uavctl.data import Vec3
-from uavctl.loss_runs import loss_std
+from uavctl.flight.link_estimate import loss_std
+from uavctl.records import Vec3
 
 _ENOUGH = 8  # samples without which nothing is said
 _AGE_TOLERANCE_S = 0.005
@@ -29,7 +28,7 @@ CAMERA_AXES = (
 _AXES = ("north", "east", "down")
 
 
-def position_items(seen: Seen, config: Config, at_ns: int) -> list[Item]:
+def position_items(seen: Heard, config: Config, at_ns: int) -> list[Item]:
     """Items of rate, gaps, age, loss, noise and place of the positions heard up to `at_ns`."""
     if not seen.samples:
         return [_nothing(seen, config)]
@@ -41,7 +40,7 @@ def position_items(seen: Seen, config: Config, at_ns: int) -> list[Item]:
     return items
 
 
-def _nothing(seen: Seen, config: Config) -> Item:
+def _nothing(seen: Heard, config: Config) -> Item:
     bad = {reason: n for stats in seen.stats.values() for reason, n in stats.bad.items()}
     told = ", ".join(f"{count} {reason}" for reason, count in sorted(bad.items())) or "nothing came"
     names = ", ".join(config.source.messages)
@@ -52,7 +51,7 @@ def _nothing(seen: Seen, config: Config) -> Item:
         )
     if from_cameras(config):
         hint = f"does Motive track the body of {config.daemon.mocap}, and stream rigid bodies? See docs/sources.md"
-    return item("positions", State.BAD, f"none ({told})", "positions of the source", hint)
+    return item("positions", ItemState.BAD, f"none ({told})", "positions of the source", hint)
 
 
 def from_cameras(config: Config) -> bool:
@@ -78,7 +77,7 @@ def _rate(captured_s: list[float], period_s: float | None, config: Config) -> It
     want = f"at least {least_hz:.3g} Hz ({why})"
     if len(captured_s) <= _ENOUGH:
         value = f"only {len(captured_s)} positions came"
-        return item("position rate", State.BAD, value, want, "listen longer, or see why")
+        return item("position rate", ItemState.BAD, value, want, "listen longer, or see why")
     arrived_hz = (len(captured_s) - 1) / max(captured_s[-1] - captured_s[0], 1e-9)
     if period_s is None:
         good, value = arrived_hz >= least_hz, "irregular captures"
@@ -93,7 +92,7 @@ def _rate(captured_s: list[float], period_s: float | None, config: Config) -> It
     )
 
 
-def _gaps(seen: Seen, config: Config, at_ns: int) -> Item:
+def _gaps(seen: Heard, config: Config, at_ns: int) -> Item:
     arrivals = [*sorted(one.received_ns for one in seen.samples), at_ns]
     longest_s = max(b - a for a, b in pairwise(arrivals)) * 1e-9
     horizon_s = config.smpc.horizon * config.plant.dt_s
@@ -106,7 +105,7 @@ def _gaps(seen: Seen, config: Config, at_ns: int) -> Item:
     )
 
 
-def _age(seen: Seen, config: Config) -> Item:
+def _age(seen: Heard, config: Config) -> Item:
     ages_s = sorted((one.received_ns - one.captured_ns) * 1e-9 for one in seen.samples)
     p95_s, limit_s = ages_s[int(0.95 * (len(ages_s) - 1))], config.link.delay_s + config.link.jitter_s
     known = any(stats.clock_source == "timesync" for stats in seen.stats.values())
@@ -122,8 +121,8 @@ def _age(seen: Seen, config: Config) -> Item:
     )
     hint = "design for the delay that is there: raise link.delay_s or link.jitter_s (then schedule.late), or the link"
     if p95_s > worst_s:
-        return item("position age", State.BAD, value, want, hint)
-    state = State.GOOD if p95_s <= limit_s + _AGE_TOLERANCE_S else State.NOTE
+        return item("position age", ItemState.BAD, value, want, hint)
+    state = ItemState.GOOD if p95_s <= limit_s + _AGE_TOLERANCE_S else ItemState.NOTE
     return item("position age", state, value, want, hint)
 
 
@@ -138,11 +137,11 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     steps = [math.floor((at_s - middle_s) / dt_s + 0.5) for at_s in captured_s]
     count = steps[-1] - steps[0] + 1
     if count < _ENOUGH:
-        return item(name, State.UNDETERMINED, f"only {count} steps", want, "listen longer")
+        return item(name, ItemState.UNDETERMINED, f"only {count} steps", want, "listen longer")
     loss = 1.0 - len(set(steps)) / count
     value = f"{loss:.0%} of {count} steps"
     if link.model != "bernoulli" or link.probability:
-        return item(name, State.NOTE, value, f"as link.model {link.model!r} has it", "compare it with the model's")
+        return item(name, ItemState.NOTE, value, f"as link.model {link.model!r} has it", "compare it with the model's")
     # Two standard deviations: fewer than one right set-up in forty is told that it loses more than it does.
     # Losses in bursts vary more than that.
     alone = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
@@ -161,7 +160,7 @@ def spread_m(samples: list[Sample]) -> Vec3:
     return n, e, d
 
 
-def rests(seen: Seen, move_m: float) -> bool:
+def rests(seen: Heard, move_m: float) -> bool:
     """Whether the vehicle stood still, as far as its own position, or else the cameras', show."""
     where = [place for _, place in seen.own] if len(seen.own) >= _ENOUGH else [one.position_m for one in seen.samples]
     low, high = np.percentile(np.array(where), [5, 95], axis=0)
@@ -172,12 +171,12 @@ def _noise(samples: list[Sample], config: Config) -> Item:
     believed_m = config.estimator.position_std_m
     want = f"at most {_NOISE_FACTOR:g} x {believed_m * 1e3:.3g} mm (estimator.position_std_m)"
     if len(samples) < _ENOUGH:
-        return item("position noise", State.UNDETERMINED, "too few positions", want, "listen longer")
+        return item("position noise", ItemState.UNDETERMINED, "too few positions", want, "listen longer")
     worst_m = max(spread_m(samples))
     value = f"{worst_m * 1e3:.3g} mm"
     low, high = np.percentile(np.array([one.position_m for one in samples]), [5, 95], axis=0)
     if float((high - low).max()) > max(10.0 * worst_m, config.check.move_m):
-        return item("position noise", State.UNDETERMINED, f"{value}, but the body moved", want, "let it rest")
+        return item("position noise", ItemState.UNDETERMINED, f"{value}, but the body moved", want, "let it rest")
     hint = "see to the cameras' calibration, or raise estimator.position_std_m"
     for scale, unit in () if from_cameras(config) else _UNITS:
         if believed_m * _NOISE_FACTOR < worst_m <= believed_m * scale * _NOISE_FACTOR and worst_m > 10 * believed_m:
@@ -218,7 +217,7 @@ def _is_inside(where: list[float], limits: dict[str, tuple[float, float]], margi
     return all(low - margin_m <= value <= high + margin_m for value, low, high in low_high)
 
 
-def _stuck(seen: Seen) -> Item:
+def _stuck(seen: Heard) -> Item:
     ordered = [one.position_m for one in seen.samples]
     run = longest = 1
     for a, b in pairwise(ordered):
@@ -226,6 +225,6 @@ def _stuck(seen: Seen) -> Item:
         longest = max(longest, run)
     name, want = "position stuck", f"no {_STUCK_SAMPLES} positions in a row the same to the last bit"
     if longest < _STUCK_SAMPLES:
-        return item(name, State.GOOD, f"at most {longest} in a row the same", want)
+        return item(name, ItemState.GOOD, f"at most {longest} in a row the same", want)
     hint = "cameras have noise: does the source repeat the last pose of a body that it has lost?"
-    return item(name, State.UNDETERMINED, f"{longest} in a row the same", want, f"{hint} Move the body to see")
+    return item(name, ItemState.UNDETERMINED, f"{longest} in a row the same", want, f"{hint} Move the body to see")

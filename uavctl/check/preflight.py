@@ -5,22 +5,122 @@ Sans IO and without a clock, as the control loop is: datagrams and times in, dat
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 from uavctl.check.axes import axis_items, compared
-from uavctl.check.clocks import clock_items
-from uavctl.check.guide import Guide
-from uavctl.check.item import Item, State, item
-from uavctl.check.parameters import parameter_items, wanted
+from uavctl.check.findings import Heard, Item, ItemState, item
 from uavctl.check.positions import position_items
-from uavctl.check.seen import Seen
-from uavctl.check.vehicle import is_armed, vehicle_items
+from uavctl.check.vehicle import clock_items, is_armed, parameter_items, vehicle_items, wanted
 from uavctl.config.types import Config
-from uavctl.data import Outgoing, PositionSample, VehicleStatus
-from uavctl.mavlink.link import Link
+from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Message
 from uavctl.mavlink.relay import Relay
+from uavctl.records import Outgoing, PositionSample, Vec3, VehicleStatus
+
+# Moving the body by hand as asked, to see the cameras' axes; pure, time is an argument.
+
+
+WAY_M = 0.5
+_DONE_M = 0.35  # from the start of a prompt, and then at rest
+_REST_NS = 700_000_000
+_REST_M = 0.05
+PROMPTS = (
+    ("up", "lift the body 0.5 m straight up, and hold it there"),
+    ("nose", "carry the body 0.5 m along its nose, level, and hold it there"),
+    ("right", "carry the body 0.5 m to its right, level, and hold it there"),
+)
+
+
+class Guide:
+    """Asks for one movement after another, and takes down what the cameras see of each.
+
+    Args:
+        limit_ns: time for each prompt; one that is not followed is passed over.
+
+    Attributes:
+        moves: (asked for, seen), local NED [m].
+        missed: names of prompts that were not followed.
+    """
+
+    def __init__(self, limit_ns: int) -> None:
+        self._limit_ns = limit_ns
+        self._index = 0
+        self._begun_ns: int | None = None
+        self._recent: deque[tuple[int, Vec3]] = deque()
+        self._start: Vec3 | None = None
+        self.moves: list[tuple[Vec3, Vec3]] = []
+        self.missed: list[str] = []
+
+    @property
+    def over(self) -> bool:
+        """Whether every prompt was followed or passed over."""
+        return self._index >= len(PROMPTS)
+
+    @property
+    def prompt(self) -> str:
+        """What is asked for now; empty while the body has to rest first, and at the end."""
+        return "" if self.over or self._start is None else PROMPTS[self._index][1]
+
+    def take(self, at_ns: int, position_m: Vec3, heading_rad: float | None) -> None:
+        """Take a position of the cameras.
+
+        Args:
+            position_m: local NED [m].
+            heading_rad: the vehicle's own heading; without one only `up` can be asked for.
+        """
+        if self.over:
+            return
+        self._begun_ns = at_ns if self._begun_ns is None else self._begun_ns
+        self._recent.append((at_ns, position_m))
+        while self._recent[0][0] < at_ns - _REST_NS:
+            self._recent.popleft()
+        middle = self._resting(at_ns)
+        if middle is not None and self._start is None:
+            self._start = middle
+        elif middle is not None and self._start is not None:
+            self._judge(middle, heading_rad)
+        if self._begun_ns is not None and at_ns - self._begun_ns > self._limit_ns:
+            self.missed.append(PROMPTS[self._index][0])
+            self._next()
+
+    def _resting(self, at_ns: int) -> Vec3 | None:
+        """Mean of the last positions if they are at one place (in any unit), and there are enough."""
+        if len(self._recent) < 4 or at_ns - self._recent[0][0] < _REST_NS * 3 // 4:
+            return None
+        places = [place for _, place in self._recent]
+        n, e, d = (sum(axis) / len(places) for axis in zip(*places, strict=True))
+        reach = 0.0 if self._start is None else math.dist((n, e, d), self._start)
+        still = max(math.dist(place, (n, e, d)) for place in places) <= max(_REST_M, 0.1 * reach)
+        return (n, e, d) if still else None
+
+    def _judge(self, middle: Vec3, heading_rad: float | None) -> None:
+        start = self._start or middle
+        seen = (middle[0] - start[0], middle[1] - start[1], middle[2] - start[2])
+        if math.hypot(*seen) < _DONE_M:
+            return
+        wanted = _direction(PROMPTS[self._index][0], heading_rad)
+        if wanted is not None:
+            self.moves.append((wanted, seen))
+            self._next()
+
+    def _next(self) -> None:
+        self._index += 1
+        self._begun_ns = self._start = None
+        self._recent.clear()
+
+
+def _direction(name: str, heading_rad: float | None) -> Vec3 | None:
+    """The movement that a prompt asks for, local NED [m]."""
+    if name == "up":
+        return (0.0, 0.0, -WAY_M)
+    if heading_rad is None:
+        return None
+    along = WAY_M * math.cos(heading_rad), WAY_M * math.sin(heading_rad)
+    return (along[0], along[1], 0.0) if name == "nose" else (-along[1], along[0], 0.0)
+
 
 VEHICLE = "vehicle"
 ASK_NS = 1_000_000_000  # between two rounds of requests
@@ -33,7 +133,7 @@ _STREAMS_HZ = {3: {148: 0.0, 193: 1.0}, 12: {148: 0.0, 230: 1.0}}
 class MakeLinks(Protocol):
     """Makes the protocol states of the connections, with somebody who hears every message."""
 
-    def __call__(self, config: Config, listen: Listen) -> Mapping[str, Link]:
+    def __call__(self, config: Config, listen: Listen) -> Mapping[str, MavlinkConnection]:
         """The links by name."""
         ...
 
@@ -47,13 +147,10 @@ class Listen(Protocol):
 
 
 class Preflight:
-    """One check; implements `uavctl.data.Flyer`.
+    """One check; implements `uavctl.records.Flyer`.
 
     Args:
-        config: the configuration.
         make_links: makes the links (`uavctl.loop.make_links`).
-        begun_ns: when listening begins.
-        move: ask a person to move the body.
         take_off_m: height of the climb that is planned [m].
 
     Attributes:
@@ -73,7 +170,7 @@ class Preflight:
     ) -> None:
         self._config, self._take_off_m = config, take_off_m
         self._links = make_links(config, self._hear)
-        self._seen = Seen(begun_ns)
+        self._seen = Heard(begun_ns)
         self._relay = Relay(config.relay)
         self._asked_ns: int | None = None
         self._rounds = 0
@@ -115,7 +212,7 @@ class Preflight:
             for data in self._requests(vehicle):
                 yield Outgoing(link=VEHICLE, data=data)
 
-    def _requests(self, vehicle: Link) -> Iterator[bytes]:
+    def _requests(self, vehicle: MavlinkConnection) -> Iterator[bytes]:
         """What has not been told yet is asked for."""
         kind = self._seen.autopilot
         if self._rounds <= 2:  # a lost request is repeated once; a vehicle that ignores it is not pestered
@@ -144,7 +241,7 @@ class Preflight:
             return []
         kept = ", ".join(f"{count} {reason}" for reason, count in self._relay.kept.items() if count)
         value = f"{self._relay.sent} positions passed on" + (f", kept: {kept}" if kept else "")
-        state = State.GOOD if self._relay.sent else State.BAD
+        state = ItemState.GOOD if self._relay.sent else ItemState.BAD
         hint = "positions need an attitude, and the vehicle has to answer TIMESYNC"
         return [item("relay", state, value, "the vehicle gets positions", hint)]
 
@@ -156,7 +253,7 @@ class Preflight:
         whole = self.guide.over and not self.guide.missed
         value = f"{done} movements seen" + ("" if whole else f", missing: {missed}")
         hint = "run it again and follow the prompts; `nose` and `right` need the vehicle's ATTITUDE"
-        return [item("movements", State.GOOD if whole else State.BAD, value, "up, nose and right", hint)]
+        return [item("movements", ItemState.GOOD if whole else ItemState.BAD, value, "up, nose and right", hint)]
 
     @property
     def waits(self) -> bool:

@@ -1,23 +1,290 @@
-"""Items of the vehicle: who it is, whether others are heard, armed, landed, battery."""
+"""Items of the vehicle's parameters: what it does when setpoints or positions stop, and where it takes positions from.
+
+The wants are those of docs/autopilots.md, as seen with ArduCopter 4.6 and PX4 (main, 2026).
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.check.item import Item, State, item, judged
-from uavctl.check.seen import Seen
+from uavctl.check.findings import Heard, Item, ItemState, item, judged
+from uavctl.check.positions import limits_m
 from uavctl.config.types import Config
 from uavctl.flight.envelope import MOTION_NS
+from uavctl.mavlink.clocksync import MAX_ROUND_TRIP_NS, RoundTrips
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
+
+# Items of the clocks: who answers TIMESYNC, how far it can be believed, how the clocks drift apart.
+
+
+_DRIFT_PPM = 500.0  # crystals keep 100; what is above is a simulator, or a broken clock
+_REJECTED = 0.5  # part of the answers
+_WANT = f"TIMESYNC answered within {MAX_ROUND_TRIP_NS * 1e-6:.0f} ms"
+
+
+def clock_items(seen: Heard, config: Config) -> list[Item]:
+    """Items of the vehicle's clock and of the source's."""
+    items = [_clock("vehicle clock", seen.trips.get("vehicle"), _of_vehicle(config))]
+    if config.source.messages != ("LOCAL_POSITION_NED",):
+        hint = "set clock.latency_s to the source's smallest delay: without answers ages count from the quickest one"
+        items.append(_clock("source clock", seen.trips.get("source"), (ItemState.NOTE, hint)))
+        items[-1] = _with_stamps(items[-1], seen)
+    return items
+
+
+def _of_vehicle(config: Config) -> tuple[ItemState, str]:
+    """How bad it is that the vehicle does not answer, and what to do."""
+    if config.relay.enabled:
+        return (
+            ItemState.BAD,
+            "[relay] needs the vehicle's clock for its stamps: does the link carry our messages to it?",
+        )
+    return ItemState.NOTE, "does the link carry our messages to the vehicle? Setpoints go the same way"
+
+
+def _clock(name: str, trips: RoundTrips | None, unanswered: tuple[ItemState, str]) -> Item:
+    if trips is None or not trips.round_trips_ns:
+        return item(name, unanswered[0], "TIMESYNC is not answered", _WANT, unanswered[1])
+    ordered = sorted(trips.round_trips_ns)
+    middle_ms, p95_ms = (ordered[int(part * (len(ordered) - 1))] * 1e-6 for part in (0.5, 0.95))
+    drift = trips.drift_ppm
+    value = f"round trip median {middle_ms:.2g} ms, 95 % within {p95_ms:.2g} ms, {trips.rejected} rejected"
+    value += "" if drift is None else f", drift {drift:+.0f} ppm"
+    if trips.rejected > _REJECTED * len(ordered):
+        hint = "a slow or busy link: offsets of such answers are not believed, ages are less certain"
+        return item(name, ItemState.NOTE, value, f"{_WANT}, and few answers rejected", hint)
+    if drift is not None and abs(drift) > _DRIFT_PPM:
+        hint = "the drift is followed; a real clock keeps 100 ppm, so this is a simulator, or a computer short of time"
+        return item(name, ItemState.NOTE, value, f"{_WANT}, and a drift of at most {_DRIFT_PPM:g} ppm", hint)
+    return item(name, ItemState.GOOD, value, _WANT)
+
+
+def _with_stamps(clock: Item, seen: Heard) -> Item:
+    """The source's clock is trouble if its stamps are refused, whether it answers or not."""
+    names = ("future-stamp", "stamp-leap", "duplicate")
+    refused = {name: sum(stats.bad.get(name, 0) for stats in seen.stats.values()) for name in names}
+    if sum(refused.values()) <= len(seen.samples) // 20:
+        return clock
+    told = ", ".join(f"{count} {name}" for name, count in refused.items() if count)
+    hint = "do two programs send the same positions, or does the source's clock jump?"
+    return item(clock.name, ItemState.BAD, f"stamps refused: {told}", "stamps of one clock that goes forward", hint)
+
+
+Get = Callable[[str], float | None]
+_SLOW_S = 1.0
+_NO_RADIO = 4  # COM_RC_IN_MODE
+_EXTERNAL = 6  # EK3_SRC1_*
+_HORIZONTAL, _VERTICAL, _YAW = 1, 2, 8  # EKF2_EV_CTRL
+_ANY = "any value"
+
+
+class ParameterVerdict(NamedTuple):
+    """How a value is, and what is wanted in its place with the other parameters as they are."""
+
+    state: ItemState
+    want: str
+
+
+Judge = Callable[[float, Get, Config], ParameterVerdict]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One parameter: how its value is judged, and what to do about another one."""
+
+    name: str
+    hint: str
+    judge: Judge
+
+
+def _wanted(want: str, *, good: bool, otherwise: ItemState = ItemState.NOTE) -> ParameterVerdict:
+    return ParameterVerdict(ItemState.GOOD if good else otherwise, want)
+
+
+def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerdict:
+    """A want that holds under a condition alone; without it any value will do, and that is what is said."""
+    return _wanted(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {unless}")
+
+
+def _timeout(value: float, _get: Get, config: Config) -> ParameterVerdict:
+    least_s = 3.0 * config.daemon.tick_s
+    want = f"{least_s:g} s (three times daemon.tick_s) to {_SLOW_S:g} s"
+    return _wanted(
+        want, good=least_s <= value <= _SLOW_S, otherwise=ItemState.BAD if value < least_s else ItemState.NOTE
+    )
+
+
+def _offboard_loss(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    flies_on = value in (0, 1, 2) and get("COM_RC_IN_MODE") == _NO_RADIO
+    return _wanted("4: land, or 5: hold", good=value in (4, 5), otherwise=ItemState.BAD if flies_on else ItemState.NOTE)
+
+
+def _guided_options(value: float, _get: Get, _config: Config) -> ParameterVerdict:
+    return _wanted("bits 4 and 5 off", good=not int(value) & 0x30)
+
+
+def _copter_source(value: float, get: Get, config: Config) -> ParameterVerdict:
+    if value == _EXTERNAL and get("VISO_TYPE") == 0:
+        return ParameterVerdict(ItemState.BAD, "6: the cameras, with a VISO_TYPE other than 0")
+    otherwise = ItemState.BAD if config.relay.enabled else ItemState.NOTE
+    return _wanted("6: the cameras", good=value == _EXTERNAL, otherwise=otherwise)
+
+
+def _copter_also(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    applies = get("EK3_SRC1_POSXY") == _EXTERNAL
+    return _only(applies, "6: the cameras", "EK3_SRC1_POSXY is not 6", good=value == _EXTERNAL)
+
+
+def _viso(value: float, get: Get, config: Config) -> ParameterVerdict:
+    if get("EK3_SRC1_POSXY") != _EXTERNAL and not config.relay.enabled:
+        return ParameterVerdict(ItemState.GOOD, f"{_ANY}: no external positions are asked for")
+    return _wanted("1, or another that is not 0", good=value != 0, otherwise=ItemState.BAD)
+
+
+def _compass(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    return _only(get("EK3_SRC1_YAW") == _EXTERNAL, "0: off", "EK3_SRC1_YAW is not 6", good=value == 0)
+
+
+def _copter_failsafe(value: float, _get: Get, config: Config) -> ParameterVerdict:
+    return _wanted("1 or 3: land", good=value in (1, 3), otherwise=_without_positions(config))
+
+
+def _copter_threshold(value: float, _get: Get, config: Config) -> ParameterVerdict:
+    off = _without_positions(config) if value <= 0.0 else ItemState.NOTE
+    return _wanted("0.6 to 1", good=0.6 <= value <= 1.0, otherwise=off)
+
+
+def _without_positions(config: Config) -> ItemState:
+    """How bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
+    return ItemState.BAD if config.relay.enabled else ItemState.NOTE
+
+
+def _px4_external(value: float, _get: Get, config: Config) -> ParameterVerdict:
+    bits = _HORIZONTAL | _VERTICAL | _YAW
+    deaf = config.relay.enabled and not int(value) & _HORIZONTAL
+    want = f"{bits}: position, height, yaw (bits 0, 1 and 3)"
+    return _wanted(want, good=int(value) & bits == bits, otherwise=ItemState.BAD if deaf else ItemState.NOTE)
+
+
+def _takes(get: Get, bit: int) -> bool:
+    """Whether PX4 takes this from external positions."""
+    return bool(int(get("EKF2_EV_CTRL") or 0) & bit)
+
+
+def _px4_height(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    return _only(_takes(get, _VERTICAL), "3: the cameras", "EKF2_EV_CTRL takes no height", good=value == 3)
+
+
+def _px4_gps(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    return _only(_takes(get, _HORIZONTAL), "0: off", "EKF2_EV_CTRL takes no position", good=value == 0)
+
+
+def _px4_mag(value: float, get: Get, _config: Config) -> ParameterVerdict:
+    return _only(_takes(get, _YAW), "5: none", "EKF2_EV_CTRL takes no yaw", good=value == 5)
+
+
+_INDOORS = "the cameras; GPS and compass lead astray indoors"
+ARDUPILOT = (
+    Rule(
+        "GUID_TIMEOUT",
+        "when our setpoints stop, the last acceleration goes on for so long: 3 s took 1.9 m/s to 4.9 m/s",
+        _timeout,
+    ),
+    Rule("GUID_OPTIONS", "with them an acceleration is not held against the wind", _guided_options),
+    Rule("EK3_SRC1_POSXY", f"set it to 6, and VISO_TYPE to 1, to fly on {_INDOORS}", _copter_source),
+    Rule("EK3_SRC1_POSZ", "set it to 6: pressure indoors moves with doors", _copter_also),
+    Rule("EK3_SRC1_YAW", "set it to 6: a compass indoors is off by tens of degrees", _copter_also),
+    Rule("VISO_TYPE", "set it to 1 and restart: without it they are not read", _viso),
+    Rule("COMPASS_USE", "set it to 0: arming checks a compass that is not used", _compass),
+    Rule(
+        "FS_EKF_ACTION",
+        "set it to 1: without its position the vehicle would stay GUIDED and drift, whatever GUID_TIMEOUT is",
+        _copter_failsafe,
+    ),
+    Rule(
+        "FS_EKF_THRESH",
+        "set it to 0.8, as shipped: 0 turns FS_EKF_ACTION off, which was seen to act 8 s after the last position",
+        _copter_threshold,
+    ),
+)
+PX4 = (
+    Rule("COM_OF_LOSS_T", "the last setpoint goes on for so long when ours stop", _timeout),
+    Rule(
+        "COM_OBL_RC_ACT",
+        "set it to 4 (land) or 5 (hold; it goes back to OFFBOARD by itself when setpoints come again): with 0 to 2 and "
+        "no radio it was seen to fly on the last acceleration for 12 s",
+        _offboard_loss,
+    ),
+    Rule("EKF2_EV_CTRL", f"set it to 11 to fly on {_INDOORS}", _px4_external),
+    Rule("EKF2_HGT_REF", "set it to 3: pressure indoors moves with doors", _px4_height),
+    Rule("EKF2_GPS_CTRL", f"set it to 0 to fly on {_INDOORS}", _px4_gps),
+    Rule("EKF2_MAG_TYPE", "set it to 5: a compass indoors is off by tens of degrees", _px4_mag),
+)
+RULES = {3: ARDUPILOT, 12: PX4}  # MAV_AUTOPILOT
+_TAKE_OFF = "MIS_TAKEOFF_ALT"
+_ALSO = {3: (), 12: ("COM_RC_IN_MODE", _TAKE_OFF)}
+
+
+def wanted(autopilot: int | None) -> tuple[str, ...]:
+    """Names of the parameters to ask this kind of autopilot for."""
+    if autopilot not in RULES:
+        return ()
+    return (*_ALSO[autopilot], *(rule.name for rule in RULES[autopilot]))
+
+
+def parameter_items(seen: Heard, config: Config, take_off_m: float | None = None) -> list[Item]:
+    """An item for each parameter that matters to this kind of autopilot; `take_off_m` is the climb that is planned."""
+    rules = RULES.get(seen.autopilot or 0, ())
+    if rules is PX4:
+        rules = (*rules, _climb(config, take_off_m))
+
+    def get(name: str) -> float | None:
+        return seen.parameter(name, px4=seen.autopilot == 12)
+
+    return [_one(rule, get, config) for rule in rules]
+
+
+def _climb(config: Config, take_off_m: float | None) -> Rule:
+    """PX4 climbs to a height of its own, and is asked for OFFBOARD on the way, where `--takeoff` is reached."""
+    ceiling_m = -limits_m(config).get("down", (-math.inf, 0.0))[0]
+    least_m = 0.0 if take_off_m is None else take_off_m
+    bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []
+    bounds += [f"at least {least_m:g} m, --takeoff"] if least_m else []
+    hint = (
+        "set it to the height of --takeoff: PX4 climbs to it by itself. Lower, the flight begins below --takeoff (not "
+        "at all under a third of it); higher than the room, the ceiling ends the climb if OFFBOARD is not granted"
+    )
+
+    def judge(value: float, _get: Get, _config: Config) -> ParameterVerdict:
+        return _wanted("; ".join(bounds) or _ANY, good=least_m <= value <= ceiling_m)
+
+    return Rule(_TAKE_OFF, hint, judge)
+
+
+def _one(rule: Rule, get: Get, config: Config) -> Item:
+    value = get(rule.name)
+    if value is None:
+        hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
+        return item(rule.name, ItemState.UNDETERMINED, "not told", "its value, to judge it", hint)
+    verdict = rule.judge(value, get, config)
+    return item(rule.name, verdict.state, f"{value:g}", verdict.want, rule.hint)
+
+
+# Items of the vehicle: who it is, whether others are heard, armed, landed, battery.
+
 
 _SILENCE_S = 3.0
 _NAMES = {3: "ArduPilot", 12: "PX4"}
 
 
-def vehicle_items(seen: Seen, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
+def vehicle_items(seen: Heard, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
     """Items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
     heartbeat = seen.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
@@ -25,7 +292,7 @@ def vehicle_items(seen: Seen, config: Config, at_ns: int, take_off_m: float | No
         hint = (
             f"is the vehicle on, and does it speak at {config.daemon.vehicle}? See --vehicle, and its telemetry ports"
         )
-        return [item("vehicle", State.BAD, "no heartbeat", want, hint)]
+        return [item("vehicle", ItemState.BAD, "no heartbeat", want, hint)]
     return [
         _who(seen, at_ns, want),
         _others(seen),
@@ -36,7 +303,7 @@ def vehicle_items(seen: Seen, config: Config, at_ns: int, take_off_m: float | No
     ]
 
 
-def _who(seen: Seen, at_ns: int, want: str) -> Item:
+def _who(seen: Heard, at_ns: int, want: str) -> Item:
     assert seen.heartbeat is not None
     kind = seen.heartbeat.autopilot
     silent_s = (at_ns - seen.heartbeat_ns) * 1e-9
@@ -44,13 +311,15 @@ def _who(seen: Seen, at_ns: int, want: str) -> Item:
     name = _NAMES.get(kind, f"MAV_AUTOPILOT {kind}")
     value = f"{name}{version}, system {seen.heartbeat.system}"
     if kind not in _NAMES:
-        return item("vehicle", State.BAD, value, want, "its modes are not known, so its setpoint mode cannot be told")
+        return item(
+            "vehicle", ItemState.BAD, value, want, "its modes are not known, so its setpoint mode cannot be told"
+        )
     if silent_s > _SILENCE_S:
-        return item("vehicle", State.BAD, f"{value}, silent for {silent_s:.1f} s", want, "see to the link")
-    return item("vehicle", State.GOOD, value, want)
+        return item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "see to the link")
+    return item("vehicle", ItemState.GOOD, value, want)
 
 
-def _others(seen: Seen) -> Item:
+def _others(seen: Heard) -> Item:
     count = sum(stats.bad.get(SECOND_VEHICLE, 0) for stats in seen.stats.values())
     return judged(
         "other vehicles",
@@ -61,24 +330,24 @@ def _others(seen: Seen) -> Item:
     )
 
 
-def is_armed(seen: Seen) -> bool:
+def is_armed(seen: Heard) -> bool:
     """Whether the vehicle says that it is armed."""
     return seen.heartbeat is not None and bool(seen.heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
-def _armed(seen: Seen, *, takes_off: bool) -> Item:
+def _armed(seen: Heard, *, takes_off: bool) -> Item:
     want = "disarmed before a flight"
     if not is_armed(seen):
-        return item("armed", State.GOOD, "no", want)
+        return item("armed", ItemState.GOOD, "no", want)
     if takes_off:
         hint = "land and disarm it, or start without --arm --takeoff to fly it from where it is"
-        return item("armed", State.BAD, "yes, already", want, hint)
-    return item("armed", State.NOTE, "yes", want, "keep away from the propellers")
+        return item("armed", ItemState.BAD, "yes, already", want, hint)
+    return item("armed", ItemState.NOTE, "yes", want, "keep away from the propellers")
 
 
-def _landed(seen: Seen) -> Item:
+def _landed(seen: Heard) -> Item:
     told = {None: "not told", True: "on the ground", False: "in the air"}[seen.landed]
-    state = State.GOOD if seen.landed else State.NOTE
+    state = ItemState.GOOD if seen.landed else ItemState.NOTE
     hint = (
         "a flight with --arm --takeoff begins on the ground"
         if seen.landed is False
@@ -87,7 +356,7 @@ def _landed(seen: Seen) -> Item:
     return item("landed", state, told, "on the ground", hint)
 
 
-def _own_velocity(seen: Seen) -> Item:
+def _own_velocity(seen: Heard) -> Item:
     """Whether positions can be held against the vehicle's own velocity in flight."""
     want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, for positions to be held against it in flight"
     hint = (
@@ -95,16 +364,16 @@ def _own_velocity(seen: Seen) -> Item:
         "see to the vehicle's streams, and to its estimator"
     )
     if len(seen.own) < 2:
-        return item("own velocity", State.NOTE, "not told", want, hint)
+        return item("own velocity", ItemState.NOTE, "not told", want, hint)
     period_ns = median(b - a for (a, _), (b, _) in pairwise(seen.own))
-    state = State.GOOD if period_ns <= MOTION_NS else State.NOTE
+    state = ItemState.GOOD if period_ns <= MOTION_NS else ItemState.NOTE
     return item("own velocity", state, f"{1e9 / period_ns:.3g} Hz", want, hint)
 
 
-def _battery(seen: Seen, config: Config) -> Item:
+def _battery(seen: Heard, config: Config) -> Item:
     least_v = config.check.battery_v
     want = f"at least {least_v:g} V (check.battery_v)" if least_v else "check.battery_v is not set"
     if seen.battery_v is None:
-        return item("battery", State.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
+        return item("battery", ItemState.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
     value = f"{seen.battery_v:.2f} V"
     return judged("battery", good=seen.battery_v >= least_v, value=value, want=want, hint="charge it, or change it")

@@ -31,20 +31,20 @@ _LONGEST_HALF = 500  # characters of a problem at either end
 
 # A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
 _COMMANDS = {
-    "loopback": ("loopback_cmd:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
-    "fly": ("fly_cmd:fly", "Fly a real vehicle: the flight daemon on a real link."),
-    "sim": ("sim_cmd:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
-    "check": ("check_cmd:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
-    "design": ("design_cmd:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
-    "solve": ("solve_cmd:solve", "Solve one decision problem, towards the configured target."),
-    "identify": ("identify_cmd:identify_command", "Identify plant, lag, disturbance and link from a recording."),
-    "tune": ("tune_cmd:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
-    "bench": ("bench_cmd:bench", "Measure the speed of a decision, beside the problem as printed."),
-    "paper": ("paper_cmd:paper", "Reproduce Section 5 of the paper, every claim beside what was measured."),
-    "campaign": ("campaign_cmd:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
-    "ctl": ("ctl_cmd:ctl_app", "Give a flight that goes on an order: goto, hold, resume, land, engage; or its status."),
-    "key": ("key_cmd:key_app", "Make and look at keys of MAVLink 2 signing."),
-    "log": ("log_cmd:log_app", "Look into recordings: info, recover, replay, report, compare, whatif, export."),
+    "loopback": ("loopback:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
+    "fly": ("fly:fly", "Fly a real vehicle: the flight daemon on a real link."),
+    "sim": ("sim:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
+    "check": ("check:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
+    "design": ("design:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
+    "solve": ("solve:solve", "Solve one decision problem, towards the configured target."),
+    "identify": ("identify:identify_command", "Identify plant, lag, disturbance and link from a recording."),
+    "tune": ("tune:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
+    "bench": ("bench:bench", "Measure the speed of a decision, beside the problem as printed."),
+    "paper": ("paper:paper", "Reproduce Section 5 of the paper, every claim beside what was measured."),
+    "campaign": ("campaign:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
+    "ctl": ("ctl:ctl_app", "Give a flight that goes on an order: goto, hold, resume, land, engage; or its status."),
+    "key": ("key:key_app", "Make and look at keys of MAVLink 2 signing."),
+    "log": ("log:log_app", "Look into recordings: info, recover, replay, report, compare, whatif, export."),
 }
 for _name, (_path, _help) in _COMMANDS.items():
     app.command(f"uavctl.cli.{_path}", name=_name, help=_help)

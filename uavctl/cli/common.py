@@ -1,4 +1,4 @@
-"""What all commands share: --config, --set and --json, where output goes, and how a bad design is told."""
+"""Options, output, wide tables."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter, validators
-from rich.console import Console, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from uavctl.config import Loaded, explain, load
-from uavctl.config.section import LARGEST_SEED, LONGEST_S
+from uavctl.config import LoadedConfig, explain, load
+from uavctl.config.document import LARGEST_SEED, LONGEST_S
 from uavctl.errors import ConfigError, DesignError
+
+# What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
+
 
 _FILE_WIDTH = 120
 
@@ -47,7 +51,7 @@ class Common:
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
     ] = False
 
-    def load(self) -> Loaded:
+    def load(self) -> LoadedConfig:
         """The configuration that the options ask for.
 
         Raises:
@@ -126,7 +130,7 @@ def warn(text: str) -> None:
 
 
 @contextmanager
-def located(loaded: Loaded) -> Iterator[None]:
+def located(loaded: LoadedConfig) -> Iterator[None]:
     """Tell a refused design with the file and line of the key that is to blame.
 
     Raises:
@@ -136,3 +140,58 @@ def located(loaded: Loaded) -> Iterator[None]:
         yield
     except DesignError as error:
         raise ConfigError((explain(loaded.source, error),)) from error
+
+
+# A table with more columns than a terminal has room for: several below each other.
+
+
+_BETWEEN = 3  # a border and a blank on either side
+
+
+@dataclass(frozen=True)
+class Column:
+    """A heading, and what stands below it row by row."""
+
+    heading: str
+    cells: Sequence[str]
+    justify: JustifyMethod = "right"
+
+    @property
+    def width(self) -> int:
+        """Characters that it takes, with its border."""
+        return max(map(cell_len, (self.heading, *self.cells))) + _BETWEEN
+
+
+@dataclass(frozen=True)
+class WideTable:
+    """Columns that are cut into as many tables as the width asks for, each beginning with the same one."""
+
+    first: Column  # column that names the rows, in every table
+    groups: Sequence[Sequence[Column]]  # columns that stay together where there is room for them
+    sections: frozenset[int] = frozenset()  # rows that a line is drawn below
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        del console
+        for columns in self._cut(options.max_width - 1 - self.first.width):
+            table = Table()
+            for column in (self.first, *columns):
+                table.add_column(column.heading, justify=column.justify, no_wrap=True)
+            rows = zip(self.first.cells, *(column.cells for column in columns), strict=True)
+            for number, row in enumerate(rows):
+                table.add_row(*row, end_section=number in self.sections)
+            yield table
+
+    def _cut(self, room: int) -> list[list[Column]]:
+        """The columns table by table, of `room` characters each beside the first column."""
+        tables: list[list[Column]] = [[]]
+        for group in self.groups:
+            together = _width(group) <= room
+            for piece in (list(group),) if together else ([column] for column in group):
+                if tables[-1] and _width(tables[-1]) + _width(piece) > room:
+                    tables.append([])
+                tables[-1] += piece
+        return tables
+
+
+def _width(columns: Sequence[Column]) -> int:
+    return sum(column.width for column in columns)

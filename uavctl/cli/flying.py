@@ -1,7 +1,8 @@
-"""What `fly` and `loopback` share: the recording's beginning and end, signals, the live line."""
+"""Shared by fly and loopback: recording, signals, live line, engagement."""
 
 from __future__ import annotations
 
+import math
 import shlex
 import signal
 import sys
@@ -17,28 +18,208 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from logs.disk import check_room
-from logs.flight_data import FlightData
-from logs.journal import RecorderStatus
-from logs.live import live_view
-from logs.made_folders import no_empty_folders
-from logs.onlookers import Onlookers
-from logs.reader import read
-from logs.report import write_report
-from logs.summary import FlightSummary, summarise
-from logs.topics import HEADER, LIBRARY
-from logs.views import Views
-from uavctl.build import record_of
+from logs.recording.disk import check_room
+from logs.recording.flight import FlightData
+from logs.recording.outputs import no_empty_folders
+from logs.recording.reader import read
+from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
+from logs.recording.summary import FlightSummary, summarise
+from logs.recording.topics import HEADER, LIBRARY
+from logs.recording.views import Views
+from logs.report.flight_page import write_report
+from uavctl.build.controller import record_of, resting
+from uavctl.build.mission import build_mission
 from uavctl.cli.common import FREE_PORT, messages
-from uavctl.cli.prepare import Prepared
-from uavctl.cli.provenance import cpu, versions
-from uavctl.cli.said import Said, waits_for
+from uavctl.cli.prepare import Prepared, cpu, versions
 from uavctl.config import Config
 from uavctl.config.load import dump_config
-from uavctl.data import ControlMode, Ending, Header, PolicyLibrary, Record, Severity
-from uavctl.ending import lacking
 from uavctl.errors import ConnectionClosedError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.outcome import lacking
+from uavctl.records import Command, ControlMode, Ending, Event, Header, Order, PolicyLibrary, Record, Severity, Vec3
+from uavctl.smpc.conditioned.planner import AnyDesign
+
+# What `fly` and `loopback` ask of the hand-over: whether to arm and take off, when, and what came of it.
+
+
+AXES = ("north", "east", "down")
+DOWN = 2
+
+
+def goto_overrides(goto: str | None) -> tuple[str, ...]:
+    """Configuration keys for `--goto x,y,z`: the place is the mission, so it is checked, and recorded, as one.
+
+    Raises:
+        UsageError: it is not three numbers.
+    """
+    if goto is None:
+        return ()
+    try:
+        place = tuple(float(number) for number in goto.split(","))
+    except ValueError:
+        place = ()
+    if len(place) != 3 or not all(map(math.isfinite, place)):
+        raise UsageError(f"--goto {goto}: give north, east and down in local NED [m], as in --goto 2,1,-2 (up is < 0)")
+    return (f"mission.waypoints={[list(place)]}", "mission.hold_s=0.0", "mission.trajectory={}", 'mission.then="hold"')
+
+
+class Engagement:
+    """From the command line's words to the order, and back to what became of it.
+
+    Attributes:
+        goal: the place of `--goto`, local NED [m].
+        arrived: whether it has been reached.
+        engaged: whether the controller has been in charge.
+
+    Args:
+        config: the configuration, `--goto` in it.
+        take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
+        goto: whether the mission is the place of `--goto`.
+    """
+
+    def __init__(self, config: Config, *, take_off_m: float | None, goto: bool) -> None:
+        self._config = config
+        self._take_off_m = take_off_m
+        self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
+        self._ordered = False
+        self.engaged = False
+        self.arrived = False
+
+    @property
+    def takes_off(self) -> bool:
+        """Whether the vehicle is to be armed."""
+        return self._take_off_m is not None
+
+    def begin(self, loop: ControlLoop) -> None:
+        """Say before the first tick what the flight is to do."""
+        loop.course.takes_off = self.takes_off
+        loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
+
+    def follow(self, loop: ControlLoop) -> None:
+        """Look at the tick that has just run; the first one gives the order to take off."""
+        self.engaged = self.engaged or loop.who_flies is HandoverState.ENGAGED
+        self._look_for_arrival(loop)
+        loop.course.arrived = self.arrived
+        if self._take_off_m is not None and not self._ordered:
+            self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
+
+    def _look_for_arrival(self, loop: ControlLoop) -> None:
+        decision, estimate = loop.decision, loop.estimate
+        if self.goal is None or decision is None or estimate is None or decision.mode is not ControlMode.TRACK:
+            return
+        plant = loop.plant
+        where = [estimate.mean[index] for index in plant.position_index]
+        goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
+        self.arrived = self.arrived or math.dist(where, goal) <= self._config.mission.accept_m
+
+
+def stand_by(loop: ControlLoop, flown_ns: int) -> None:
+    """Leave a vehicle alone that is found armed, and say so: the daemon before this one left it in flight.
+
+    Args:
+        flown_ns: when that flight began; a vehicle that has started since is another one.
+    """
+    loop.order(Command(order=Order.STAND_BY, flown_ns=flown_ns))
+    messages().print(
+        "[bold yellow]warning:[/] the daemon before this one left the vehicle in flight; if it is still armed, and "
+        "has not started anew since, nothing is sent until `uavctl ctl engage`",
+        soft_wrap=True,
+    )
+
+
+def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
+    """Refuse what the room has no place for, before anything is made for the flight, or sent.
+
+    Raises:
+        UsageError: the plant may not rest at the goal, or the climb would end above the room.
+        DesignError: the mission does not fit the design.
+    """
+    if take_off_m is not None and "down" not in design.plant.axes:
+        raise UsageError("--takeoff: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
+    if take_off_m is None and goal is None:
+        return
+    room = build_mission(config, design, resting(design)).room
+    if room is None:
+        raise UsageError("--takeoff, --goto: this plant cannot rest wherever it is sent; see plant")
+    why = "" if goal is None else room.refusal(goal)
+    if why:
+        raise UsageError(f"--goto: {why}")
+    if take_off_m is None:
+        return
+    highest_m = -float(room.lower[room.axes.index(DOWN)])
+    if take_off_m > highest_m:
+        raise UsageError(f"--takeoff {take_off_m:g}: above {highest_m:.2f} m it may not rest (sets.state_lower)")
+
+
+def checked_take_off(arm: bool, takeoff: float | None) -> float | None:
+    """The height of the climb, if the command line asks for one; neither word stands alone.
+
+    Raises:
+        UsageError: one of the two is missing.
+    """
+    if arm and takeoff is None:
+        raise UsageError("--arm needs --takeoff HEIGHT: on the ground nothing else can be done with an armed vehicle")
+    if takeoff is not None and not arm:
+        raise UsageError("--takeoff needs --arm: say that the vehicle may be armed")
+    return takeoff
+
+
+def tell_ending(ending: Ending) -> None:
+    """Say on the console how the flight ended."""
+    style = "[bold]ended:[/]" if ending.as_ordered else "[bold red]ended:[/]"
+    messages().print(f"{style} {escape(ending.sentence)}", soft_wrap=True)
+    if ending.relay:
+        messages().print(f"[bold]relay:[/] {escape(ending.relay)}", soft_wrap=True)
+
+
+# What a person at the console is told of a flight's events, and of what is being waited for.
+
+
+AGAIN_NS = 30_000_000_000  # until the same is said again, if it goes on
+MOST = 256  # different texts that are remembered
+VEHICLE_TEXT = "vehicle-text"
+
+_WAITS_FOR = {
+    HandoverState.WAITING: "the vehicle's heartbeat",
+    HandoverState.MODE: "the mode to take off in",
+    HandoverState.ARMING: "arming",
+    HandoverState.CLIMBING: "the end of the climb",
+    HandoverState.ENGAGING: "the mode that takes setpoints",
+    HandoverState.RETURNING: "the mode that takes setpoints",
+    HandoverState.LANDING: "landing",
+    HandoverState.SETTLING: "the ground",
+}
+
+
+def waits_for(state: HandoverState) -> str:
+    """What the hand-over waits for; empty where it waits for nothing of the vehicle's."""
+    return _WAITS_FOR.get(state, "")
+
+
+class Said:
+    """Says each different text once, at once, and again only after a while if it goes on."""
+
+    def __init__(self) -> None:
+        self._said_ns: dict[str, int] = {}
+
+    def line(self, event: Event, state: HandoverState) -> str | None:
+        """What to say of an event now, if anything."""
+        if event.code == VEHICLE_TEXT and event.severity is Severity.INFO:
+            return None
+        said_ns = self._said_ns.get(event.text)
+        if said_ns is not None and event.at_ns - said_ns < AGAIN_NS:
+            return None
+        if said_ns is None and len(self._said_ns) >= MOST:
+            del self._said_ns[min(self._said_ns, key=lambda text: self._said_ns[text])]
+        self._said_ns[event.text] = event.at_ns
+        waiting = waits_for(state)
+        text = f'the vehicle says: "{event.text}"' if event.code == VEHICLE_TEXT else event.text
+        return f"{text} (waiting for {waiting})" if waiting else text
+
+
+# What `fly` and `loopback` share: the recording's beginning and end, signals, the live line.
+
 
 LANDING_S = 10.0  # after braking: for asking the vehicle to land
 REFRESH_S = 0.25
@@ -80,7 +261,7 @@ def live_view_port(*, live: bool, port: int | None) -> int | None:
 
 
 @contextmanager
-def onlookers(live_port: int | None = None) -> Iterator[Onlookers]:
+def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
     """Those who look at a flight: viewers of its recording, and with a port a live view.
 
     Raises:
@@ -91,7 +272,7 @@ def onlookers(live_port: int | None = None) -> Iterator[Onlookers]:
         messages().print(f'live view: ws://localhost:{port} (Foxglove, "Open connection")', soft_wrap=True)
 
     with live_view(live_port, on_open=tell) as watch:
-        yield Onlookers(Views(), watch)
+        yield DerivedTopics(Views(), watch)
 
 
 def recording_path(out: Path | None, name: str) -> Path:
@@ -147,7 +328,6 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
     Args:
         path: of the recording, which is closed.
         wall_s: how long the flight took [s].
-        status: how the recorder fared.
         ending: how the flight ended, in the words of those who flew; None where nobody did.
 
     Raises:

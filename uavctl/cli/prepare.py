@@ -1,39 +1,37 @@
-"""From a configuration to a controller that is ready to decide, with a progress bar where that takes seconds."""
+"""A controller ready to decide; provenance."""
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from uavctl.build import build_controller
+from uavctl import __version__
+from uavctl.build.controller import build_controller
+from uavctl.build.library import StoredLibrary, decider_id, library_for
 from uavctl.cli.common import messages
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
-from uavctl.library_bytes import StoredLibrary
-from uavctl.library_store import library_for
-from uavctl.smpc.conditioned_design import AnyDesign
-from uavctl.smpc.design import Design
+from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.hahn_stursberg.design import Design
+
+# From a configuration to a controller that is ready to decide, with a progress bar where that takes seconds.
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What flies.
+    """What flies."""
 
-    Attributes:
-        config: The configuration.
-        design: Its design.
-        library: The design's policy library; None where scheme or `solver.method` ask for none.
-        controller: The controller.
-    """
-
-    config: Config
-    design: AnyDesign
-    library: StoredLibrary | None
-    controller: Controller
+    config: Config  # the configuration
+    design: AnyDesign  # its design
+    library: StoredLibrary | None  # the design's policy library; None where scheme or `solver.method` ask for none
+    controller: Controller  # the controller
 
 
 def prepare(config: Config, design: AnyDesign) -> Prepared:
@@ -78,3 +76,24 @@ def _bar(title: str) -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(escape(title), total=None)
         yield lambda text: progress.update(task, description=escape(text))
+
+
+# What decides a flight's last bits beside its configuration: code, libraries, CPU type.
+
+
+_LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
+
+
+def versions() -> dict[str, str]:
+    """What decides alike must be of the same versions."""
+    found = {name: metadata.version(name) for name in _LIBRARIES}
+    return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
+
+
+def cpu() -> str:
+    """The CPU type: linear algebra kernels, and so the last bits, depend on it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

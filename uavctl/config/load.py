@@ -1,34 +1,89 @@
-"""TOML and overrides in, a checked `Config` out; every problem at once, with its place."""
+"""TOML and overrides in, Config out; dump; fault files."""
 
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
 import msgspec
-from msgspec import NODEFAULT
+from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
-from uavctl.config.bounds import DEEPEST, LONGEST_KEY, excess, oversized
-from uavctl.config.checks import Problem, check
-from uavctl.config.data_file import DataFileError, read_text
-from uavctl.config.dump import dump_config as dump_config
-from uavctl.config.index import key_lines
-from uavctl.config.link import LinkConfig
-from uavctl.config.mission import MissionConfig
+from uavctl.config.checks import check
+from uavctl.config.document import (
+    DEEPEST,
+    LONGEST_KEY,
+    ConfigProblem,
+    DataFileError,
+    Section,
+    Source,
+    excess,
+    key_lines,
+    oversized,
+    read_lines,
+    read_text,
+)
+from uavctl.config.link import LinkConfig, read_trace
+from uavctl.config.mission import MissionConfig, read_samples
 from uavctl.config.reference import description, element, is_section, type_text
-from uavctl.config.samples import read_samples
-from uavctl.config.source import Source
-from uavctl.config.trace import read_trace
-from uavctl.config.types import OF_HAHN_STURSBERG, Config, Section
+from uavctl.config.sim import MOST_FAULTS, FaultConfig, faults
+from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.errors import ConfigError, DesignError
+
+# A configuration as TOML text, in a time that grows with its length only.
+
+
+_DELETE = "\x7f"  # the one character that JSON leaves as it is and TOML wants escaped
+
+
+def dump_config(config: Config) -> str:
+    """TOML text with every key that has a value (TOML knows no null); `parse` gives an equal configuration back."""
+    return "\n".join(_lines(msgspec.to_builtins(config), "")) + "\n"
+
+
+def _lines(table: Mapping[str, Any], path: str) -> Iterator[str]:
+    """The plain keys of a table, then the tables in it: TOML wants them in this order."""
+    inner = {key: value for key, value in table.items() if _is_table(value)}
+    for key, value in table.items():
+        if key not in inner and value is not None:
+            yield f"{key} = {_text(value)}"
+    for key, value in inner.items():
+        name = f"{path}.{key}" if path else key
+        if isinstance(value, Mapping):
+            yield f"\n[{name}]"
+            yield from _lines(value, name)
+        else:
+            for one in value:
+                yield f"\n[[{name}]]"
+                yield from _lines(one, name)
+
+
+def _is_table(value: object) -> bool:
+    return isinstance(value, Mapping) or (
+        isinstance(value, list | tuple) and bool(value) and isinstance(value[0], Mapping)
+    )
+
+
+def _text(value: object) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return repr(value)
+
+
+# TOML and overrides in, a checked `Config` out; every problem at once, with its place.
+
 
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
 _DECODE_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
@@ -49,7 +104,7 @@ MOST_OVERRIDES = 1000
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedConfig:
     """A configuration together with its places."""
 
     config: Config
@@ -62,7 +117,7 @@ def presets() -> tuple[str, ...]:
     return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
-def load(name_or_path: str, overrides: Sequence[str] = ()) -> Loaded:
+def load(name_or_path: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     """Load a preset or a TOML file, apply `key.path=value` overrides, check everything.
 
     Raises:
@@ -77,7 +132,7 @@ def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> Config:
     return load(name_or_path, overrides).config
 
 
-def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
+def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     """The same from TOML text; `file` is the name that messages show.
 
     Raises:
@@ -89,7 +144,7 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
         raise ConfigError((f"--set: is given {len(overrides)} times, at most {MOST_OVERRIDES} are taken; use a file",))
     applied = tuple(_override(table, override, problems) for override in overrides)
     source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
-    found: list[Problem] = list(oversized(table))
+    found: list[ConfigProblem] = list(oversized(table))
     if found:
         raise ConfigError((*problems, *map(source.tell, found)))
     sections: dict[str, Decoded] = {}
@@ -107,12 +162,12 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> Loaded:
         problems.append(f"{file}: {len(found) - _MOST_PROBLEMS} more; mend these first")
     if problems or config is None:
         raise ConfigError(tuple(problems))
-    return Loaded(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
+    return LoadedConfig(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
 
 
 def explain(source: Source, error: DesignError) -> str:
     """A refused design as the loader's own problems are told: place, key, reason, what to do."""
-    return source.tell(Problem(error.key, error.reason, error.hint))
+    return source.tell(ConfigProblem(error.key, error.reason, error.hint))
 
 
 def find_nearest(name: str, names: Sequence[str]) -> str:
@@ -200,7 +255,7 @@ def decode(
     section: type[Section],
     table: Mapping[str, Any],
     path: str,
-    found: list[Problem],
+    found: list[ConfigProblem],
     sections: dict[str, Decoded],
     needed: frozenset[str] = frozenset(),
 ) -> Section | None:
@@ -213,7 +268,9 @@ def decode(
     unknown = [key for key in table if key not in fields]
     found.extend(_unknown(path + key, key, tuple(fields), path) for key in unknown[:_MOST_UNKNOWN])
     if len(unknown) > _MOST_UNKNOWN:
-        found.append(Problem(path + unknown[_MOST_UNKNOWN], f"{_UNKNOWN}, and {len(unknown)} in all", "remove them"))
+        found.append(
+            ConfigProblem(path + unknown[_MOST_UNKNOWN], f"{_UNKNOWN}, and {len(unknown)} in all", "remove them")
+        )
     values: dict[str, Any] = {}
     for name, field in fields.items():
         key, value = path + name, table.get(name)
@@ -239,48 +296,50 @@ def decode(
             if inner is not None:
                 values[name] = sections[key] = inner
         else:
-            found.append(Problem(key, f"expected a table, got {_short(value)}", f"write [{key}] and its keys below"))
+            found.append(
+                ConfigProblem(key, f"expected a table, got {_short(value)}", f"write [{key}] and its keys below")
+            )
     usable = all(problem.reason.startswith(_UNKNOWN) for problem in found[before:])
     return section(**values) if usable else None
 
 
-def _too_many(key: str, tables: Sequence[object], field: FieldInfo) -> Problem | None:
+def _too_many(key: str, tables: Sequence[object], field: FieldInfo) -> ConfigProblem | None:
     most = next((meta.max_length for meta in get_args(field.type)[1:] if isinstance(meta, msgspec.Meta)), None)
     if most is None or len(tables) <= most:
         return None
-    return Problem(key, f"has {len(tables)} tables", f"give at most {most}")
+    return ConfigProblem(key, f"has {len(tables)} tables", f"give at most {most}")
 
 
-def _decode_element(section: type[Section], value: object, path: str, found: list[Problem]) -> Section | None:
+def _decode_element(section: type[Section], value: object, path: str, found: list[ConfigProblem]) -> Section | None:
     """Decode one table of a list."""
     if isinstance(value, dict):
         return decode(section, value, f"{path}.", found, {})
-    found.append(Problem(path, f"expected a table, got {_short(value)}", "write [[…]] and its keys below"))
+    found.append(ConfigProblem(path, f"expected a table, got {_short(value)}", "write [[…]] and its keys below"))
     return None
 
 
-def _unknown(path: str, key: str, names: Sequence[str], table: str) -> Problem:
+def _unknown(path: str, key: str, names: Sequence[str], table: str) -> ConfigProblem:
     nearest = find_nearest(key, names)
     where = f"[{table[:-1]}]" if table else "the top level"
-    return Problem(
+    return ConfigProblem(
         path,
         f"{_UNKNOWN}{nearest}",
         "rename or remove it" if nearest else f"remove it; {where} knows {', '.join(names)}",
     )
 
 
-def _missing(key: str, field: FieldInfo) -> Problem:
+def _missing(key: str, field: FieldInfo) -> ConfigProblem:
     if is_section(field.type):
-        return Problem(key, "missing table", f"add [{key}]; the presets are complete examples")
-    return Problem(key, "missing key", f"add it: {type_text(field.type)}, {description(field)}")
+        return ConfigProblem(key, "missing table", f"add [{key}]; the presets are complete examples")
+    return ConfigProblem(key, "missing key", f"add it: {type_text(field.type)}, {description(field)}")
 
 
-def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
+def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[ConfigProblem]:
     """What is wrong with a value by its type, if anything."""
     todo = f"give {type_text(field.type)}: {description(field)}"
     for path, number in _numbers(key, value):
         if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):
-            yield Problem(path, f"{number} is not a finite number", todo)
+            yield ConfigProblem(path, f"{number} is not a finite number", todo)
             return
     try:
         msgspec.convert(value, field.type)
@@ -291,7 +350,7 @@ def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[Problem]:
         got = value
         for number in re.findall(r"\[(\d+)\]", path):
             got = cast("Sequence[object]", got)[int(number)]
-        yield Problem(key + path, _reason(_DECODE_PLACE.sub("", message), got, field), todo)
+        yield ConfigProblem(key + path, _reason(_DECODE_PLACE.sub("", message), got, field), todo)
 
 
 def _reason(message: str, got: object, field: FieldInfo) -> str:
@@ -321,3 +380,45 @@ def _numbers(path: str, value: object) -> Iterator[tuple[str, float]]:
 def _short(value: object) -> str:
     text = f'"{value}"' if isinstance(value, str) else str(value)
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
+
+
+# A list of faults from a TOML file of its own: the same tables as `[[sim.fault]]`, headed `[[fault]]`.
+
+
+Check = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[ConfigProblem]]
+_Faults = Annotated[
+    tuple[FaultConfig, ...], Meta(max_length=MOST_FAULTS, description="what happens in the course of a flight")
+]
+
+
+class _FaultFile(Section, frozen=True, kw_only=True):
+    """The whole file."""
+
+    fault: _Faults
+
+
+def with_faults(config: Config, path: Path, check: Check) -> Config:
+    """The configuration with the faults of a file after its own.
+
+    Args:
+        check: what the simulator cannot do of a list of faults, given the kind of autopilot, the list and its key.
+
+    Raises:
+        ConfigError: With all problems found in the file, each with its line.
+    """
+    try:
+        text = "\n".join(read_lines(path)) + "\n"
+    except DataFileError as error:
+        raise ConfigError(error.reasons) from error
+    found: list[ConfigProblem] = []
+    table = parse_toml(text, str(path))
+    found.extend(oversized(table))
+    script = None if found else decode(_FaultFile, table, "", found, {})
+    given = script.fault if isinstance(script, _FaultFile) else ()
+    found.extend(faults("fault", given, config.sim.plant))
+    found.extend(check(config.sim.autopilot, given, "fault"))
+    if found:
+        source = Source(str(path), key_lines(text))
+        raise ConfigError(tuple(source.tell(problem) for problem in found))
+    sim = msgspec.structs.replace(config.sim, fault=(*config.sim.fault, *given))
+    return msgspec.structs.replace(config, sim=sim)

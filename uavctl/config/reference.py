@@ -10,7 +10,8 @@ import msgspec
 from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
-from uavctl.config.types import OF_HAHN_STURSBERG, Config, Section
+from uavctl.config.document import Section
+from uavctl.config.types import OF_HAHN_STURSBERG, Config
 
 _HEAD = """# Configuration
 

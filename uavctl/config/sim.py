@@ -1,12 +1,18 @@
-"""The simulated side of the wire: vehicle, autopilot and motion capture."""
+"""[sim]: the simulated side, and its checks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
 
-from uavctl.config.section import LARGEST_SEED, LONGEST_S, MOST_SPANS, Position, Section, Spans, Wind
+from uavctl.config.connections import DaemonConfig
+from uavctl.config.document import LARGEST_SEED, LONGEST_S, MOST_SPANS, ConfigProblem, Position, Section, Spans, Wind
+
+# The simulated side of the wire: vehicle, autopilot and motion capture.
+
 
 MOST_FAULTS = 1000
 
@@ -30,8 +36,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     ] = 0.0
     clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
     clock_drift_ppm: Annotated[
-        float,
-        Meta(ge=-1e5, le=1e5, description="what the cameras' clock gains [millionths]; recorded: 1e4 to 3e4"),
+        float, Meta(ge=-1e5, le=1e5, description="what the cameras' clock gains [millionths]; recorded: 1e4 to 3e4")
     ] = 0.0
     occluded: Annotated[
         Spans,
@@ -113,8 +118,7 @@ class InertialConfig(Section, frozen=True, kw_only=True):
         ),
     ] = 1.0
     flown: Annotated[
-        bool,
-        Meta(description="whether the quadrotor flies by the wrong attitude too: what it takes for level is not"),
+        bool, Meta(description="whether the quadrotor flies by the wrong attitude too: what it takes for level is not")
     ] = False
 
 
@@ -226,11 +230,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
     system_id: Annotated[int, Meta(ge=1, le=250, description="MAVLink system id of the simulated vehicle")] = 1
     seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
-    start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (0.0, 0.0, 0.0)
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
         Meta(
@@ -238,3 +238,94 @@ class SimConfig(Section, frozen=True, kw_only=True):
             "(COM_OF_LOSS_T), 3 s with ArduPilot (GUID_TIMEOUT)"
         ),
     ] = None
+
+
+# Checks of the simulated side's configuration.
+
+
+# Keys that a kind of fault heeds; the others are spans.
+_OF_KIND = {
+    "wind": ("velocity_mps",),
+    "battery": ("charge",),
+    "frame": ("name",),
+    "noise": ("value",),
+    "drift": ("velocity_mps",),
+    "parameter": ("name", "value"),
+    "mode": ("name",),
+}
+
+
+def spans(key: str, given: Spans) -> Iterator[ConfigProblem]:
+    """Spans of time since the start that are none."""
+    for i, (start, end) in enumerate(given):
+        if not 0 <= start < end:
+            yield ConfigProblem(
+                f"{key}[{i}]",
+                f"[{start:g}, {end:g}] is not a span of time",
+                "give [from_s, to_s] with 0 <= from_s < to_s",
+            )
+
+
+def sim(config: SimConfig) -> Iterator[ConfigProblem]:
+    """All problems of `[sim]`."""
+    for name in ("occluded", "swapped", "frozen"):
+        yield from spans(f"sim.camera.{name}", getattr(config.camera, name))
+    yield from spans("sim.autopilot.autopilot.invalid", config.checks.invalid)
+    if config.checks.clears and config.autopilot != "px4":
+        yield ConfigProblem(
+            "sim.autopilot.autopilot.clears",
+            f'has no effect with autopilot "{config.autopilot}", which stays in the mode of its failsafe',
+            'remove it, or set sim.autopilot.autopilot = "px4"',
+        )
+    yield from faults("sim.fault", config.fault, config.plant)
+    if config.plant == "linear":
+        for key, same in (("wind", config.wind == WindConfig()), ("quadrotor", config.quadrotor == QuadrotorConfig())):
+            if not same:
+                yield ConfigProblem(
+                    f"sim.{key}",
+                    'has no effect with plant "linear", whose disturbance is that of [plant]',
+                    'remove it, or set sim.plant = "quadrotor"',
+                )
+        if config.inertial.flown:
+            yield ConfigProblem(
+                "sim.autopilot.inertial.flown",
+                'has no effect with plant "linear", which is always level',
+                'remove it, or set sim.plant = "quadrotor"',
+            )
+    elif config.start_position_m[2] >= 0.0:
+        yield ConfigProblem(
+            "sim.start_position_m[2]",
+            f"{config.start_position_m[2]:g} m is not above the floor z = 0, where the quadrotor would stand",
+            "give a number below 0 (local NED: up is negative)",
+        )
+
+
+def ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
+    """Two on one link that cannot be told apart."""
+    if sim.system_id == daemon.system_id:
+        yield ConfigProblem(
+            "sim.system_id", f"{sim.system_id} is that of the daemon too (daemon.system_id)", "give another number"
+        )
+
+
+def faults(key: str, given: tuple[FaultConfig, ...], plant: str) -> Iterator[ConfigProblem]:
+    """All problems of a list of faults that happen to a plant of this kind."""
+    for i, fault in enumerate(given):
+        yield from _fault(f"{key}[{i}]", fault, plant)
+
+
+def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[ConfigProblem]:
+    meant = ("at_s", "kind", *_OF_KIND.get(fault.kind, ("for_s",)))
+    for field in msgspec.structs.fields(fault):
+        if field.name not in meant and getattr(fault, field.name) != field.default:
+            yield ConfigProblem(f"{key}.{field.name}", f'has no effect with kind "{fault.kind}"', "remove it")
+    if fault.kind in ("wind", "battery"):
+        if plant == "linear":
+            yield ConfigProblem(f"{key}.kind", f'plant "linear" has no {fault.kind}', 'set sim.plant = "quadrotor"')
+    elif fault.kind in ("parameter", "mode", "frame"):
+        if not fault.name:
+            yield ConfigProblem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
+    elif fault.kind in ("noise", "drift"):
+        return
+    elif fault.for_s == 0.0:
+        yield ConfigProblem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")

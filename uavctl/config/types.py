@@ -6,24 +6,75 @@ from them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.hand_over import HandOverConfig
-from uavctl.config.link import LinkConfig as LinkConfig
-from uavctl.config.log import LogConfig as LogConfig
-from uavctl.config.mission import FenceConfig as FenceConfig
-from uavctl.config.mission import MissionConfig as MissionConfig
-from uavctl.config.peers import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
-from uavctl.config.preflight import CheckConfig, RelayConfig
-from uavctl.config.section import LARGEST_PLANT, LONGEST_S, Open, Weights
-from uavctl.config.section import Floats as Floats
-from uavctl.config.section import Position as Position
-from uavctl.config.section import Rows as Rows
-from uavctl.config.section import Section as Section
-from uavctl.config.security import SecurityConfig as SecurityConfig
+from uavctl.config.connections import (
+    CheckConfig,
+    ClockConfig,
+    DaemonConfig,
+    FrameConfig,
+    HandOverConfig,
+    RelayConfig,
+    SecurityConfig,
+    SourceConfig,
+)
+from uavctl.config.document import (
+    LARGEST_PLANT,
+    LONGEST_S,
+    ConfigProblem,
+    Floats,
+    Open,
+    Position,
+    Rows,
+    Section,
+    Weights,
+)
+from uavctl.config.link import LinkConfig
+from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.config.sim import SimConfig
+
+# `[log]`: the recording and the room that it needs.
+
+
+class LogConfig(Section, frozen=True, kw_only=True):
+    """Recording."""
+
+    chunk_bytes: Annotated[int, Meta(ge=1024, le=16384, description="largest chunk of the recording [bytes]")] = 16384
+    segment_bytes: Annotated[
+        int,
+        Meta(ge=100_000, le=10**12, description="after about so much the recording goes on in another file [bytes]"),
+    ] = 50_000_000
+    queue: Annotated[
+        int, Meta(ge=16, le=100_000, description="records that may wait for the disk; more are dropped and counted")
+    ] = 8192
+    free_bytes: Annotated[
+        int, Meta(ge=0, le=10**15, description="a flight is refused with less free space than this [bytes]")
+    ] = 50_000_000
+    low_bytes: Annotated[
+        int, Meta(ge=0, le=10**15, description="less free space than this in flight is a warning [bytes]")
+    ] = 30_000_000
+    stop_bytes: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=10**15,
+            description="recording rests with less free space than this, until there is low_bytes [bytes]",
+        ),
+    ] = 10_000_000
+
+
+def check(log: LogConfig) -> Iterator[ConfigProblem]:
+    """What does not fit together."""
+    if log.stop_bytes > log.low_bytes:
+        yield ConfigProblem(
+            "log.stop_bytes",
+            f"{log.stop_bytes} is more than log.low_bytes = {log.low_bytes}: there would be no warning",
+            "lower it",
+        )
+
 
 LIBRARY_HORIZON = 24  # making the library takes minutes beyond
 PLANNED_HORIZON = 40  # so does solving the whole program with planned feedback
@@ -91,8 +142,7 @@ class PlantConfig(Section, frozen=True, kw_only=True):
         ),
     ] = ()
     dead_time_s: Annotated[
-        float,
-        Meta(ge=0, le=1, description="time from sending an input until it begins to act, all axes [s]"),
+        float, Meta(ge=0, le=1, description="time from sending an input until it begins to act, all axes [s]")
     ] = 0.0
     position_1ps: Annotated[
         Floats,

@@ -6,17 +6,16 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from uavctl.data import Command, ControlMode, Plan, Vec3
 from uavctl.flight.envelope import NOT_WATCHING, OF_POSITIONS, Breach, EnvelopeParameters, Watching
-from uavctl.flight.estimator import Coming, History
-from uavctl.flight.fallback import Biases, End, Fallback, FallbackParameters
+from uavctl.flight.estimator import Coming, FilterHistory
+from uavctl.flight.fallback import Biases, Fallback, FallbackEnd, FallbackParameters
+from uavctl.flight.gating import GateParameters, Reach, SourceHealth, make_reach
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
-from uavctl.flight.reach import GateParameters, Reach, make_reach
-from uavctl.flight.samples import Trust
-from uavctl.naming import Names
+from uavctl.labels import Names
+from uavctl.records import Command, ControlMode, Plan, Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 
@@ -25,48 +24,28 @@ from uavctl.smpc.plant import Plant
 class Controller:
     """Everything constant that `step` needs.
 
-    Attributes:
-        plant: The model.
-        design_id: Goes into every plan.
-        horizon: H [steps].
-        solver: Answers the decision problem.
-        mission: Where to fly to, and within what limits.
-        names: What the rows and states are called in events.
-        estimator: Parameters of the filter.
-        fallback: Parameters of the fallback.
-        limits: Parameters of the last gate.
-        trust: How far positions are believed.
-        dt_ns: Δt [ns].
-        tick_ns: Time between ticks [ns]; divides Δt.
-        link: What the estimate of the link goes by.
-        envelope: What is possible; None: nothing is held against it.
-        dead_ns: From sending an input until it begins to act [ns].
-        late_steps: Age up to which the solver counts what it has not seen since [steps].
-        kalman: The filter, made from the others.
-        reach: Where the vehicle can be, made from the others.
-
     Raises:
         ValueError: If the ticks do not divide Δt, or a target has not one entry a state.
     """
 
-    plant: Plant
-    design_id: str
-    horizon: int
-    solver: Solver
-    mission: Mission
-    names: Names
-    estimator: EstimatorParameters
-    fallback: FallbackParameters
-    limits: LimitsParameters
-    trust: GateParameters
-    dt_ns: int
-    tick_ns: int
-    link: LinkEstimateParameters
-    dead_ns: int = 0
-    late_steps: int = 0
-    envelope: EnvelopeParameters | None = None
-    kalman: Kalman = field(init=False, repr=False)
-    reach: Reach = field(init=False, repr=False)
+    plant: Plant  # the model
+    design_id: str  # goes into every plan
+    horizon: int  # H [steps]
+    solver: Solver  # answers the decision problem
+    mission: Mission  # where to fly to, and within what limits
+    names: Names  # what the rows and states are called in events
+    estimator: EstimatorParameters  # parameters of the filter
+    fallback: FallbackParameters  # parameters of the fallback
+    limits: LimitsParameters  # parameters of the last gate
+    trust: GateParameters  # how far positions are believed
+    dt_ns: int  # δt [ns]
+    tick_ns: int  # time between ticks [ns]; divides Δt
+    link: LinkEstimateParameters  # what the estimate of the link goes by
+    dead_ns: int = 0  # from sending an input until it begins to act [ns]
+    late_steps: int = 0  # age up to which the solver counts what it has not seen since [steps]
+    envelope: EnvelopeParameters | None = None  # what is possible; None: nothing is held against it
+    kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
+    reach: Reach = field(init=False, repr=False)  # where the vehicle can be, made from the others
 
     def __post_init__(self) -> None:
         if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
@@ -85,56 +64,35 @@ class Controller:
 
 
 class ControlState(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next.
+    """What one tick leaves to the next."""
 
-    Attributes:
-        history: The estimator; None before the first tick.
-        decided_step: Step of the last boundary that was seen.
-        plan: The plan that is flown; None if none is.
-        fallback: The fallback that flies; None if it does not.
-        trust: What is known of the sources of positions.
-        fresh: Fresh samples in a row.
-        accel_mps2: The last setpoint.
-        mission: How far the mission has come; None before the first decision.
-        order: What the operator ordered of the mission and no decision has taken up yet.
-        link: What the boundaries so far have shown of the link.
-        link_alarms: What was told of the link and still holds, by event code.
-        inertial: How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly.
-        at_bounds: Inputs whose bias was told to be as large as what is flown against it.
-        watching: What the envelope knows of this flight.
-        breach: What it found that cannot be; None for nothing.
-        recalled: The operator has asked for a vehicle that is outside of the limits, and it has not been inside since.
-        biases: Estimated biases of late.
-        taken_back: The step in which positions were last taken back; None for none.
-        coming: Inputs that were sent and do not act yet, oldest first.
-        held_m: Where HOLD began, as it was estimated [m]; None in other modes.
-    """
-
-    history: History | None = None
-    decided_step: int | None = None
-    plan: Plan | None = None
-    fallback: Fallback | None = None
-    trust: Trust = msgspec.field(default_factory=Trust)
-    fresh: int = 0
-    accel_mps2: Vec3 = ZERO
-    mission: MissionState | None = None
-    order: Command | None = None
-    link: LinkBelief = NOTHING_SEEN
-    link_alarms: tuple[str, ...] = ()
+    history: FilterHistory | None = None  # the estimator; None before the first tick
+    decided_step: int | None = None  # step of the last boundary that was seen
+    plan: Plan | None = None  # the plan that is flown; None if none is
+    fallback: Fallback | None = None  # the fallback that flies; None if it does not
+    trust: SourceHealth = msgspec.field(default_factory=SourceHealth)  # what is known of the sources of positions
+    fresh: int = 0  # fresh samples in a row
+    accel_mps2: Vec3 = ZERO  # the last setpoint
+    mission: MissionState | None = None  # how far the mission has come; None before the first decision
+    order: Command | None = None  # what the operator ordered of the mission and no decision has taken up yet
+    link: LinkBelief = NOTHING_SEEN  # what the boundaries so far have shown of the link
+    link_alarms: tuple[str, ...] = ()  # what was told of the link and still holds, by event code
+    # How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly
     inertial: str = ""
-    at_bounds: tuple[int, ...] = ()
-    watching: Watching = NOT_WATCHING
-    breach: Breach | None = None
+    at_bounds: tuple[int, ...] = ()  # inputs whose bias was told to be as large as what is flown against it
+    watching: Watching = NOT_WATCHING  # what the envelope knows of this flight
+    breach: Breach | None = None  # what it found that cannot be; None for nothing
+    # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since
     recalled: bool = False
-    biases: Biases = ()
-    taken_back: int | None = None
-    coming: Coming = ()
-    held_m: Vec3 | None = None
+    biases: Biases = ()  # estimated biases of late
+    taken_back: int | None = None  # the step in which positions were last taken back; None for none
+    coming: Coming = ()  # inputs that were sent and do not act yet, oldest first
+    held_m: Vec3 | None = None  # where HOLD began, as it was estimated [m]; None in other modes
 
     @property
     def disbelieves(self) -> bool:
         """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
-        jumped = self.fallback is not None and self.fallback.end is End.BARRED
+        jumped = self.fallback is not None and self.fallback.end is FallbackEnd.BARRED
         if jumped or self.breach is None:
             return jumped
         # An estimate that is outside right after the start may be so because positions are not what they say.

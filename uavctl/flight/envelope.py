@@ -29,8 +29,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.data import PositionSample, Vec3, Vector, VehicleMotion
 from uavctl.flight.limits import AXES, ZERO
+from uavctl.records import PositionSample, Vec3, Vector, VehicleMotion
 
 Array = NDArray[np.float64]
 
@@ -76,31 +76,18 @@ _TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 @dataclass(frozen=True)
 class EnvelopeParameters:
-    """What is possible; vectors are north, east, down.
+    """What is possible; vectors are north, east, down."""
 
-    Attributes:
-        axes: Which axes the plant has; the others are not looked at.
-        lower_m: Position limits; minus infinity where there is none.
-        upper_m: The same, infinity where there is none.
-        outside_m: How far beyond them the vehicle may be.
-        brake_mps2: What it can brake with.
-        lag_s: Time constant from setpoint to acceleration.
-        unexplained_mps2: Acceleration that positions may show beside what was sent: wind, and the model's error.
-        disagreement_mps: Difference between the velocity that positions show and the vehicle's own.
-        window_ns: Time over which those two are compared [ns].
-        begins_mps: Standard deviation of the velocity at which a flight begins.
-    """
-
-    axes: tuple[bool, ...]
-    lower_m: Vec3
-    upper_m: Vec3
-    outside_m: Vec3
-    brake_mps2: Vec3
-    lag_s: Vec3
-    unexplained_mps2: float
-    disagreement_mps: float
-    window_ns: int
-    begins_mps: float
+    axes: tuple[bool, ...]  # which axes the plant has; the others are not looked at
+    lower_m: Vec3  # position limits; minus infinity where there is none
+    upper_m: Vec3  # the same, infinity where there is none
+    outside_m: Vec3  # how far beyond them the vehicle may be
+    brake_mps2: Vec3  # what it can brake with
+    lag_s: Vec3  # time constant from setpoint to acceleration
+    unexplained_mps2: float  # acceleration that positions may show beside what was sent: wind, and the model's error
+    disagreement_mps: float  # difference between the velocity that positions show and the vehicle's own
+    window_ns: int  # time over which those two are compared [ns]
+    begins_mps: float  # standard deviation of the velocity at which a flight begins
 
 
 class Breach(msgspec.Struct, frozen=True):
@@ -114,85 +101,52 @@ ABSURD = Breach(OUTSIDE, "all positions are further out than any can be, as if t
 
 
 class Observation(msgspec.Struct, frozen=True):
-    """What the envelope may know of a tick.
+    """What the envelope may know of a tick."""
 
-    Attributes:
-        at_ns: The tick [ns].
-        samples: Positions that were believed in this tick.
-        sent_mps2: Setpoint that acts since the tick before.
-        position_m: Estimated position; NaN in axes that the plant has not.
-        velocity_mps: Estimated velocity, the same.
-        motion: What the vehicle itself says.
-        braking: Whether the fallback brakes.
-    """
-
-    at_ns: int
-    samples: Sequence[PositionSample]
-    sent_mps2: Vec3
-    position_m: Vec3 | None
-    velocity_mps: Vec3
-    motion: VehicleMotion | None
-    braking: bool
+    at_ns: int  # the tick [ns]
+    samples: Sequence[PositionSample]  # positions that were believed in this tick
+    sent_mps2: Vec3  # setpoint that acts since the tick before
+    position_m: Vec3 | None  # estimated position; NaN in axes that the plant has not
+    velocity_mps: Vec3  # estimated velocity, the same
+    motion: VehicleMotion | None  # what the vehicle itself says
+    braking: bool  # whether the fallback brakes
 
 
 class Observer(msgspec.Struct, frozen=True, eq=False):
-    """Position, velocity and unexplained acceleration at the newest position that counted.
+    """Position, velocity and unexplained acceleration at the newest position that counted."""
 
-    Attributes:
-        at_ns: Its capture time [ns].
-        mean: (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis.
-        cov: (3, 3) of one axis; those of all axes are alike.
-        accel_mps2: What the setpoints so far make the vehicle accelerate by, behind its lag (3,).
-    """
-
-    at_ns: int
-    mean: Array
-    cov: Array
-    accel_mps2: Array
+    at_ns: int  # its capture time [ns]
+    mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
+    cov: Array  # (3, 3) of one axis; those of all axes are alike
+    accel_mps2: Array  # what the setpoints so far make the vehicle accelerate by, behind its lag (3,)
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next while we fly.
+    """What one tick leaves to the next while we fly."""
 
-    Attributes:
-        observer: None before the first position.
-        tick_ns: The last tick.
-        began_ns: The first one.
-        flown_mps: Velocity (3,) that was sent since then, behind the vehicle's lag.
-        flown_mps2: The acceleration (3,) that belongs to it.
-        sent: Setpoints, each with the tick from which it acted [ns], oldest first.
-        clipped: Whether each of the last innovations was clipped, newest last.
-        unexplained_mps2: Size of the unexplained acceleration, when it was last looked at; None before.
-        apart_mps: How far the velocities of positions and vehicle were apart then; None where that is not known.
-        over_ns: Capture time from which the unexplained acceleration has been too large; None while it is not.
-        apart_ns: The same of the velocities.
-        clean_ns: Capture time of the last position at which all was quiet; None before any.
-        way: (at_ns, distance (3,)) flown by the vehicle's own velocity; empty while it is silent.
-        offsets: (capture time, position minus that distance (3,)), oldest first.
-        places: (capture time, mean of the offsets then (3,)), one for each second or so, oldest first.
-        contradicted: Whether the vehicle's own velocity disagreed with positions when it was last compared.
-        outside_ns: Since when the estimate has been outside; None while it is not.
-        braking: When braking began, and the speed then [m/s]; None while it does not.
-    """
-
-    observer: Observer | None = None
-    tick_ns: int | None = None
-    began_ns: int | None = None
-    flown_mps: Vector = ZERO
-    flown_mps2: Vector = ZERO
-    sent: tuple[tuple[int, Vec3], ...] = ()
-    clipped: tuple[bool, ...] = ()
+    observer: Observer | None = None  # None before the first position
+    tick_ns: int | None = None  # the last tick
+    began_ns: int | None = None  # the first one
+    flown_mps: Vector = ZERO  # velocity (3,) that was sent since then, behind the vehicle's lag
+    flown_mps2: Vector = ZERO  # the acceleration (3,) that belongs to it
+    sent: tuple[tuple[int, Vec3], ...] = ()  # setpoints, each with the tick from which it acted [ns], oldest first
+    clipped: tuple[bool, ...] = ()  # whether each of the last innovations was clipped, newest last
+    # Size of the unexplained acceleration, when it was last looked at; None before
     unexplained_mps2: float | None = None
+    # How far the velocities of positions and vehicle were apart then; None where that is not known
     apart_mps: float | None = None
+    # Capture time from which the unexplained acceleration has been too large; None while it is not
     over_ns: int | None = None
-    apart_ns: int | None = None
-    clean_ns: int | None = None
+    apart_ns: int | None = None  # the same of the velocities
+    clean_ns: int | None = None  # capture time of the last position at which all was quiet; None before any
+    # (at_ns, distance (3,)) flown by the vehicle's own velocity; empty while it is silent
     way: tuple[tuple[int, Array], ...] = ()
-    offsets: tuple[tuple[int, Array], ...] = ()
+    offsets: tuple[tuple[int, Array], ...] = ()  # (capture time, position minus that distance (3,)), oldest first
+    # (capture time, mean of the offsets then (3,)), one for each second or so, oldest first
     places: tuple[tuple[int, Array], ...] = ()
-    contradicted: bool = False
-    outside_ns: int | None = None
-    braking: tuple[int, float] | None = None
+    contradicted: bool = False  # whether the vehicle's own velocity disagreed with positions when it was last compared
+    outside_ns: int | None = None  # since when the estimate has been outside; None while it is not
+    braking: tuple[int, float] | None = None  # when braking began, and the speed then [m/s]; None while it does not
 
     @property
     def answered(self) -> bool:
@@ -209,8 +163,6 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
 
     Args:
         watching: What the tick before left; `NOT_WATCHING` where a flight begins.
-        seen: The tick.
-        parameters: What is possible.
     """
     seen = _shown(seen, parameters)
     watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
@@ -229,10 +181,8 @@ def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters
     For it speak positions that agreed with it, the velocity that is predicted, and what was sent since a flight began.
 
     Args:
-        watching: After the tick.
         seen: The tick; with the velocity that is predicted.
         age_s: How old that prediction's newest position is [s]: gusts may have changed it since.
-        parameters: What is possible.
     """
     velocity = own_words(seen.motion, seen.at_ns)
     if velocity is None or watching.contradicted:
@@ -258,10 +208,8 @@ def contradicts(watching: Watching, seen: Observation, age_s: float, parameters:
     """Whether a velocity that inertial data have carried on is not the vehicle's own, which may be believed.
 
     Args:
-        watching: After the tick before.
         seen: The tick; with the velocity that was carried on to the time of the vehicle's own.
         age_s: How old the newest position was then [s].
-        parameters: What is possible.
     """
     velocity = own_velocity(watching, seen, age_s, parameters)
     return velocity is not None and not _near(velocity, seen.velocity_mps, parameters.disagreement_mps)

@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.data import Estimate, InertialSample, PositionSample
 from uavctl.flight.kalman import Array, Belief, Kalman, captured_ns, felt, first_belief, predicted, updated
+from uavctl.records import Estimate, InertialSample, PositionSample
 
 DUPLICATE = "sample-duplicate"
 TOO_OLD = "sample-too-old"
@@ -44,7 +44,7 @@ class Node(msgspec.Struct, frozen=True, eq=False):
     input: Array | None
 
 
-class Entry(msgspec.Struct, frozen=True, eq=False):
+class FilterEvent(msgspec.Struct, frozen=True, eq=False):
     """One happening: a sample, inertial data, an input change, or none (a boundary, where a belief is kept)."""
 
     key: Key
@@ -55,20 +55,13 @@ class Entry(msgspec.Struct, frozen=True, eq=False):
     doubted: bool = False  # inertial data are doubted from here on
 
 
-class History(msgspec.Struct, frozen=True, eq=False):
-    """State of the filter; immutable.
+class FilterHistory(msgspec.Struct, frozen=True, eq=False):
+    """State of the filter; immutable."""
 
-    Attributes:
-        origin_ns: A boundary of the Δt grid [ns].
-        horizon_ns: Everything up to here is in the anchor; older samples are refused [ns].
-        anchor: What was known at the horizon.
-        entries: What happened since, sorted by key.
-    """
-
-    origin_ns: int
-    horizon_ns: int
-    anchor: Node
-    entries: tuple[Entry, ...] = ()
+    origin_ns: int  # A boundary of the Δt grid [ns]
+    horizon_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
+    anchor: Node  # what was known at the horizon
+    entries: tuple[FilterEvent, ...] = ()  # what happened since, sorted by key
 
     @property
     def newest(self) -> Node:
@@ -82,35 +75,31 @@ class History(msgspec.Struct, frozen=True, eq=False):
         return None if belief is None else belief.captured_ns
 
 
-def begin(kalman: Kalman, origin_ns: int, at_ns: int) -> History:
+def begin(kalman: Kalman, origin_ns: int, at_ns: int) -> FilterHistory:
     """An empty history at `at_ns`, on the grid of boundaries origin_ns + n Δt."""
-    return History(
-        origin_ns=origin_ns,
-        horizon_ns=_horizon_ns(kalman, at_ns),
-        anchor=Node(belief=None, input=None),
+    return FilterHistory(
+        origin_ns=origin_ns, horizon_ns=_horizon_ns(kalman, at_ns), anchor=Node(belief=None, input=None)
     )
 
 
-def move_on(kalman: Kalman, history: History, at_ns: int) -> History:
+def move_on(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """Move the window up to `at_ns`, and keep a belief at a boundary that has come."""
     horizon_ns = max(history.horizon_ns, _horizon_ns(kalman, at_ns))
     boundary_ns = at_ns - (at_ns - history.origin_ns) % kalman.propagation.dt_ns
     mark = (boundary_ns, _MARK, "", boundary_ns)
     if boundary_ns > horizon_ns and (not history.entries or history.entries[-1].key < mark):
-        history = _inserted(kalman, history, Entry(key=mark, sample=None, input=None, after=history.newest), None)
+        history = _inserted(kalman, history, FilterEvent(key=mark, sample=None, input=None, after=history.newest), None)
     return _trimmed(history, horizon_ns)
 
 
 def absorb(
-    kalman: Kalman, history: History, at_ns: int, samples: Sequence[PositionSample], belief: Belief | None = None
-) -> tuple[History, tuple[PositionSample, ...], tuple[str, ...]]:
+    kalman: Kalman, history: FilterHistory, at_ns: int, samples: Sequence[PositionSample], belief: Belief | None = None
+) -> tuple[FilterHistory, tuple[PositionSample, ...], tuple[str, ...]]:
     """Move the window up to `at_ns` and take samples of any age and order.
 
     Args:
-        kalman: The filter.
-        history: State before.
         at_ns: Time now [ns]; no sample may be captured or received later.
-        samples: Valid samples (see `uavctl.flight.samples`).
+        samples: Valid samples (see `uavctl.flight.gating`).
         belief: What `belief_at` gives at the first one's capture time, if that has been asked.
 
     Returns:
@@ -127,13 +116,13 @@ def absorb(
             refused.append(DUPLICATE)
         else:
             taken.append(sample)
-            new = Entry(key=key, sample=sample, input=None, after=history.anchor)
+            new = FilterEvent(key=key, sample=sample, input=None, after=history.anchor)
             history = _inserted(kalman, history, new, belief)
         belief = None  # the next one's is another
     return history, tuple(taken), tuple(refused)
 
 
-def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) -> History:
+def feel(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
     """Take the inertial data of a tick as what they are in the mean, at the mean of their times.
 
     One that is no number, or that says to the last bit what the one before did, says nothing.
@@ -146,11 +135,11 @@ def feel(kalman: Kalman, history: History, samples: Sequence[InertialSample]) ->
         return history
     accel = np.add.reduce([one.accel_mps2 for one in told], axis=0)[list(kalman.axes)] / len(told)
     key = (at_ns, _FELT, "", at_ns)
-    new = Entry(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
+    new = FilterEvent(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
     return _inserted(kalman, history, new, None)
 
 
-def doubted(kalman: Kalman, history: History, at_ns: int) -> History:
+def doubted(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """The state without the inertial data since the newest position of the window, and with more of them doubted."""
     newest = max((place for place, entry in enumerate(history.entries) if entry.sample is not None), default=-1)
     node, kept = history.anchor, []
@@ -160,7 +149,7 @@ def doubted(kalman: Kalman, history: History, at_ns: int) -> History:
         node = _after(kalman, history.origin_ns, node, entry)
         kept.append(replace(entry, after=node))
     history = replace(history, entries=tuple(kept))
-    mark = Entry(key=(at_ns, _MARK, "doubted", at_ns), sample=None, input=None, after=node, doubted=True)
+    mark = FilterEvent(key=(at_ns, _MARK, "doubted", at_ns), sample=None, input=None, after=node, doubted=True)
     return _inserted(kalman, history, mark, None)
 
 
@@ -169,7 +158,7 @@ def _says_something(sample: InertialSample, before: InertialSample | None) -> bo
     return told and (before is None or before.accel_mps2 != sample.accel_mps2)
 
 
-def _known_already(entries: Sequence[Entry], key: Key) -> bool:
+def _known_already(entries: Sequence[FilterEvent], key: Key) -> bool:
     """Whether a source has said something of this capture time, as stamped; near it, as stamps lie near arrivals."""
     first = bisect_left(entries, key[3] - LATEST_STAMP_NS, key=lambda entry: entry.key[0])
     for entry in entries[first:]:
@@ -180,7 +169,7 @@ def _known_already(entries: Sequence[Entry], key: Key) -> bool:
     return False
 
 
-def without(kalman: Kalman, history: History, poisoned: Callable[[PositionSample], bool]) -> History:
+def without(kalman: Kalman, history: FilterHistory, poisoned: Callable[[PositionSample], bool]) -> FilterHistory:
     """The state as if some samples of the window had not come."""
     node, kept = history.anchor, []
     for entry in history.entries:
@@ -191,12 +180,12 @@ def without(kalman: Kalman, history: History, poisoned: Callable[[PositionSample
     return replace(history, entries=tuple(kept))
 
 
-def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, belief: Belief | None = None) -> History:
+def set_input(
+    kalman: Kalman, history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None
+) -> FilterHistory:
     """Note that an input acts from now on.
 
     Args:
-        kalman: The filter.
-        history: State before.
         at_ns: Time now [ns]; it never goes back, and nothing that is known is later.
         u: The input (n_u,); None: others fly.
         belief: What `belief_at` gives at `at_ns`, if that has been asked.
@@ -205,13 +194,13 @@ def set_input(kalman: Kalman, history: History, at_ns: int, u: Array | None, bel
     if before is u or (before is not None and u is not None and before.tolist() == u.tolist()):
         return history
     after = Node(belief=belief or belief_at(kalman, history, at_ns), input=u)
-    entry = Entry(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=after)
+    entry = FilterEvent(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=after)
     place = bisect_right(history.entries, entry.key, key=_KEY)
     marks = (replace(mark, after=after) for mark in history.entries[place:])  # of the same instant
     return replace(history, entries=(*history.entries[:place], entry, *marks))
 
 
-def act(kalman: Kalman, history: History, coming: Coming, at_ns: int) -> tuple[History, Coming]:
+def act(kalman: Kalman, history: FilterHistory, coming: Coming, at_ns: int) -> tuple[FilterHistory, Coming]:
     """Note the inputs that have begun to act by `at_ns`; those that have not are left."""
     for due_ns, u in coming:
         if due_ns > at_ns:
@@ -221,7 +210,7 @@ def act(kalman: Kalman, history: History, coming: Coming, at_ns: int) -> tuple[H
     return history, coming
 
 
-def belief_ahead(kalman: Kalman, history: History, coming: Coming, at_ns: int, ahead_ns: int) -> Belief | None:
+def belief_ahead(kalman: Kalman, history: FilterHistory, coming: Coming, at_ns: int, ahead_ns: int) -> Belief | None:
     """The belief of `at_ns`, see `belief_at`, moved on by `ahead_ns` with the inputs that were sent."""
     belief = belief_at(kalman, history, at_ns)
     if belief is None or not ahead_ns:
@@ -239,7 +228,7 @@ def belief_ahead(kalman: Kalman, history: History, coming: Coming, at_ns: int, a
     return predicted(kalman, history.origin_ns, belief, u, at_ns + ahead_ns)
 
 
-def estimate(kalman: Kalman, history: History, at_ns: int) -> Estimate | None:
+def estimate(kalman: Kalman, history: FilterHistory, at_ns: int) -> Estimate | None:
     """Estimate at `at_ns` from all that had happened by then; None before the first sample.
 
     A time before the newest entry leaves out what came after it; a time before the window has no estimate.
@@ -266,13 +255,13 @@ def uncertain(kalman: Kalman, belief: Belief) -> Array:
     return np.ascontiguousarray(belief.cov[:n, :n])
 
 
-def newest_capture_ns(history: History, at_ns: int) -> int | None:
+def newest_capture_ns(history: FilterHistory, at_ns: int) -> int | None:
     """Capture time of the newest sample from up to `at_ns`; None where there is no estimate."""
     belief = _known(history, at_ns).belief
     return None if belief is None or belief.at_ns > at_ns else belief.captured_ns
 
 
-def belief_at(kalman: Kalman, history: History, at_ns: int) -> Belief | None:
+def belief_at(kalman: Kalman, history: FilterHistory, at_ns: int) -> Belief | None:
     """The belief at `at_ns` from all that had happened by then; None where there is none, as with `estimate`."""
     node = _known(history, at_ns)
     if node.belief is None or node.belief.at_ns > at_ns:
@@ -280,7 +269,7 @@ def belief_at(kalman: Kalman, history: History, at_ns: int) -> Belief | None:
     return predicted(kalman, history.origin_ns, node.belief, node.input, at_ns)
 
 
-def coasted(kalman: Kalman, history: History, belief: Belief, at_ns: int) -> Belief:
+def coasted(kalman: Kalman, history: FilterHistory, belief: Belief, at_ns: int) -> Belief:
     """An earlier belief moved on to `at_ns` by the inputs that acted, without what samples have shown since."""
     u = _known(history, belief.at_ns).input
     for entry in history.entries:
@@ -290,7 +279,7 @@ def coasted(kalman: Kalman, history: History, belief: Belief, at_ns: int) -> Bel
     return predicted(kalman, history.origin_ns, belief, u, at_ns)
 
 
-def _known(history: History, at_ns: int) -> Node:
+def _known(history: FilterHistory, at_ns: int) -> Node:
     """What was known after all that had happened by `at_ns`."""
     for entry in reversed(history.entries):  # one of the newest, as a rule
         if entry.key[0] <= at_ns:
@@ -302,7 +291,7 @@ def _horizon_ns(kalman: Kalman, at_ns: int) -> int:
     return at_ns - round(kalman.parameters.window_s * 1e9)
 
 
-def _inserted(kalman: Kalman, history: History, new: Entry, belief: Belief | None) -> History:
+def _inserted(kalman: Kalman, history: FilterHistory, new: FilterEvent, belief: Belief | None) -> FilterHistory:
     """Sort an entry in and recompute the beliefs from there on; its own prediction may have been asked before."""
     entries = history.entries
     place = bisect_right(entries, new.key, key=_KEY)
@@ -318,7 +307,7 @@ def _inserted(kalman: Kalman, history: History, new: Entry, belief: Belief | Non
     return replace(history, entries=(*entries[:place], *changed))
 
 
-def _trimmed(history: History, horizon_ns: int) -> History:
+def _trimmed(history: FilterHistory, horizon_ns: int) -> FilterHistory:
     """Move the anchor up to the horizon."""
     past = 0
     while past < len(history.entries) and history.entries[past].key[0] <= horizon_ns:
@@ -327,7 +316,7 @@ def _trimmed(history: History, horizon_ns: int) -> History:
     return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[past:])
 
 
-def _after(kalman: Kalman, origin_ns: int, node: Node, entry: Entry, belief: Belief | None = None) -> Node:
+def _after(kalman: Kalman, origin_ns: int, node: Node, entry: FilterEvent, belief: Belief | None = None) -> Node:
     """What is known after an entry; `belief` is the prediction for it, if that has been asked."""
     if belief is None and node.belief is not None:
         belief = predicted(kalman, origin_ns, node.belief, node.input, entry.key[0])

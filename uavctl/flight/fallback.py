@@ -17,7 +17,7 @@ only when the setpoint has come down to what is held: it never accelerates. Wher
 the estimate on, HOLD brings it back to where it began to hold, gently.
 
 The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at Δt boundaries
-(`uavctl.flight.decide`).
+(`uavctl.flight.decision`).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import math
 from dataclasses import dataclass, replace
 from enum import IntEnum, auto
 
-from uavctl.data import ControlMode, Vec3, Vector
 from uavctl.flight.limits import ZERO
+from uavctl.records import ControlMode, Vec3, Vector
 
 SETTLE_S = 1.0  # longest time that the last gate may take to let a zero through
 STILL_MPS = 0.02  # below this speed there is nothing left to brake
@@ -41,26 +41,17 @@ LATELY_NS = 3_000_000_000  # as far as it has been there for all of this time
 
 @dataclass(frozen=True)
 class FallbackParameters:
-    """How the fallback acts.
+    """How the fallback acts."""
 
-    Attributes:
-        brake_gain_1ps: Deceleration per predicted speed [1/s].
-        brake_s: Longest time of braking [s].
-        hold_s: Time of zero acceleration before landing [s].
-        blind_hold_s: Longest time of it where not even the vehicle itself tells whether it drifts [s].
-        land: Whether to hand over to the vehicle's own landing after that.
-        recover_samples: Fresh samples in a row before plans are flown again.
-    """
-
-    brake_gain_1ps: float
-    brake_s: float
-    hold_s: float
-    blind_hold_s: float
-    land: bool
-    recover_samples: int
+    brake_gain_1ps: float  # deceleration per predicted speed [1/s]
+    brake_s: float  # longest time of braking [s]
+    hold_s: float  # time of zero acceleration before landing [s]
+    blind_hold_s: float  # longest time of it where not even the vehicle itself tells whether it drifts [s]
+    land: bool  # whether to hand over to the vehicle's own landing after that
+    recover_samples: int  # fresh samples in a row before plans are flown again
 
 
-class End(IntEnum):
+class FallbackEnd(IntEnum):
     """What the fallback ends in; a greater one overrides a smaller one, and there is no way back to a smaller one."""
 
     RECOVER = auto()  # plans, once positions are back; until then as configured
@@ -72,19 +63,12 @@ class End(IntEnum):
 
 @dataclass(frozen=True)
 class Fallback:
-    """State of the fallback.
+    """State of the fallback."""
 
-    Attributes:
-        mode: BRAKE, HOLD, LAND or STOPPED.
-        since_ns: When this mode was entered [ns].
-        end: What it ends in.
-        held_ns: When it first held [ns]; None before.
-    """
-
-    mode: ControlMode
-    since_ns: int
-    end: End = End.RECOVER
-    held_ns: int | None = None
+    mode: ControlMode  # BRAKE, HOLD, LAND or STOPPED
+    since_ns: int  # when this mode was entered [ns]
+    end: FallbackEnd = FallbackEnd.RECOVER  # what it ends in
+    held_ns: int | None = None  # when it first held [ns]; None before
 
     @property
     def ended(self) -> bool:
@@ -94,7 +78,7 @@ class Fallback:
     @property
     def final(self) -> bool:
         """Whether there is no way back to plans."""
-        return self.end is not End.RECOVER
+        return self.end is not FallbackEnd.RECOVER
 
 
 def enter(at_ns: int) -> Fallback:
@@ -102,13 +86,13 @@ def enter(at_ns: int) -> Fallback:
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns)
 
 
-def request(fallback: Fallback | None, end: End, at_ns: int) -> Fallback:
+def request(fallback: Fallback | None, end: FallbackEnd, at_ns: int) -> Fallback:
     """The fallback once an end other than RECOVER is asked for; it brakes first, unless nothing may be braked on."""
     if fallback is not None and (fallback.ended or fallback.end >= end):
         return fallback
-    if end is End.LET_GO:
+    if end is FallbackEnd.LET_GO:
         return Fallback(mode=ControlMode.HOLD, since_ns=at_ns, end=end)
-    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.end is End.LET_GO):
+    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.end is FallbackEnd.LET_GO):
         return replace(fallback, end=end)
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, end=end)
 
@@ -127,11 +111,9 @@ def advance(
     """The fallback at `at_ns`, with all transitions that are due.
 
     Args:
-        fallback: State after the tick before.
         at_ns: Time of this tick [ns].
         speed_mps: Speed now [m/s]; NaN counts as moving.
         sent_mps2: The setpoint of the tick before [m/s²].
-        parameters: Times and choices.
         held_mps2: What HOLD sends [m/s²].
         measured: Whether the speed is the vehicle's own word, not a prediction.
         blind: Whether it is a prediction without a position of late: nothing tells a drift.
@@ -182,10 +164,10 @@ def _gently(accel_mps2: float) -> float:
     return min(max(accel_mps2, -BACK_MPS2), BACK_MPS2) if math.isfinite(accel_mps2) else 0.0
 
 
-def _after_hold(end: End, land: bool) -> ControlMode:
-    if land or end is End.LAND:
+def _after_hold(end: FallbackEnd, land: bool) -> ControlMode:
+    if land or end is FallbackEnd.LAND:
         return ControlMode.LAND
-    return ControlMode.HOLD if end is End.RECOVER else ControlMode.STOPPED
+    return ControlMode.HOLD if end is FallbackEnd.RECOVER else ControlMode.STOPPED
 
 
 # The bias that braking and holding count on

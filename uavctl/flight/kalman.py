@@ -4,29 +4,97 @@ Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W);
 boundary. So the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w:
 mean 0, covariance W, uncorrelated with x. With u piecewise constant this is exact at any instant.
 
-Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.bias`). While others fly the
+Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.estimate`). While others fly
+the
 vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
 
-Where the vehicle's inertial data are used, x is (x, d, b): they show the acceleration of each axis plus b, which comes
+Where the vehicle's inertial data are used, x is (x, d, b): they show the acceleration of each axis plus b, which
+comes
 and goes slowly: a bias of the sensors, and an attitude that is not quite level.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.data import PositionSample, Vec3
 from uavctl.flight.limits import AXES
-from uavctl.flight.propagation import Propagation, make_propagation
-from uavctl.smpc.bias import at_once, with_bias, with_wander
+from uavctl.records import PositionSample, Vec3
+from uavctl.smpc.estimate import at_once, with_bias, with_wander
 from uavctl.smpc.plant import Plant
 
+# Exact propagation of state and disturbance over any part of a Δt interval, fast enough for every tick.
+
+
 Array = NDArray[np.float64]
+
+# exp(G Δt s) is entire in s: this many Chebyshev terms on [0, 1] reach rounding for any plant whose
+# fastest time constant is above a twentieth of Δt.
+_TERMS = 32
+_MOST_PARTS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation:
+    """z(t + dt) = F(dt) z(t) + G(dt) u for z = (x, w), u and w held; 0 < dt <= Δt."""
+
+    dt_ns: int  # δt [ns]
+    whole: Array  # F and G side by side over Δt (n_x + n_w, n_x + n_w + n_u)
+    series: Array  # chebyshev coefficients of the same in 2 dt/Δt - 1 (terms, its entries)
+    # F and G of the first spans that were asked for: the ticks' own, which come again and again
+    parts: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+
+    def over(self, dt_ns: int) -> tuple[Array, Array]:
+        """(F, G) over `dt_ns`, 0 < dt_ns <= Δt; each by itself in memory, as products want it."""
+        known = self.parts.get(dt_ns)
+        if known is None:
+            known = self._part(dt_ns)
+            if len(self.parts) < _MOST_PARTS:
+                self.parts[dt_ns] = known
+        return known
+
+    def _part(self, dt_ns: int) -> tuple[Array, Array]:
+        if dt_ns == self.dt_ns:
+            joint = self.whole
+        else:
+            angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
+            joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
+        n_z = joint.shape[0]
+        part = joint[:, :n_z].copy(), joint[:, n_z:].copy()
+        for array in part:
+            array.flags.writeable = False
+        return part
+
+
+_ORDERS = np.arange(_TERMS, dtype=np.float64)
+
+
+def make_propagation(plant: Plant, dt_ns: int) -> Propagation:
+    """Sample `plant.transition` at the Chebyshev nodes of (0, Δt) and fit the series.
+
+    `plant.transition` takes a matrix exponential each time; a tick cannot afford that.
+    """
+    angles = (np.arange(_TERMS) + 0.5) * math.pi / _TERMS
+    samples = np.array([_joint(plant, plant.dt_s * 0.5 * (1.0 + math.cos(angle))).ravel() for angle in angles])
+    series = 2.0 / _TERMS * np.cos(np.outer(_ORDERS, angles)) @ samples
+    series[0] *= 0.5
+    whole = _joint(plant, plant.dt_s)
+    for array in (series, whole):
+        array.flags.writeable = False
+    return Propagation(dt_ns=dt_ns, whole=whole, series=series)
+
+
+def _joint(plant: Plant, dt_s: float) -> Array:
+    """[[A, E, B], [0, I, 0]] over dt_s."""
+    a, b, e = plant.transition(dt_s)
+    n_w = plant.n_w
+    return np.block([[a, e, b], [np.zeros((n_w, plant.n_x)), np.eye(n_w), np.zeros((n_w, plant.n_u))]])
+
 
 # Inertial data further from the prediction than this many standard deviations, in any axis, are not believed: twenty
 # come in a second, so one that is left out for nothing costs next to nothing.
@@ -47,74 +115,45 @@ RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may hav
 
 @dataclass(frozen=True)
 class EstimatorParameters:
-    """What the filter believes of its samples.
+    """What the filter believes of its samples."""
 
-    Attributes:
-        position_std_m: Least standard deviation of a position sample, each axis [m]; a sample may claim more.
-        velocity_std_mps: Standard deviation of a velocity sample, each axis [m/s].
-        initial_std: Standard deviation of the states that the first sample does not show.
-        window_s: Samples later than this are refused [s].
-        max_position_m: Largest plausible position, each axis [m].
-        max_velocity_mps: Largest plausible velocity, each axis [m/s].
-        bias_drift: Standard deviation of what an input's bias gains in a second [input units / √s]; 0: there is none.
-        bias_max: Bias that plans leave room for, each input [input units]; it begins with a quarter as deviation.
-        bias_bounds: Largest bias that is flown against, of each input (n_u,) [input units]; empty: bias_max.
-        inertial_std_mps2: Standard deviation of the inertial data of a tick, each axis [m/s²]; 0: they are not used.
-        inertial_bias_mps2: Standard deviation of what they are off for longer [m/s²].
-        inertial_bias_s: Time in which that comes and goes [s].
-    """
-
-    position_std_m: float
-    velocity_std_mps: float
-    initial_std: float
-    window_s: float
-    max_position_m: float
-    max_velocity_mps: float
+    position_std_m: float  # least standard deviation of a position sample, each axis [m]; a sample may claim more
+    velocity_std_mps: float  # standard deviation of a velocity sample, each axis [m/s]
+    initial_std: float  # standard deviation of the states that the first sample does not show
+    window_s: float  # samples later than this are refused [s]
+    max_position_m: float  # largest plausible position, each axis [m]
+    max_velocity_mps: float  # largest plausible velocity, each axis [m/s]
+    # Standard deviation of what an input's bias gains in a second [input units / √s]; 0: there is none
     bias_drift: float = 0.0
+    # Bias that plans leave room for, each input [input units]; it begins with a quarter as deviation
     bias_max: float = 0.0
+    # Largest bias that is flown against, of each input (n_u,) [input units]; empty: bias_max
     bias_bounds: tuple[float, ...] = ()
+    # Standard deviation of the inertial data of a tick, each axis [m/s²]; 0: they are not used
     inertial_std_mps2: float = 0.0
-    inertial_bias_mps2: float = 0.1
-    inertial_bias_s: float = 20.0
+    inertial_bias_mps2: float = 0.1  # standard deviation of what they are off for longer [m/s²]
+    inertial_bias_s: float = 20.0  # time in which that comes and goes [s]
 
 
 @dataclass(frozen=True, eq=False)
 class Kalman:
-    """The constant part of the filter: model, noise and indices.
+    """The constant part of the filter: model, noise and indices."""
 
-    Attributes:
-        propagation: F and G of z = (x, w).
-        w: Covariance W (n_w, n_w).
-        unfelt_w: The same while the filter could use inertial data and has none (n_w, n_w).
-        n_x: Number of states: the plant's, the biases, and what inertial data are off.
-        n_u: Number of inputs.
-        n_bias: Number of biases, behind the plant's states: n_u, or 0 where none is estimated.
-        n_felt: Number of axes of inertial data, the last of the states: 0 where they are not used.
-        axes: Index (0 north, 1 east, 2 down) of each axis that the plant has.
-        shown: State index of each axis' position, then of each axis' velocity.
-        parameters: Noise and window.
-        felt_z: What inertial data show of z (n_felt, n_x + n_w).
-        felt_u: What they show of the input (n_felt, n_u).
-        felt_noise: Covariance of their noise (n_felt, n_felt).
-        pushed: Covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w).
-        identity: Of the size of z.
-    """
-
-    propagation: Propagation
-    w: Array
-    unfelt_w: Array
-    n_x: int
-    n_u: int
-    n_bias: int
-    n_felt: int
-    axes: tuple[int, ...]
-    shown: NDArray[np.intp]
-    parameters: EstimatorParameters
-    felt_z: Array
-    felt_u: Array
-    felt_noise: Array
-    pushed: Array
-    identity: Array
+    propagation: Propagation  # F and G of z = (x, w)
+    w: Array  # covariance W (n_w, n_w)
+    unfelt_w: Array  # the same while the filter could use inertial data and has none (n_w, n_w)
+    n_x: int  # number of states: the plant's, the biases, and what inertial data are off
+    n_u: int  # number of inputs
+    n_bias: int  # number of biases, behind the plant's states: n_u, or 0 where none is estimated
+    n_felt: int  # number of axes of inertial data, the last of the states: 0 where they are not used
+    axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
+    shown: NDArray[np.intp]  # state index of each axis' position, then of each axis' velocity
+    parameters: EstimatorParameters  # noise and window
+    felt_z: Array  # what inertial data show of z (n_felt, n_x + n_w)
+    felt_u: Array  # what they show of the input (n_felt, n_u)
+    felt_noise: Array  # covariance of their noise (n_felt, n_felt)
+    pushed: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
+    identity: Array  # of the size of z
 
     @property
     def bias_bounds(self) -> tuple[float, ...]:
@@ -128,25 +167,15 @@ class Kalman:
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
-    """Gaussian of z = (x, w) at `at_ns`, and what went into it.
+    """Gaussian of z = (x, w) at `at_ns`, and what went into it."""
 
-    Attributes:
-        at_ns: Time [ns].
-        captured_ns: Capture time of the newest sample in it [ns].
-        mean: (n_x + n_w,).
-        cov: (n_x + n_w, n_x + n_w).
-        felt_ns: Time of the newest inertial data in it [ns]; None without any.
-        refused: Inertial data in a row that were not believed.
-        doubted_ns: Since when inertial data are doubted, and not used [ns]; None where they are not.
-    """
-
-    at_ns: int
-    captured_ns: int
-    mean: Array
-    cov: Array
-    felt_ns: int | None = None
-    refused: int = 0
-    doubted_ns: int | None = None
+    at_ns: int  # time [ns]
+    captured_ns: int  # capture time of the newest sample in it [ns]
+    mean: Array  # (n_x + n_w,)
+    cov: Array  # (n_x + n_w, n_x + n_w)
+    felt_ns: int | None = None  # time of the newest inertial data in it [ns]; None without any
+    refused: int = 0  # inertial data in a row that were not believed
+    doubted_ns: int | None = None  # since when inertial data are doubted, and not used [ns]; None where they are not
 
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
@@ -192,7 +221,6 @@ def settled_cov(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
     """Covariance (n, n) of states and biases that a filter settles at, with a position and inertial data in every step.
 
     Args:
-        kalman: The filter.
         dt_ns: Δt [ns].
         age_ns: Age of a step's position at the step's end, up to Δt [ns].
         dead_ns: How long after that end it is asked for [ns].
@@ -224,9 +252,7 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
     """The belief at `at_ns`; the grid's boundaries cut the way at the same places whatever came in.
 
     Args:
-        kalman: The filter.
         origin_ns: A boundary of the grid [ns].
-        belief: The belief before.
         u: Input that acts (n_u,); None while others fly the vehicle.
         at_ns: Time to predict for [ns].
     """

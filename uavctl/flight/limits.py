@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from uavctl.data import Vec3
+from uavctl.records import Vec3
 
 AXES = ("north", "east", "down")
 NON_FINITE = "non-finite"
@@ -14,15 +14,10 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class LimitsParameters:
-    """Limits of the acceleration setpoint.
+    """Limits of the acceleration setpoint."""
 
-    Attributes:
-        accel_mps2: Largest acceleration of each axis, north, east, down [m/s²].
-        slew_mps3: Largest change in a second, each axis [m/s³].
-    """
-
-    accel_mps2: Vec3
-    slew_mps3: float
+    accel_mps2: Vec3  # largest acceleration of each axis, north, east, down [m/s²]
+    slew_mps3: float  # largest change in a second, each axis [m/s³]
 
 
 def gate(want_mps2: Vec3, previous_mps2: Vec3, tick_s: float, limits: LimitsParameters) -> tuple[Vec3, tuple[str, ...]]:
@@ -32,7 +27,6 @@ def gate(want_mps2: Vec3, previous_mps2: Vec3, tick_s: float, limits: LimitsPara
         want_mps2: What is asked for, north, east, down [m/s²]; any floats, NaN and infinity too.
         previous_mps2: What was sent last [m/s²]; taken as within the limits (zero where it is not finite).
         tick_s: Time since then [s].
-        limits: The limits.
 
     Returns:
         The acceleration to send, and the names of what was changed ("non-finite", "clamp-north", "slew-down" ...).

@@ -1,6 +1,7 @@
 """The link as it shows in flight: did a step's news come in time? Pure; one observation each Δt boundary.
 
-An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the boundary
+An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the
+boundary
 is there at the boundary. All counts are forgotten exponentially, so the estimate follows a link that drifts.
 """
 
@@ -10,26 +11,21 @@ import math
 from dataclasses import dataclass
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, ndtri
 
-from uavctl.data import LinkEstimate
+from uavctl.records import LinkEstimate
 
 
 @dataclass(frozen=True)
 class LinkEstimateParameters:
-    """What the estimate goes by.
+    """What the estimate goes by."""
 
-    Attributes:
-        promised: The least p(k) that the design counts on.
-        half_life_steps: An observation this old counts half [steps].
-        credible: Level of the lower bound, and of `below_promise`.
-        false_alarm: Probability at which independent losses are taken for bursts, at one boundary.
-    """
-
-    promised: float
-    half_life_steps: float = 100.0
-    credible: float = 0.95
-    false_alarm: float = 0.001
+    promised: float  # the least p(k) that the design counts on
+    half_life_steps: float = 100.0  # an observation this old counts half [steps]
+    credible: float = 0.95  # level of the lower bound, and of `below_promise`
+    false_alarm: float = 0.001  # probability at which independent losses are taken for bursts, at one boundary
 
     @property
     def forgetting(self) -> float:
@@ -38,22 +34,14 @@ class LinkEstimateParameters:
 
 
 class LinkBelief(msgspec.Struct, frozen=True):
-    """What one boundary leaves to the next: forgotten counts.
+    """What one boundary leaves to the next: forgotten counts."""
 
-    Attributes:
-        arrived: Steps with news.
-        lost: Steps without.
-        pairs: Transitions from one step to the next, as (from lost, to lost): (no, no), (no, yes), (yes, no),
-            (yes, yes).
-        squares: Sum of the squared weights of the transitions.
-        last: Whether the last step had news; None before the first one.
-    """
-
-    arrived: float = 0.0
-    lost: float = 0.0
+    arrived: float = 0.0  # steps with news
+    lost: float = 0.0  # steps without
+    # Transitions from one step to the next, as (from lost, to lost): (no, no), (no, yes), (yes, no), (yes, yes)
     pairs: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    squares: float = 0.0
-    last: bool | None = None
+    squares: float = 0.0  # sum of the squared weights of the transitions
+    last: bool | None = None  # whether the last step had news; None before the first one
 
 
 NOTHING_SEEN = LinkBelief()
@@ -63,9 +51,7 @@ def observe(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameter
     """Take the observation of one boundary.
 
     Args:
-        belief: What the boundary before left.
         arrived: Whether at least one position captured in the Δt that ends here is there.
-        parameters: What the estimate goes by.
     """
     weight = parameters.forgetting
     pairs = [weight * count for count in belief.pairs]
@@ -135,3 +121,24 @@ def _correlation(belief: LinkBelief) -> float:
     """
     n00, n01, n10, n11 = belief.pairs
     return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
+
+
+# How well a share of losses is known that come in runs.
+
+
+def loss_std(missing: NDArray[np.int64]) -> float:
+    """Standard error of the share of losses, each run of arrivals with the losses after it counted as one draw.
+
+    Losses in bursts tell less than as many that are each by themselves.
+
+    Args:
+        missing: how many are missing after each one that came.
+    """
+    lost, came = int(missing.sum()), len(missing)
+    loss = lost / max(lost + came, 1)
+    ends = np.flatnonzero(missing > 0)
+    if len(ends) < 2:
+        return float(np.sqrt(loss * (1.0 - loss) / max(lost + came, 1)))
+    arrived, gone = np.diff(ends), missing[ends[1:]]
+    off = gone - loss * (gone + arrived)
+    return float(np.sqrt((off**2).sum()) / (gone + arrived).sum())

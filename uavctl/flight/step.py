@@ -1,17 +1,43 @@
 """One control tick: samples in; estimate, plan, decision and setpoint out. Pure: time is an argument.
 
-    samples -> estimator -> envelope -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last gate
+    samples -> estimator -> envelope -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last
+gate
 
 Tick n is at n * tick on the grid, step k = n // (Δt / tick). What a boundary decides is held until the next.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.data import (
+from uavctl.flight import fallback as fb
+from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.decision import (
+    Choice,
+    Tick,
+    back_mps2,
+    choose,
+    held_mps2,
+    moving_mps,
+    place,
+    seen_of,
+    take_orders,
+    unready,
+)
+from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
+from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
+from uavctl.flight.fallback import FallbackEnd
+from uavctl.flight.gating import REPEATED, MeasurementUpdate, forget, take
+from uavctl.flight.kalman import Array, captured_ns
+from uavctl.flight.limits import ZERO, gate
+from uavctl.flight.link_estimate import LinkBelief, observe, report
+from uavctl.flight.mission import wanted
+from uavctl.labels import Names, tell_all
+from uavctl.records import (
     ControlMode,
     Decision,
     Estimate,
@@ -24,24 +50,51 @@ from uavctl.data import (
     SetpointSource,
     Severity,
     StepInput,
+    Vec3,
     VehicleStatus,
 )
-from uavctl.flight import fallback as fb
-from uavctl.flight.bias_bound import at_bound, bias_events
-from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decide import Choice, Tick, back_mps2, choose, held_mps2, moving_mps, place, seen_of
-from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
-from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
-from uavctl.flight.fallback import End
-from uavctl.flight.kalman import Array, captured_ns
-from uavctl.flight.limits import ZERO, gate
-from uavctl.flight.link_estimate import LinkBelief, observe, report
-from uavctl.flight.mission import wanted
-from uavctl.flight.orders import take_orders, unready
-from uavctl.flight.samples import Intake, forget, take
-from uavctl.flight.stuck import REPEATED
-from uavctl.naming import Names, tell_all
 from uavctl.smpc.plant import Plant
+
+# Whether the estimated bias is as large as what is flown against it: told once, and again when it no longer is.
+
+
+BIAS_AT_BOUND, BIAS_FREE = "bias-at-bound", "bias-free"
+FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is told once
+
+
+def at_bound(bias: Sequence[float], bounds: Sequence[float], told: Sequence[int]) -> tuple[int, ...]:
+    """Inputs whose bias is at its bound.
+
+    Args:
+        bias: estimated one, each input [input units].
+        bounds: what of each input may be spent against it [input units].
+    """
+    return tuple(
+        i
+        for i, (value, bound) in enumerate(zip(bias, bounds, strict=False))
+        if abs(value) >= (FREE * bound if i in told else bound)
+    )
+
+
+def bias_events(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_ns: int) -> tuple[Event, ...]:
+    """What has become of it: an event if more inputs are at their bounds than before, and one if none is any more.
+
+    Args:
+        push_mps2: the bias as an acceleration, local NED [m/s²].
+        before: inputs of which was told that they are at their bounds.
+    """
+    if set(now) - set(before):
+        pushes = ", ".join(f"{value:+.2f}" for value in push_mps2)
+        text = (
+            f"a lasting push, as wind, is as large as what may be flown against it ({pushes} m/s² north, east, down): "
+            "what it is more carries the vehicle off its target"
+        )
+        return (Event(at_ns=at_ns, severity=Severity.WARNING, code=BIAS_AT_BOUND, text=text),)
+    if before and not now:
+        text = "the lasting push is again within what may be flown against it"
+        return (Event(at_ns=at_ns, severity=Severity.INFO, code=BIAS_FREE, text=text),)
+    return ()
+
 
 __all__ = ["ControlState", "Controller", "StepOutput", "initial_state", "step"]
 
@@ -58,27 +111,16 @@ _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
 class StepOutput(msgspec.Struct, frozen=True):
-    """What a tick gives to the outside.
+    """What a tick gives to the outside."""
 
-    Attributes:
-        estimate: State estimate at the tick; None before the first sample.
-        plan: A new plan, only if this tick made one.
-        decision: Everything that the tick knew and chose.
-        setpoint: What to send; None for nothing.
-        events: What is worth telling.
-        land: Ask for the vehicle's own landing, once.
-        refused: Samples that were not believed.
-        link: What is believed of the link; at boundaries that were not missed.
-    """
-
-    estimate: Estimate | None
-    plan: Plan | None
-    decision: Decision
-    setpoint: Setpoint | None
-    events: tuple[Event, ...]
-    land: bool
-    refused: tuple[PositionSample, ...] = ()
-    link: LinkEstimate | None = None
+    estimate: Estimate | None  # state estimate at the tick; None before the first sample
+    plan: Plan | None  # A new plan, only if this tick made one
+    decision: Decision  # everything that the tick knew and chose
+    setpoint: Setpoint | None  # what to send; None for nothing
+    events: tuple[Event, ...]  # what is worth telling
+    land: bool  # ask for the vehicle's own landing, once
+    refused: tuple[PositionSample, ...] = ()  # samples that were not believed
+    link: LinkEstimate | None = None  # what is believed of the link; at boundaries that were not missed
 
 
 def initial_state() -> ControlState:
@@ -90,9 +132,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     """Run one control tick.
 
     Args:
-        state: What the tick before left.
         inp: All that this tick may know; its number is greater than the last one's.
-        controller: Everything constant.
 
     Returns:
         The state for the next tick, and what to send and record.
@@ -125,9 +165,9 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
     ordered, answers = take_orders(state, inp, controller)
     if moved:
-        ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.BARRED, inp.at_ns))
+        ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.BARRED, inp.at_ns))
     if breach is not None:
-        ordered = replace(ordered, fallback=fb.request(ordered.fallback, End.LET_GO, inp.at_ns), breach=breach)
+        ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.LET_GO, inp.at_ns), breach=breach)
     taken_back = state.taken_back if clean_ns is None and not lies else tick.number
     since = None if taken_back is None else tick.number - taken_back
     afresh = tick.boundary and since is not None and (0 < since <= AFRESH_STEPS or lies)
@@ -242,7 +282,13 @@ def _lies(state: ControlState, tick: Tick, inp: StepInput, controller: Controlle
 
 
 def _watched(
-    state: ControlState, tick: Tick, intake: Intake, inp: StepInput, controller: Controller, *, recalled: bool
+    state: ControlState,
+    tick: Tick,
+    intake: MeasurementUpdate,
+    inp: StepInput,
+    controller: Controller,
+    *,
+    recalled: bool,
 ) -> tuple[Watching, Breach | None]:
     """Hold the tick against the envelope, as long as it is we who fly."""
     if state.breach is not None:
@@ -250,19 +296,14 @@ def _watched(
     if controller.envelope is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
         return NOT_WATCHING, None
     seen = seen_of(
-        tick,
-        inp,
-        state.accel_mps2,
-        controller.plant,
-        intake.accepted,
-        braking=state.mode is ControlMode.BRAKE,
+        tick, inp, state.accel_mps2, controller.plant, intake.accepted, braking=state.mode is ControlMode.BRAKE
     )
     if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
         seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
     return watch(state.watching, seen, controller.envelope)
 
 
-def _cleaned(intake: Intake, clean_ns: int, controller: Controller) -> Intake:
+def _cleaned(intake: MeasurementUpdate, clean_ns: int, controller: Controller) -> MeasurementUpdate:
     """Take back what was captured after `clean_ns` and believed."""
     history = without(controller.kalman, intake.history, lambda sample: captured_ns(sample) > clean_ns)
     return replace(intake, history=history, fresh=0)
@@ -391,7 +432,7 @@ def _setpoint(
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
     # Level at once where what is seen cannot be: each tick of slewing would be flown on nobody knows what.
-    before = ZERO if state.fallback is not None and state.fallback.end is fb.End.LET_GO else state.accel_mps2
+    before = ZERO if state.fallback is not None and state.fallback.end is fb.FallbackEnd.LET_GO else state.accel_mps2
     accel, limited = gate(want, before, controller.tick_ns * 1e-9, controller.limits)
     setpoint = Setpoint(at_ns=inp.at_ns, accel_mps2=accel, source=source, limited=limited)
     return setpoint, controller.plant.to_input(accel)
@@ -442,7 +483,7 @@ def _events(
         events.append(Event(at_ns=inp.at_ns, severity=Severity.WARNING, code="gave-way", text=text))
     if mode is not before:
         severity, code = _ENTERED[mode]
-        if choice.state.fallback is not None and choice.state.fallback.end >= End.STOP:
+        if choice.state.fallback is not None and choice.state.fallback.end >= FallbackEnd.STOP:
             severity = Severity.INFO  # somebody wanted it
         events.append(Event(at_ns=inp.at_ns, severity=severity, code=code, text=choice.reason))
     return tuple(events)

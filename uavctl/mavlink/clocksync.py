@@ -26,7 +26,7 @@ MAX_DRIFT = 0.05  # recorded: up to 0.034
 REMEMBERED_TRIPS = 60
 
 
-class Refusal(StrEnum):
+class StampRefusal(StrEnum):
     """Why a stamp gives no time of capture."""
 
     FUTURE = "future-stamp"
@@ -106,8 +106,6 @@ class RoundTrips:
 
         Args:
             sent_ns: our time when the request was sent.
-            remote_ns: the peer's time in the answer.
-            received_ns: our time when the answer came.
 
         Returns:
             Whether it was used; a slow or deviating one is not.
@@ -157,7 +155,6 @@ class ClockSync:
     """The clock of one source, identified by system, component and kind of stamp.
 
     Args:
-        window_ns: window of the sliding minimum.
         latency_ns: smallest delay from capture to arrival.
         future_tolerance_ns: a stamp further ahead than this is refused.
     """
@@ -175,12 +172,11 @@ class ClockSync:
         self.offset_ns: int | None = None
         self.source = ClockSource.NONE
 
-    def captured_ns(self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None) -> int | Refusal:
+    def captured_ns(self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None) -> int | StampRefusal:
         """Time of capture in our clock.
 
         Args:
             stamp_ns: the source's stamp; None if it gives none.
-            received_ns: our time of arrival.
             offset_ns: offset from round trips, if there is one. It is used if it makes the smallest
                 delay plausible: answers and stamps may come from different clocks.
 
@@ -218,19 +214,19 @@ class ClockSync:
         newest = self._newest_ns // unit_ns if self._count else stamp
         return (newest + (stamp - newest + half) % modulus - half) * unit_ns
 
-    def _judge(self, stamp_ns: int, received_ns: int) -> Refusal | None:
+    def _judge(self, stamp_ns: int, received_ns: int) -> StampRefusal | None:
         """Refuse stamps that the clock so far cannot have given, until several in a row agree on a new clock."""
         minimum_ns = self._minimum.value
         if minimum_ns is None:
             return None
         if stamp_ns in self._stamps:
-            return Refusal.DUPLICATE
+            return StampRefusal.DUPLICATE
         delay_ns = received_ns - stamp_ns
         ahead_ns = self._future_tolerance_ns if self._count >= SETTLED_AFTER else LEAP_NS
         if minimum_ns - delay_ns > ahead_ns:
-            refusal = Refusal.FUTURE
+            refusal = StampRefusal.FUTURE
         elif self._newest_ns - stamp_ns > LEAP_NS:
-            refusal = Refusal.LEAP
+            refusal = StampRefusal.LEAP
         else:
             self._leaps.clear()
             return None

@@ -1,23 +1,138 @@
 """MAVLink bytes to typed messages.
 
-Message definitions: https://mavlink.io/en/messages/common.html. Decoding never raises: what cannot be used is counted
+Message definitions: https://mavlink.io/en/messages/common.html. Decoding never raises: what cannot be used is
+counted
 by reason.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Vec3
-from uavctl.frames import Convention, Quaternion, from_euler, rotate, unit
-from uavctl.mavlink.framing import BadBytes, Scan, scan
-from uavctl.mavlink.messages import Ack, Battery, Heartbeat, Landed, Message, Origin, Position, Text, TimeSync
-from uavctl.mavlink.state_readers import STATE_READERS
-from uavctl.mavlink.wire import Fields, Layout, text_of
+from uavctl.frames import Convention, Quaternion, from_euler, rotate, to_euler, unit
+from uavctl.mavlink.framing import BadBytes, Fields, MessageLayout, Scan, scan, text_of
+from uavctl.mavlink.messages import (
+    Ack,
+    Attitude,
+    AutopilotVersion,
+    Battery,
+    EstimatorFlags,
+    GlobalOrigin,
+    Heartbeat,
+    Inertial,
+    Landed,
+    Message,
+    ParamValue,
+    Position,
+    Text,
+    TimeSync,
+)
+from uavctl.mavlink.relay import Pose
+from uavctl.records import Setpoint, Vec3
+
+# Readers of what the vehicle tells of itself: attitude, inertial data, parameters, estimator, version.
+
+
+_MILLI_G_MPS2 = 9.80665e-3
+# Integer types of MAV_PARAM_TYPE as struct names them; the value is in the low bytes.
+_INTEGERS = {
+    mavlink.MAV_PARAM_TYPE_UINT8: "<B",
+    mavlink.MAV_PARAM_TYPE_INT8: "<b",
+    mavlink.MAV_PARAM_TYPE_UINT16: "<H",
+    mavlink.MAV_PARAM_TYPE_INT16: "<h",
+    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
+    mavlink.MAV_PARAM_TYPE_INT32: "<i",
+}
+
+
+def _attitude(raw: Fields) -> Attitude | None:
+    angles = (raw.roll, raw.pitch, raw.yaw)
+    if not all(map(math.isfinite, angles)):
+        return None
+    return Attitude(
+        system=raw.src_system, component=raw.src_component, angles_rad=angles, stamp_us=1000 * raw.time_boot_ms
+    )
+
+
+def _attitude_quaternion(raw: Fields) -> Attitude | None:
+    turn = unit((raw.q1, raw.q2, raw.q3, raw.q4))
+    if turn is None:
+        return None
+    return Attitude(
+        system=raw.src_system,
+        component=raw.src_component,
+        angles_rad=to_euler(turn),
+        quaternion=True,
+        stamp_us=1000 * raw.time_boot_ms,
+    )
+
+
+def _highres_imu(raw: Fields) -> Inertial | None:
+    return _inertial(raw, 1.0)
+
+
+def _raw_imu(raw: Fields) -> Inertial | None:
+    return _inertial(raw, _MILLI_G_MPS2)
+
+
+def _inertial(raw: Fields, unit_mps2: float) -> Inertial | None:
+    force = (unit_mps2 * raw.xacc, unit_mps2 * raw.yacc, unit_mps2 * raw.zacc)
+    if not all(map(math.isfinite, force)):
+        return None
+    return Inertial(
+        system=raw.src_system,
+        component=raw.src_component,
+        specific_force_mps2=force,
+        raw=unit_mps2 != 1.0,
+        stamp_us=raw.time_usec,
+    )
+
+
+def _param_value(raw: Fields) -> ParamValue:
+    form = _INTEGERS.get(raw.param_type)
+    bytewise = raw.param_value
+    if form is not None:
+        (bytewise,) = struct.unpack_from(form, struct.pack("<f", raw.param_value))
+    return ParamValue(
+        system=raw.src_system,
+        component=raw.src_component,
+        name=text_of(raw.param_id),
+        cast=raw.param_value,
+        bytewise=float(bytewise),
+    )
+
+
+def _estimator(raw: Fields) -> EstimatorFlags:
+    return EstimatorFlags(system=raw.src_system, component=raw.src_component, flags=raw.flags)
+
+
+def _version(raw: Fields) -> AutopilotVersion:
+    number = raw.flight_sw_version
+    return AutopilotVersion(
+        system=raw.src_system,
+        component=raw.src_component,
+        capabilities=raw.capabilities,
+        version=(number >> 24 & 0xFF, number >> 16 & 0xFF, number >> 8 & 0xFF),
+    )
+
+
+STATE_READERS: dict[int, Callable[[Fields], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: _raw_imu,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: _param_value,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _estimator,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
+}
+
 
 MAX_DATAGRAM_BYTES = 4096
 
@@ -28,17 +143,11 @@ OWN_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no externa
 
 
 class Decoded(msgspec.Struct, frozen=True):
-    """What some bytes held.
+    """What some bytes held."""
 
-    Attributes:
-        messages: those that are understood, in order.
-        total: number of messages, also of kinds that are passed over.
-        bad: what was skipped, by reason.
-    """
-
-    messages: tuple[Message, ...]
-    total: int
-    bad: dict[str, int]
+    messages: tuple[Message, ...]  # those that are understood, in order
+    total: int  # number of messages, also of kinds that are passed over
+    bad: dict[str, int]  # what was skipped, by reason
 
 
 class _RefusedError(Exception):
@@ -246,8 +355,8 @@ def _ack(raw: Fields) -> Ack:
     )
 
 
-def _origin(raw: Fields) -> Origin:
-    return Origin(system=raw.src_system, component=raw.src_component)
+def _origin(raw: Fields) -> GlobalOrigin:
+    return GlobalOrigin(system=raw.src_system, component=raw.src_component)
 
 
 _READERS: dict[int, Callable[[Fields], Message | None]] = {
@@ -266,4 +375,145 @@ _READERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
     **STATE_READERS,
 }
-_UNDERSTOOD = {number: (Layout(mavlink.mavlink_map[number]), reader) for number, reader in _READERS.items()}
+_UNDERSTOOD = {number: (MessageLayout(mavlink.mavlink_map[number]), reader) for number, reader in _READERS.items()}
+
+
+# Typed messages to MAVLink bytes; what a vehicle must not get is refused.
+#
+# Message definitions: https://mavlink.io/en/messages/common.html.
+
+
+BOOT_MS_WRAP = 2**32  # time_boot_ms is unsigned, 32 bits: 49.7 days
+ACCEL_ONLY = 0x0C3F  # type_mask 3135: acceleration used; position, velocity, yaw and yaw rate ignored
+ACCEL_AND_YAW = 0x083F  # type_mask 2111: yaw is used too
+_COMMAND_LONG = MessageLayout(mavlink.MAVLink_command_long_message)
+_HEARTBEAT = MessageLayout(mavlink.MAVLink_heartbeat_message)
+_ODOMETRY = MessageLayout(mavlink.MAVLink_odometry_message)
+_PARAM_REQUEST_READ = MessageLayout(mavlink.MAVLink_param_request_read_message)
+_SET_GPS_GLOBAL_ORIGIN = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
+_SET_POSITION_TARGET_LOCAL_NED = MessageLayout(mavlink.MAVLink_set_position_target_local_ned_message)
+_TIMESYNC = MessageLayout(mavlink.MAVLink_timesync_message)
+_VISION_POSITION_ESTIMATE = MessageLayout(mavlink.MAVLink_vision_position_estimate_message)
+_ABSURD_ACCEL_MPS2 = 1e3
+_INT64 = 2**63
+
+
+class UnsendableError(ValueError):
+    """A message must not be sent as it is; a NaN, for one, aborts ArduPilot."""
+
+
+class Encoder:
+    """Messages to frames, numbered modulo 256 as one sequence."""
+
+    def __init__(self, system_id: int, component_id: int) -> None:
+        self._address = (system_id, component_id)
+        self._number = 0
+
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT of an onboard controller."""
+        return self._pack(
+            _HEARTBEAT,
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+            mavlink.MAV_AUTOPILOT_INVALID,
+            0,
+            0,
+            mavlink.MAV_STATE_ACTIVE,
+            3,
+        )
+
+    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+        """TIMESYNC: request with tc1 = 0, answer with our time in tc1 and the request's ts1.
+
+        Raises:
+            UnsendableError: a time is not a signed 64-bit number.
+        """
+        if not all(-_INT64 <= value < _INT64 for value in (tc1_ns, ts1_ns)):
+            raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
+        return self._pack(_TIMESYNC, tc1_ns, ts1_ns)
+
+    def setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
+        """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
+
+        Raises:
+            UnsendableError: a value is not finite, or absurd.
+        """
+        yaw = setpoint.yaw_rad
+        north, east, down = map(abs, setpoint.accel_mps2)
+        limit = _ABSURD_ACCEL_MPS2
+        sane = north <= limit and east <= limit and down <= limit  # NaN is not
+        if not sane or not math.isfinite(yaw or 0.0):
+            raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
+        return self._pack(
+            _SET_POSITION_TARGET_LOCAL_NED,
+            setpoint.at_ns // 1_000_000 % BOOT_MS_WRAP,
+            target_system,
+            target_component,
+            mavlink.MAV_FRAME_LOCAL_NED,
+            ACCEL_ONLY if yaw is None else ACCEL_AND_YAW,
+            *(0.0, 0.0, 0.0),
+            *(0.0, 0.0, 0.0),
+            *setpoint.accel_mps2,
+            yaw or 0.0,
+            0.0,
+        )
+
+    def command(self, command: int, parameters: Sequence[float], target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG; parameters that are not given are 0."""
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        return self._pack(_COMMAND_LONG, target_system, target_component, command, 0, *seven)
+
+    def origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
+        """SET_GPS_GLOBAL_ORIGIN: latitude and longitude [deg], altitude above the sea [m] of local zero."""
+        latitude, longitude, altitude = place_deg_m
+        return self._pack(
+            _SET_GPS_GLOBAL_ORIGIN, target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
+        )
+
+    def request_parameter(self, name: str, target_system: int, target_component: int) -> bytes:
+        """PARAM_REQUEST_READ by name."""
+        return self._pack(_PARAM_REQUEST_READ, target_system, target_component, name.encode(), -1)
+
+    def request_interval(self, message_id: int, interval_us: int, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""
+        wanted = (float(message_id), float(interval_us), *(0.0,) * 5)
+        return self._pack(
+            _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
+        )
+
+    def request_message(self, message_id: int, target_system: int, target_component: int) -> bytes:
+        """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE: send this message once."""
+        wanted = (float(message_id), *(0.0,) * 6)
+        return self._pack(_COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted)
+
+    def external_position(self, pose: Pose) -> bytes:
+        """VISION_POSITION_ESTIMATE or ODOMETRY in local NED; covariances unknown.
+
+        Raises:
+            UnsendableError: a value is not finite, or the stamp does not fit.
+        """
+        angles = to_euler(pose.attitude)
+        values = (*pose.position_m, *angles, *(pose.body_mps or ()))
+        if not all(map(math.isfinite, values)) or not 0 < pose.usec < 2**64:
+            raise UnsendableError(f"pose {values}, stamp {pose.usec} us: not finite, or no stamp")
+        unknown = [math.nan, *([0.0] * 20)]
+        if pose.body_mps is None:
+            return self._pack(_VISION_POSITION_ESTIMATE, pose.usec, *pose.position_m, *angles, unknown)
+        return self._pack(
+            _ODOMETRY,
+            pose.usec,
+            mavlink.MAV_FRAME_LOCAL_FRD,
+            mavlink.MAV_FRAME_BODY_FRD,
+            *pose.position_m,
+            list(pose.attitude),
+            *pose.body_mps,
+            *(0.0,) * 3,
+            unknown,
+            unknown,
+            0,
+            mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
+        )
+
+    def _pack(self, layout: MessageLayout, *fields: Any) -> bytes:
+        data = layout.frame(self._address, self._number, *fields)
+        self._number = (self._number + 1) % 256
+        return data

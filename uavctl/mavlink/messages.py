@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from uavctl.data import Vec3
 from uavctl.frames import Convention, Quaternion
+from uavctl.records import Vec3
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True):
@@ -16,30 +16,19 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Position(Message, frozen=True, kw_only=True):
-    """A position, and perhaps a velocity, in the axes that the message declares.
+    """A position, and perhaps a velocity, in the axes that the message declares."""
 
-    Attributes:
-        name: name of the MAVLink message.
-        stamp_us: the source's time of capture [µs]; None if it gives none.
-        boot_ms: the stamp is `time_boot_ms`, which wraps at 2**32 ms.
-        position_m: position [m].
-        velocity_mps: velocity in the same axes [m/s], or None.
-        convention: axes that the message declares; None if it leaves them to the configuration.
-        local_ned: the message is in the vehicle's local NED already.
-        attitude: how the body is turned (w, x, y, z), body axes to those of the position; None if not given, or no
-            rotation.
-        euler: the attitude came as Euler angles: its body axes are forward, right, down in a frame that points down
-            and forward, left, up in one that points up. Otherwise they are forward, right, down.
-    """
-
-    name: str
-    stamp_us: int | None
-    boot_ms: bool = False
-    position_m: Vec3
-    velocity_mps: Vec3 | None = None
-    convention: Convention | None = None
-    local_ned: bool = False
+    name: str  # name of the MAVLink message
+    stamp_us: int | None  # the source's time of capture [µs]; None if it gives none
+    boot_ms: bool = False  # the stamp is `time_boot_ms`, which wraps at 2**32 ms
+    position_m: Vec3  # position [m]
+    velocity_mps: Vec3 | None = None  # velocity in the same axes [m/s], or None
+    convention: Convention | None = None  # axes that the message declares; None if it leaves them to the configuration
+    local_ned: bool = False  # the message is in the vehicle's local NED already
+    # how the body is turned (w, x, y, z), body axes to those of the position; None if not given, or no rotation
     attitude: Quaternion | None = None
+    # the attitude came as Euler angles: its body axes are forward, right, down in a frame that points down and forward,
+    # left, up in one that points up. Otherwise they are forward, right, down.
     euler: bool = False
 
 
@@ -74,21 +63,13 @@ class Battery(Message, frozen=True, kw_only=True):
 
 
 class Text(Message, frozen=True, kw_only=True):
-    """STATUSTEXT, or a piece of a long one.
+    """STATUSTEXT, or a piece of a long one."""
 
-    Attributes:
-        severity: MAV_SEVERITY, 0 the worst, 7 the least.
-        text: what it says.
-        number: of the long text that it is a piece of; 0: it is whole.
-        chunk: which piece, from 0.
-        more: another piece follows.
-    """
-
-    severity: int
-    text: str
-    number: int = 0
-    chunk: int = 0
-    more: bool = False
+    severity: int  # MAV_SEVERITY, 0 the worst, 7 the least
+    text: str  # what it says
+    number: int = 0  # of the long text that it is a piece of; 0: it is whole
+    chunk: int = 0  # which piece, from 0
+    more: bool = False  # another piece follows
 
 
 class Ack(Message, frozen=True, kw_only=True):
@@ -100,69 +81,42 @@ class Ack(Message, frozen=True, kw_only=True):
     target_component: int
 
 
-class Origin(Message, frozen=True, kw_only=True):
+class GlobalOrigin(Message, frozen=True, kw_only=True):
     """GPS_GLOBAL_ORIGIN: the vehicle knows its place on the globe."""
 
 
 class Attitude(Message, frozen=True, kw_only=True):
-    """ATTITUDE or ATTITUDE_QUATERNION.
+    """ATTITUDE or ATTITUDE_QUATERNION."""
 
-    Attributes:
-        angles_rad: roll, pitch, yaw of body axes forward, right, down in NED.
-        quaternion: it is ATTITUDE_QUATERNION.
-        stamp_us: by the sender's clock, since boot; 0: it does not tell.
-    """
-
-    angles_rad: Vec3
-    quaternion: bool = False
-    stamp_us: int = 0
+    angles_rad: Vec3  # roll, pitch, yaw of body axes forward, right, down in NED
+    quaternion: bool = False  # it is ATTITUDE_QUATERNION
+    stamp_us: int = 0  # by the sender's clock, since boot; 0: it does not tell
 
 
 class Inertial(Message, frozen=True, kw_only=True):
-    """HIGHRES_IMU or RAW_IMU: specific force, body axes forward, right, down [m/s²].
+    """HIGHRES_IMU or RAW_IMU: specific force, body axes forward, right, down [m/s²]."""
 
-    Attributes:
-        specific_force_mps2: that; (0, 0, -g) at rest.
-        raw: it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g.
-        stamp_us: by the sender's clock, since boot or of an epoch; 0: it does not tell.
-    """
-
-    specific_force_mps2: Vec3
-    raw: bool = False
-    stamp_us: int = 0
+    specific_force_mps2: Vec3  # that; (0, 0, -g) at rest
+    raw: bool = False  # it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g
+    stamp_us: int = 0  # by the sender's clock, since boot or of an epoch; 0: it does not tell
 
 
 class ParamValue(Message, frozen=True, kw_only=True):
-    """PARAM_VALUE; `cast` and `bytewise` are the two readings of the same four bytes.
+    """PARAM_VALUE; `cast` and `bytewise` are the two readings of the same four bytes."""
 
-    Attributes:
-        name: of the parameter.
-        cast: the value as a number, as ArduPilot means it.
-        bytewise: the value as PX4 means it: the bytes of an integer, if the type is one.
-    """
-
-    name: str
-    cast: float
-    bytewise: float
+    name: str  # of the parameter
+    cast: float  # the value as a number, as ArduPilot means it
+    bytewise: float  # the value as PX4 means it: the bytes of an integer, if the type is one
 
 
 class EstimatorFlags(Message, frozen=True, kw_only=True):
-    """ESTIMATOR_STATUS or EKF_STATUS_REPORT: what the vehicle's own estimator trusts.
+    """ESTIMATOR_STATUS or EKF_STATUS_REPORT: what the vehicle's own estimator trusts."""
 
-    Attributes:
-        flags: ESTIMATOR_STATUS_FLAGS, which are EKF_STATUS_FLAGS.
-    """
-
-    flags: int
+    flags: int  # ESTIMATOR_STATUS_FLAGS, which are EKF_STATUS_FLAGS
 
 
 class AutopilotVersion(Message, frozen=True, kw_only=True):
-    """AUTOPILOT_VERSION.
+    """AUTOPILOT_VERSION."""
 
-    Attributes:
-        capabilities: MAV_PROTOCOL_CAPABILITY.
-        version: of the software: major, minor, patch.
-    """
-
-    capabilities: int
-    version: tuple[int, int, int]
+    capabilities: int  # MAV_PROTOCOL_CAPABILITY
+    version: tuple[int, int, int]  # of the software: major, minor, patch

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from uavctl.config.preflight import RelayConfig
-from uavctl.data import PositionSample, Vec3
+from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion, rotate
+from uavctl.records import PositionSample, Vec3
 
 MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
 STUCK_AFTER = 25  # poses in a row, the same to the last bit
@@ -23,28 +23,17 @@ _WAITING = 64  # poses of one tick
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A body as an estimator is told of it.
+    """A body as an estimator is told of it."""
 
-    Attributes:
-        message: as which message.
-        usec: time of capture, in the clock that the vehicle expects [us].
-        position_m: local NED [m].
-        attitude: body axes forward, right, down to NED (w, x, y, z).
-        body_mps: velocity in body axes [m/s]; None where it is not known.
-    """
-
-    message: str
-    usec: int
-    position_m: Vec3
-    attitude: Quaternion
-    body_mps: Vec3 | None
+    message: str  # as which message
+    usec: int  # time of capture, in the clock that the vehicle expects [us]
+    position_m: Vec3  # local NED [m]
+    attitude: Quaternion  # body axes forward, right, down to NED (w, x, y, z)
+    body_mps: Vec3 | None  # velocity in body axes [m/s]; None where it is not known
 
 
 class Relay:
     """Passes positions on; stale, stuck and refused ones stay here, and are counted.
-
-    Args:
-        config: whether, as what, how often.
 
     Attributes:
         sent: poses passed on.
@@ -84,7 +73,6 @@ class Relay:
         """What goes to the vehicle in this tick, in order of capture.
 
         Args:
-            at_ns: now, in our clock.
             offset_ns: (our time - the vehicle's) from round trips; None if it does not answer.
             asks: the vehicle asks for our time, and so moves stamps itself.
             refused: samples that the tick did not believe.

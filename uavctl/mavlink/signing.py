@@ -1,6 +1,7 @@
 """MAVLink 2 signing, sans IO: who holds the key, and whether a frame is newer than the last one.
 
-Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked at,
+Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked
+at,
 so that who has not the key changes nothing here: with the other order one forged frame with a stamp from the future
 locks the true peer out.
 """
@@ -9,12 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.framing import CHECKSUM, with_checksum
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES
+from uavctl.mavlink.framing import CHECKSUM, BadBytes, scan, with_checksum
 
 KEY_BYTES = 32
 EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
@@ -32,7 +35,7 @@ Stream = tuple[int, int, int]
 """(system, component, link id)"""
 
 
-class Refusal(StrEnum):
+class SignatureRefusal(StrEnum):
     """Why a frame is not taken."""
 
     FORGED = "forged"  # made without the key, or damaged
@@ -69,16 +72,11 @@ class SigningKey:
 
 @dataclass
 class Stamps:
-    """Stamps of one key.
+    """Stamps of one key."""
 
-    Attributes:
-        floor: newest of all before the start; it has to be kept, so that nothing older is taken ever again.
-        own: newest that was sent or verified since, on any connection.
-        streams: newest that was verified of each stream, on any connection.
-    """
-
-    floor: int = 0
-    own: int = 0
+    floor: int = 0  # newest of all before the start; it has to be kept, so that nothing older is taken ever again
+    own: int = 0  # newest that was sent or verified since, on any connection
+    # newest that was verified of each stream, on any connection
     streams: dict[Stream, int] = field(default_factory=dict)
 
     def note(self, stream: Stream, stamp: int) -> None:
@@ -94,7 +92,6 @@ class Signing:
 
     Args:
         key: the secret that is shared with the peers.
-        link_id: ours, on this connection.
         stamps: of this key, shared by all connections. What is new is decided by each for itself: a frame that somebody
             brings to another connection first is not old on its own.
         wall_offset_ns: wall clock (UTC, since 1970) − the clock of `at_ns`. It is read once: a step of the wall clock
@@ -125,19 +122,18 @@ class Signing:
         signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._stamps.own.to_bytes(6, "little")
         return signed + self._key.hash(signed)
 
-    def verify(self, frame: bytes, at_ns: int) -> Refusal | None:
+    def verify(self, frame: bytes, at_ns: int) -> SignatureRefusal | None:
         """Whether to take a frame that has a signature; None takes it, and none of its kind that is older.
 
         Args:
             frame: the whole frame, signature included; its checksum is covered by the hash.
-            at_ns: time of arrival.
         """
         if not hmac.compare_digest(self._key.hash(frame[:-_HASH]), frame[-_HASH:]):
-            return Refusal.FORGED
+            return SignatureRefusal.FORGED
         address, link_id = (frame[5], frame[6]), frame[-SIGNATURE]
         stamp = int.from_bytes(frame[-SIGNATURE + 1 : -_HASH], "little")
         if not self._expects(address, link_id):
-            return Refusal.LINK_ID
+            return SignatureRefusal.LINK_ID
         stream = (*address, link_id)
         refusal = self._too_old(stream, stamp, at_ns)
         if refusal is None:
@@ -160,16 +156,16 @@ class Signing:
             return link_id in self._peer_link_ids
         return self._links.get(address) in (None, link_id)
 
-    def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> Refusal | None:
+    def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
         if stamp + SKEW < self._stamps.streams.get(stream, 0):
-            return Refusal.REPLAYED
+            return SignatureRefusal.REPLAYED
         newest = self._newest.get(stream)
         if newest is not None:
-            return Refusal.REPLAYED if stamp <= newest else None
+            return SignatureRefusal.REPLAYED if stamp <= newest else None
         if stamp <= max(self._floor, self._stamps.floor):
-            return Refusal.REPLAYED
+            return SignatureRefusal.REPLAYED
         ours = max(self._now(at_ns), self._stamps.own)
-        return Refusal.STALE if stamp + FIRST_BEHIND < ours else None
+        return SignatureRefusal.STALE if stamp + FIRST_BEHIND < ours else None
 
     def _now(self, at_ns: int) -> int:
         return stamp_at(at_ns + self._offset_ns)
@@ -189,3 +185,46 @@ def without_signature(frame: bytes) -> bytes:
     body = bytearray(frame[:-SIGNATURE][:-CHECKSUM])
     body[_FLAGS] &= ~_SIGNED
     return with_checksum(bytes(body))
+
+
+# The door of a signed connection: only verified frames come in, only signed ones go out.
+#
+# What passes is handed on without its signature, so nothing behind the door knows of keys: recordings hold no
+# signatures, and a replay needs no key and no wall clock.
+
+
+class Gate:
+    """Verifies and signs what crosses one connection.
+
+    Args:
+        stream: the connection carries a stream of bytes, not datagrams.
+
+    Attributes:
+        refused: what was dropped, by reason.
+    """
+
+    def __init__(self, signing: Signing, *, stream: bool) -> None:
+        self._signing, self._is_stream = signing, stream
+        self._rest, self._in_step = b"", True
+        self.refused: Counter[str] = Counter()
+
+    def admit(self, data: bytes, at_ns: int) -> bytes:
+        """The verified frames of a datagram or chunk, without their signatures; empty if there are none."""
+        if not self._is_stream and len(data) > MAX_DATAGRAM_BYTES:
+            self.refused[BadBytes.OVERSIZE] += 1
+            return b""
+        data = self._rest + data
+        found = scan(
+            data,
+            final=not self._is_stream,
+            in_step=self._in_step,
+            verify=lambda frame: self._signing.verify(frame, at_ns),
+        )
+        if self._is_stream:
+            self._rest, self._in_step = data[found.consumed :], found.in_step
+        self.refused.update(found.bad)
+        return b"".join(without_signature(frame.data) for frame in found.frames)
+
+    def seal(self, frame: bytes, at_ns: int) -> bytes:
+        """One of our frames, signed."""
+        return self._signing.sign(frame, at_ns)

@@ -1,17 +1,164 @@
-"""The vehicle as its messages tell: status, and its own words."""
+"""The vehicle by its messages: status, boot clock, STATUSTEXT."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.data import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 from uavctl.frames import Quaternion, from_euler, rotate
-from uavctl.mavlink.boot_clock import BootClock
+from uavctl.mavlink.autopilots import autopilot_name, describe_mode
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
-from uavctl.mavlink.modes import autopilot_name, describe_mode
+from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
+
+# A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
+
+
+BACK_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
+AHEAD_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
+AGREE_NS = 5_000_000_000  # within which another clock's second message has to come
+_WRAP_MS = 2**32
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A time since boot [ms] and when it came [ns]; confirmed by the message after it that agrees."""
+
+    boot_ms: int
+    at_ns: int
+    confirmed: bool = False
+
+
+class BootClock:
+    """Takes `time_boot_ms` of several kinds of messages, each against its own kind.
+
+    One message is no evidence, as a field may hold garbage: a clock counts once two agree, be it between those of
+    another vehicle with the same id.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, _Reading] = {}  # by kind of message
+        self._doubted: dict[str, _Reading] = {}  # does not go on from what is known
+        self._newest: _Reading | None = None
+
+    def up_s(self, at_ns: int) -> float | None:
+        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        newest = self._newest
+        return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
+
+    def take(self, kind: str, boot_ms: int, at_ns: int) -> bool:
+        """Take a time since boot; whether it shows that the vehicle has started anew.
+
+        Args:
+            kind: of message; the clocks of two need not agree.
+            boot_ms: its time since boot, modulo 2**32 ms.
+        """
+        known, doubted = self._known.get(kind), self._doubted.get(kind)
+        reading = _Reading(boot_ms, at_ns)
+        if known is None or _goes_on(known, reading):
+            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
+        elif doubted is not None and at_ns - doubted.at_ns <= AGREE_NS and _goes_on(doubted, reading):
+            del self._doubted[kind]
+            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _is_young(known, reading))
+            if anew:  # what the others have told is of the time before
+                self._known.clear()
+                self._doubted.clear()
+            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=True))
+            return anew
+        else:
+            self._doubted[kind] = reading
+        return False
+
+    def forget(self) -> None:
+        """Begin anew, with another vehicle."""
+        self._known.clear()
+        self._doubted.clear()
+        self._newest = None
+
+    def _adopt(self, kind: str, reading: _Reading) -> None:
+        self._known[kind] = self._newest = reading
+
+
+def _advance_ms(before: _Reading, after: _Reading) -> int:
+    """By how much a clock went on, the shorter way around its wrap [ms]."""
+    return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
+
+
+def _passed_ms(before: _Reading, after: _Reading) -> int:
+    return (after.at_ns - before.at_ns) // 1_000_000
+
+
+def _goes_on(before: _Reading, after: _Reading) -> bool:
+    """Whether two readings may be of one clock."""
+    return -BACK_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + AHEAD_MS
+
+
+def _is_young(before: _Reading, after: _Reading) -> bool:
+    """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
+    return after.boot_ms <= _passed_ms(before, after) + AHEAD_MS
+
+
+# STATUSTEXT in one piece again: a vehicle says what is longer than 50 characters in several.
+
+
+WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
+MOST = 16  # texts under way
+LOST = "…"  # stands for a piece that did not come
+
+
+class _Begun(msgspec.Struct):
+    """A text of which more is to come."""
+
+    first: Text
+    said: str
+    next_chunk: int
+    at_ns: int
+
+    def so_far(self) -> Text:
+        """What has come of it."""
+        return _plain(self.first, self.said + LOST)
+
+
+class Joiner:
+    """Joins the pieces of texts, by their sender."""
+
+    def __init__(self) -> None:
+        self._begun: dict[tuple[int, int], _Begun] = {}
+
+    def take(self, text: Text, at_ns: int) -> tuple[Text, ...]:
+        """Take a piece, or a whole text; the texts that are whole now."""
+        sender = text.system, text.component
+        begun = self._begun.get(sender)
+        told: tuple[Text, ...] = ()
+        if begun is not None and (begun.first.number != text.number or text.chunk < begun.next_chunk):
+            told = (self._begun.pop(sender).so_far(),)
+            begun = None
+        if begun is None:
+            begun = _Begun(text, LOST if text.chunk else "", text.chunk, at_ns)
+        begun.said += ("" if text.chunk == begun.next_chunk else LOST) + text.text
+        begun.next_chunk = text.chunk + 1
+        if not text.more:
+            self._begun.pop(sender, None)
+            return (*told, _plain(begun.first, begun.said))
+        if sender in self._begun or len(self._begun) < MOST:
+            self._begun[sender] = begun
+            return told
+        return (*told, begun.so_far())
+
+    def overdue(self, at_ns: int) -> tuple[Text, ...]:
+        """The texts whose rest has not come."""
+        late = [sender for sender, begun in self._begun.items() if at_ns - begun.at_ns > WAIT_NS]
+        return tuple(self._begun.pop(sender).so_far() for sender in late)
+
+
+def _plain(first: Text, text: str) -> Text:
+    return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
+
+
+# The vehicle as its messages tell: status, and its own words.
+
 
 SECOND_VEHICLE = "second-vehicle"
 UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
@@ -55,7 +202,6 @@ class Punctual:
         Args:
             stamp_us: when it was measured, by the sender's clock.
             values: what was measured; the same to the last bit is no measurement.
-            at_ns: its arrival.
         """
         if stamp_us < self._stamp_us - BACK_US:
             self._least_ns, self._stamp_us = None, 0
@@ -79,7 +225,6 @@ class VehicleWatch:
         bad: counter that heartbeats of other vehicles are added to.
         own: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
-        inertial: its inertial data are used.
     """
 
     def __init__(

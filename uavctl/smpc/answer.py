@@ -10,42 +10,32 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.data import GaveWay, SolveStatus
+from uavctl.records import GaveWay, SolveStatus
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A trajectory to follow, as deviations from the equilibrium that it is followed by.
+    """A trajectory to follow, as deviations from the equilibrium that it is followed by."""
 
-    Attributes:
-        states: (H, n_x): desired state of stage t minus the target.
-        inputs: (H, n_u): desired input of stage t minus the target's.
-    """
-
-    states: Array
-    inputs: Array
+    states: Array  # (H, n_x): desired state of stage t minus the target
+    inputs: Array  # (H, n_u): desired input of stage t minus the target's
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
-    """What is known ahead about the steps of one plan.
+class Preview:
+    """What is known ahead about the steps of one plan."""
 
-    Attributes:
-        limits: Right sides of the state rows in each stage (H+1, m_x); None: those of the design. What holds in the
-            last τ + 1 stages holds for the reference.
-        path: Trajectory to follow; None: stay at the target.
-        late: Age of the position that the state was predicted from [steps].
-        cov: Covariance of the state estimate's error (n_x, n_x), with those of the inputs' biases behind the states if
-            the solver counts on biases (n_x + n_u, n_x + n_u); None: it is exact. A design with its own uses that.
-        sent: Input (n_u,) that acts until the plan begins, in the plan's own count; None: nothing is known of it.
-    """
-
+    # Right sides of the state rows in each stage (H+1, m_x); None: those of the design. What holds in the last τ + 1
+    # stages holds for the reference.
     limits: Array | None = None
-    path: Path | None = None
-    late: int = 0
+    path: Path | None = None  # trajectory to follow; None: stay at the target
+    late: int = 0  # age of the position that the state was predicted from [steps]
+    # Covariance of the state estimate's error (n_x, n_x), with those of the inputs' biases behind the states if the
+    # solver counts on biases (n_x + n_u, n_x + n_u); None: it is exact. A design with its own uses that.
     cov: Array | None = None
+    # Input (n_u,) that acts until the plan begins, in the plan's own count; None: nothing is known of it
     sent: Array | None = None
 
     @property
@@ -54,10 +44,10 @@ class Outlook:
         return self.limits is None and self.path is None and not self.late
 
 
-NOMINAL = Outlook()
+NOMINAL = Preview()
 
 
-def finite(x: Array, target: Array, outlook: Outlook) -> bool:
+def finite(x: Array, target: Array, outlook: Preview) -> bool:
     """Whether a question is made of finite numbers."""
     given = [x, target]
     for one in (outlook.cov, outlook.limits, outlook.sent):
@@ -76,53 +66,31 @@ def all_finite(given: Iterable[Array]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Optimal plan from one state, for the whole plant; one row a step Δt.
+    """Optimal plan from one state, for the whole plant; one row a step Δt."""
 
-    Attributes:
-        seq: Number of the question, given back as it came.
-        status: How the solve ended; only OPTIMAL may fly.
-        method: Which program answered.
-        inputs: Mean inputs v_t (H, n_u), within the hard limits, in the plant's input units.
-        states: Predicted mean states (H+1, n_x), those that follow from `inputs`.
-        backoff_x: Back-off of each row of the state set (H+1, m_x), in the row's unit.
-        backoff_u: Back-off of each row of the input set (H, m_u), in the row's unit.
-        reference: Equilibrium x_s (n_x,) that the plan ends in.
-        slack: Sum of all slacks of the state constraints.
-        gave_way: Which constraints gave way, and by how much.
-        offset: l1 distance of the reference from the target, in equilibrium coordinates.
-        terminal_miss: l1 violation of the terminal equality and of the terminal limits.
-        cost: Objective: cost (18) and all penalties.
-        cost_lower: Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method
-            knows none.
-        gap: (cost - cost_lower) / |cost|, see `relative_gap`; inf if no lower bound is known.
-        iterations: Iterations of the solver, summed over all programs that were run.
-    """
-
-    seq: int
-    status: SolveStatus
-    method: str
-    inputs: Array
-    states: Array
-    backoff_x: Array
-    backoff_u: Array
-    reference: Array
-    slack: float
-    offset: float
-    terminal_miss: float
-    cost: float
+    seq: int  # number of the question, given back as it came
+    status: SolveStatus  # how the solve ended; only OPTIMAL may fly
+    method: str  # which program answered
+    inputs: Array  # mean inputs v_t (H, n_u), within the hard limits, in the plant's input units
+    states: Array  # predicted mean states (H+1, n_x), those that follow from `inputs`
+    backoff_x: Array  # back-off of each row of the state set (H+1, m_x), in the row's unit
+    backoff_u: Array  # back-off of each row of the input set (H, m_u), in the row's unit
+    reference: Array  # equilibrium x_s (n_x,) that the plan ends in
+    slack: float  # sum of all slacks of the state constraints
+    offset: float  # l1 distance of the reference from the target, in equilibrium coordinates
+    terminal_miss: float  # l1 violation of the terminal equality and of the terminal limits
+    cost: float  # objective: cost (18) and all penalties
+    # Dual objective, a lower bound of the optimal cost up to the solver's tolerance; -inf if the method knows none
     cost_lower: float
-    gap: float
-    iterations: int
-    gave_way: tuple[GaveWay, ...] = ()
+    gap: float  # (cost - cost_lower) / |cost|, see `relative_gap`; inf if no lower bound is known
+    iterations: int  # iterations of the solver, summed over all programs that were run
+    gave_way: tuple[GaveWay, ...] = ()  # which constraints gave way, and by how much
 
     @classmethod
     def failed(cls, seq: int, status: SolveStatus, method: str, iterations: int = 0) -> Answer:
         """An answer without a plan: empty arrays, infinite cost.
 
         Args:
-            seq: Number of the question.
-            status: Why there is no plan.
-            method: Which program was asked.
             iterations: Interior-point iterations spent.
         """
         empty = np.zeros((0, 0))
@@ -157,7 +125,7 @@ def relative_gap(cost: float, cost_lower: float) -> float:
 class Solver(Protocol):
     """Answers the decision problem of one step."""
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Outlook = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """Plan from state `x` (n_x,) towards `target` (n_x,), an equilibrium; never raises on numbers.
 
         With an `outlook.late` of j, `x` is the prediction for now from a position j steps old.

@@ -17,7 +17,22 @@ from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
 
+# Age of information (Sec. 4.1): what its distribution mu says, mu[t, j] = P(a(k+t) = j).
+
+
 Array = NDArray[np.float64]
+
+
+def at_most(mu: Array, t: int, age: int) -> float:
+    """P(a(k+t) <= age)."""
+    return float(mu[t, : max(0, age + 1)].sum())
+
+
+def information_probability(mu: Array, t: int, r: int) -> float:
+    """p_{t,r}: probability that w(k+r) is available at stage t."""
+    return at_most(mu, t, t - r - 1)
+
+
 _ROUNDING = 1e-9
 
 
@@ -103,18 +118,13 @@ class _AgeChain(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Arrivals(_AgeChain):
-    """A step's news arrives at its end or never; a hidden state of the channel says how likely.
+    """A step's news arrives at its end or never; a hidden state of the channel says how likely."""
 
-    Attributes:
-        start: Distribution of the state (S,) after a step whose news arrived.
-        arrived: arrived[t-1, i, j] (T, S, S): P(step t's news arrives, and the state is j after it | it was i). The
-            last one is repeated.
-        lost: The same that it is lost.
-    """
-
-    start: Array
+    start: Array  # distribution of the state (S,) after a step whose news arrived
+    # arrived[t-1, i, j] (T, S, S): P(step t's news arrives, and the state is j after it | it was i). The last one is
+    # repeated.
     arrived: Array
-    lost: Array
+    lost: Array  # the same that it is lost
 
     def outage(self, steps: int) -> float:
         """See `LinkModel`."""
@@ -147,14 +157,11 @@ class LatePackets(_AgeChain):
     With a(k) = j, all that was captured after k - j is still under way, so the age is a Markov chain by itself:
     P(a(k+1) > i | a(k) = j) = P(D > 0) ∏_{0<n<=i} P(D > n | D > n-1) = P(D > i) for i <= j.
 
-    Attributes:
-        tail: P(D > i), i = 0 … (n,); the last one is the loss, and goes for all that follow.
-
     Raises:
         DesignError: The numbers are no probabilities, or grow.
     """
 
-    tail: Array
+    tail: Array  # P(D > i), i = 0 … (n,); the last one is the loss, and goes for all that follow
 
     def __post_init__(self) -> None:
         _check_probabilities(self.tail, "link.delay_s", "probabilities of a delay")
@@ -189,14 +196,11 @@ class LateArrivals:
     """Packets that a channel with a memory loses, and that come late, their delays independent of it and each other.
 
     a(k) >= t says that of each of the t newest steps nothing has come by k: a product along the chain, oldest first.
-
-    Attributes:
-        channel: The chain of one packet a step.
-        longer: P(a packet that is not lost is on its way for longer than until the end of the step i after its own)
-            (I, n), i = 0 … of a step's packets in the order in which they are sent; none of those that follow.
     """
 
-    channel: Arrivals
+    channel: Arrivals  # the chain of one packet a step
+    # P(a packet that is not lost is on its way for longer than until the end of the step i after its own) (I, n), i = 0
+    # … of a step's packets in the order in which they are sent; none of those that follow
     longer: Array
 
     def outage(self, steps: int) -> float:
@@ -211,13 +215,9 @@ class LateArrivals:
 
 @dataclass(frozen=True, eq=False)
 class TracedAges:
-    """The ages on a link that repeats what was recorded, one packet a step, from anywhere in it.
+    """The ages on a link that repeats what was recorded, one packet a step, from anywhere in it."""
 
-    Attributes:
-        late: Delay of each packet (n,) [steps], infinite if it is lost.
-    """
-
-    late: Array
+    late: Array  # delay of each packet (n,) [steps], infinite if it is lost
 
     def outage(self, steps: int) -> float:
         """See `AgeModel`."""

@@ -1,20 +1,110 @@
-"""The plant (1): x(k+1) = A x(k) + B u(k) + E w(k), w(k) ~ N(0, W)."""
+"""The plant (1): sampling, velocity reference, digest."""
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, matrix_balance, sqrtm
 
-from uavctl.data import Vec3
 from uavctl.errors import DesignError
-from uavctl.smpc.digest import WORDS
-from uavctl.smpc.sampling import balanced_units, exponential, logarithm
+from uavctl.records import Vec3
+
+# Hash of everything that a design is made from.
+
+
+WORDS = {"words": True}
+
+
+def digest(value: object) -> str:
+    """First 16 hexadecimal digits of SHA-256 over a tree of dataclasses, tuples, arrays and numbers.
+
+    Fields with a leading underscore are left out: they are derived from the others. So are those with the metadata
+    `WORDS`, which say what something is called: no answer depends on them.
+    """
+    hasher = hashlib.sha256()
+
+    def feed(part: object) -> None:
+        if isinstance(part, np.ndarray):
+            hasher.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+        elif is_dataclass(part) and not isinstance(part, type):
+            for one in fields(part):
+                if not one.name.startswith("_") and one.metadata != WORDS:
+                    hasher.update(one.name.encode())
+                    feed(getattr(part, one.name))
+        elif isinstance(part, tuple):
+            hasher.update(f"({len(part)}".encode())
+            for one in part:
+                feed(one)
+        else:
+            hasher.update(f"{part!r};".encode())
+
+    feed(value)
+    return hasher.hexdigest()[:16]
+
+
+# Sampled and continuous plants: matrix exponential and logarithm of [[A, B, E], [0, I]], in balanced units.
+
 
 Array = NDArray[np.float64]
+
+
+def exponential(matrix: Array) -> Array:
+    """Matrix exponential by scaling, series and squaring.
+
+    scipy's `expm` divides differences of nearly equal diagonal entries of a triangular matrix (SciPy 1.17: an error
+    of 0.05 for drags of 1e-15), and plants with an integrator and little drag are just that.
+    """
+    norm = float(np.abs(matrix).sum(axis=1).max())
+    halvings = max(0, math.ceil(math.log2(max(norm, 0.25) / 0.25)))
+    scaled = matrix / 2.0**halvings
+    term = result = np.eye(len(matrix))
+    for order in range(1, 15):  # 0.25^15 / 15! is below 1e-21
+        term = term @ scaled / order
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result
+
+
+def logarithm(matrix: Array) -> Array:
+    """Principal matrix logarithm by square roots and series.
+
+    scipy's `logm` judges itself by its `expm` and warns in vain.
+    """
+    identity = np.eye(len(matrix))
+    root, halvings = matrix, 0
+    while np.abs(root - identity).sum(axis=1).max() > 0.1 and halvings < 60:
+        root, halvings = np.real(sqrtm(root)), halvings + 1
+    # log R = 2 artanh Z with Z = (R + I)⁻¹ (R - I); |Z| <= 0.053, so that |Z|^17 is below 1e-21
+    z = np.linalg.solve(root + identity, root - identity)
+    square = z @ z
+    power = total = z
+    for order in range(3, 17, 2):
+        power = power @ square
+        total = total + power / order
+    return np.asarray(2.0 ** (halvings + 1) * total, dtype=np.float64)
+
+
+def balanced_units(a: Array, b: Array, e: Array) -> Array:
+    """Units (n_x + n_u + n_w,), powers of 2, in which the entries of A, B and E are of similar size.
+
+    A plant in metres and one in millimetres are the same numbers in these units, up to a factor of 2.
+    """
+    _, (unit_x, _) = matrix_balance(a, permute=False, separate=True)
+    reach = np.abs(np.hstack([b, e]) / unit_x[:, None]).max(axis=0, initial=0.0)
+    unit_u = np.exp2(-np.round(np.log2(np.where(reach > 0.0, reach, 1.0))))
+    return np.concatenate([unit_x, unit_u])
+
+
+# The plant (1): x(k+1) = A x(k) + B u(k) + E w(k), w(k) ~ N(0, W).
+
+
 AXES = ("north", "east", "down")
 _ROUNDING = 1e-12
 _DRIFT = 1e-9
@@ -24,33 +114,22 @@ _DRIFT = 1e-9
 class Plant:
     """A linear plant with the meaning of its states; the arrays are copied and read-only.
 
-    Attributes:
-        a: A (n_x, n_x).
-        b: B (n_x, n_u).
-        e: E (n_x, n_w).
-        w: W (n_w, n_w), covariance of the disturbance of one step.
-        dt_s: Δt [s].
-        axes: Axes of local NED that it moves in.
-        position_index: State index of each axis' position.
-        velocity_index: State index of each axis' velocity.
-        accel_per_input: Acceleration setpoint per unit of input [m/s² per unit]: a number an axis (n_axes,) where each
-            axis has its own input, in the axes' order; else a map (n_axes, n_u).
-        further: (name, unit) of the states that follow position and velocity in each axis; empty where that is not
-            known.
-
     Raises:
         DesignError: Shapes do not fit, W is no covariance, or A has no real logarithm.
     """
 
-    a: Array
-    b: Array
-    e: Array
-    w: Array
-    dt_s: float
-    axes: tuple[str, ...]
-    position_index: tuple[int, ...]
-    velocity_index: tuple[int, ...]
+    a: Array  # A (n_x, n_x)
+    b: Array  # B (n_x, n_u)
+    e: Array  # E (n_x, n_w)
+    w: Array  # W (n_w, n_w), covariance of the disturbance of one step
+    dt_s: float  # δt [s]
+    axes: tuple[str, ...]  # axes of local NED that it moves in
+    position_index: tuple[int, ...]  # state index of each axis' position
+    velocity_index: tuple[int, ...]  # state index of each axis' velocity
+    # Acceleration setpoint per unit of input [m/s² per unit]: a number an axis (n_axes,) where each axis has its own
+    # input, in the axes' order; else a map (n_axes, n_u)
     accel_per_input: Array
+    # (name, unit) of the states that follow position and velocity in each axis; empty where that is not known
     further: tuple[tuple[str, str], ...] = field(default=(), metadata=WORDS)
     _accel_map: Array = field(init=False, repr=False)
     _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
@@ -182,10 +261,8 @@ def drag_lag(
     Args:
         drag_1ps: Drag c of each axis [1/s].
         lag_s: Acceleration lag T of each axis [s].
-        gain: Gain g of each axis.
         wind_std_mps2: Standard deviation of w of each axis [m/s²].
         dt_s: Δt [s].
-        axes: Axes of local NED.
 
     Raises:
         DesignError: Not one number for each axis, or a lag that is not positive.
@@ -315,3 +392,92 @@ def _logarithm(plant: Plant) -> Array:
     if np.abs(exponential(generator) - lifted).max() > 1e-9 * max(1.0, float(np.abs(lifted).max())):
         raise refused
     return _frozen(generator)
+
+
+# A plant whose autopilot integrates an acceleration setpoint into a velocity and position that its own loops hold.
+#
+# Each axis moves under a force f (wind, an error of the hover thrust) that is a random walk, f' = n:
+#
+#     p' = v,    v' = b + f - c v + w,    T b' = u + kv (s + kp q) + j - b,    j' = ki (s + kp q),
+#     q' = s,    s' = u - v',
+#
+# with the reference's lead q, s over position and velocity, the acceleration b that the loops make and their integral
+# j. Only the sums a = b + f and i = j + f meet a motion, and both take a change of f at once:
+#
+#     v' = a - c v + w,    T a' = u + kv (s + kp q) + i - a + T n,    i' = ki (s + kp q) + n
+#
+# So a force that stays needs no state, and where it is learnt the loops are known to fly against it already. The lead
+# and not the reference is the state: it is zero where the loops begin, wherever that is.
+#
+# The input is u = r + e of what was sent, r, and an error e: jerk limits, setpoints that come late or not at all, and
+# a vehicle's own estimate that wanders, move the reference by what nobody sent. Without it the reference would be the
+# sum of all that was ever sent, and no position could correct it.
+
+
+_FURTHER = (
+    ("acceleration", "m/s²"),
+    ("reference's lead in position", "m"),
+    ("reference's lead in velocity", "m/s"),
+    ("own integral", "m/s²"),
+)
+STATES = 2 + len(_FURTHER)  # of an axis: p, v, a, q, s, i
+
+
+class HeldAxis(NamedTuple):
+    """Numbers of one axis."""
+
+    drag_1ps: float  # drag c [1/s]
+    lag_s: float  # lag T of the acceleration [s]
+    position_1ps: float  # gain kp of the position loop [1/s]
+    velocity_1ps: float  # gain kv of the velocity loop [1/s]
+    integral_1ps2: float  # integral gain ki of the velocity loop [1/s²]
+    wind_std_mps2: float  # standard deviation of w, held over Δt [m/s²]
+    input_std_mps2: float  # standard deviation of e, held over Δt [m/s²]
+    force_drift_mps2_rts: float  # standard deviation of what f gains in a second [m/s² / √s]
+
+
+def velocity_reference(held: Sequence[HeldAxis], dt_s: float, axes: tuple[str, ...]) -> Plant:
+    """Axes with the states (p, v, a, q, s, i), input r, and the disturbances (w, e, n), all held over Δt.
+
+    Args:
+        dt_s: Δt [s].
+
+    Raises:
+        DesignError: Not one entry for each axis, or a lag or gain that is not positive: without one of the gains
+            there are states that no input moves.
+    """
+    if len(held) != len(axes):
+        raise DesignError("plant.lag_s", f"{len(held)} entries for {len(axes)} axes", "give one an axis")
+    for key in ("lag_s", "position_1ps", "velocity_1ps", "integral_1ps2"):
+        values = [getattr(one, key) for one in held]
+        if min(values, default=1.0) <= 0.0:
+            raise DesignError(f"plant.{key}", f"{values} has a number that is not positive", "give numbers above 0")
+    parts = [exponential(_generator(one) * dt_s)[:STATES] for one in held]
+    # n is what f gains in a second: over a step it gains n Δt, with the deviation drift √Δt.
+    spread = [(one.wind_std_mps2, one.input_std_mps2, one.force_drift_mps2_rts / np.sqrt(dt_s)) for one in held]
+    return Plant(
+        a=block_diag(*(part[:, :STATES] for part in parts)),
+        b=block_diag(*(part[:, STATES : STATES + 1] for part in parts)),
+        e=block_diag(*(part[:, [STATES + 1, STATES, STATES + 2]] for part in parts)),
+        w=np.diag(np.square(np.array(spread, dtype=np.float64)).ravel()),
+        dt_s=dt_s,
+        axes=axes,
+        position_index=tuple(range(0, STATES * len(axes), STATES)),
+        velocity_index=tuple(range(1, STATES * len(axes), STATES)),
+        accel_per_input=np.ones(len(axes)),
+        further=_FURTHER,
+    )
+
+
+def _generator(one: HeldAxis) -> Array:
+    """Slope (9, 9) of (p, v, a, q, s, i, u, w, n)."""
+    slope = np.zeros((STATES + 3, STATES + 3))
+    _, v, a, q, s, i, u, w, n = np.eye(STATES + 3)
+    error = s + one.position_1ps * q
+    slope[0] = v
+    slope[1] = a - one.drag_1ps * v + w
+    slope[2] = (u + one.velocity_1ps * error + i - a) / one.lag_s + n
+    slope[3] = s
+    slope[4] = u - slope[1]
+    slope[5] = one.integral_1ps2 * error + n
+    return slope

@@ -1,22 +1,18 @@
 """What others would fly: every one a real controller on the same plant, weights, limits, noise and losses."""
 
-from uavctl.smpc.baselines.governor import Governor
-from uavctl.smpc.baselines.lqg import Lqg
-from uavctl.smpc.baselines.pid import CascadedPid, PidGains
-from uavctl.smpc.baselines.pid_tuning import tune
-from uavctl.smpc.baselines.problem import Problem
-from uavctl.smpc.baselines.receipt import HoldLast, MeanQp, PacketisedPredictive, ZeroOnLoss
-from uavctl.smpc.baselines.worst_case import WorstCaseDelay
+from uavctl.smpc.baselines.feedback import CascadedPid, Governor, Lqg, PidGains, tune
+from uavctl.smpc.baselines.mpc import HoldLast, MeanQp, PacketisedPredictive, WorstCaseDelay, ZeroOnLoss
+from uavctl.smpc.nominal import ControlProblem
 
 __all__ = [
     "CascadedPid",
+    "ControlProblem",
     "Governor",
     "HoldLast",
     "Lqg",
     "MeanQp",
     "PacketisedPredictive",
     "PidGains",
-    "Problem",
     "WorstCaseDelay",
     "ZeroOnLoss",
     "tune",

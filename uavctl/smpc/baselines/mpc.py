@@ -1,111 +1,217 @@
-"""Constrained MPC without disturbances, for many states at once.
+"""MPC for the worst-case delay: all information counts as d steps old, which is what the paper argues against.
 
-With u_t = K x_t + c_t, K the regulator's gain and its Riccati solution as the terminal cost, the cost is
-x'Px + Σ_t c_t'(R + B'PB)c_t: where the regulator's own plan keeps every row, c = 0 is the optimum, and no program has
-to be solved. Elsewhere c is the shortest vector that keeps the rows; state rows give way at the price of their slack.
+The mean x̂ predicted over d steps has the error S = Σ_{i<d} A^i N A'^i, always, and is moved by A^d E w(k-d) in
+each
+step. Under u = mean + K_ρ(x̂ - mean) a stage t of the plan has the covariance S + Z_t, its input K_ρ Z_t K_ρ', with
+Z_{t+1} = (A + B K_ρ) Z_t (A + B K_ρ)' + A^d N A'^d from Z_0 = 0: κ standard deviations are taken off the rows.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_lyapunov
 
-from uavctl.smpc.baselines.problem import Part, Problem, parts
-from uavctl.smpc.lqg_bound import Lqr, lqr
-from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
+from uavctl.errors import DesignError
+from uavctl.smpc.batch import News, predict
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import BatchMpc, ControlProblem, deviations, unseen
+
+# Constrained MPC on receipt, and three ways to fill the silence: play the plan out, hold, or let go.
+
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 
-class BatchMpc:
-    """Plans of H steps from many states; inputs within their limits, state limits soft.
+class _OnReceipt(ABC):
+    """A new plan from each position that is newer than the last one; a late one is predicted to now first.
 
     Args:
-        problem: The problem.
-        backoff_x: What is taken off the state rows in the stages 0 … H (H+1, m_x); nothing by default.
-        backoff_u: The same of the input rows (H, m_u).
+        margin: How far the plans keep from the state limits, in standard deviations of one step's disturbance.
 
     Raises:
         DesignError: The plant has no regulator.
     """
 
-    def __init__(self, problem: Problem, backoff_x: Array | None = None, backoff_u: Array | None = None) -> None:
+    def __init__(self, problem: ControlProblem, margin: float = 0.0) -> None:
         self._problem = problem
-        law = lqr(problem.plant, problem.q_x, problem.q_u)
-        room_x = problem.state_set.margin(problem.target) - (0.0 if backoff_x is None else backoff_x)
-        room_u = problem.input_set.margin(problem.u_target) - (0.0 if backoff_u is None else backoff_u)
-        sides_x = np.broadcast_to(room_x, (problem.horizon + 1, problem.state_set.b.size))
-        sides_u = np.broadcast_to(room_u, (problem.horizon, problem.input_set.b.size))
-        self._parts = [_PartMpc(problem, law, part, sides_x, sides_u) for part in parts(problem)]
+        self._mpc = self._planner(margin)
+        self.begin(0)
 
-    def plans(self, x: Array) -> Array:
-        """Inputs (M, H, n_u) from states (M, n_x); NaN where the state is not finite or a program found no optimum."""
-        problem = self._problem
-        plans = np.empty((len(x), problem.horizon, problem.plant.n_u))
-        plans[:] = problem.u_target
-        for part in self._parts:
-            plans[:, :, part.inputs] += part.plans(x[:, part.states] - problem.target[part.states])
-        return plans
+    def _planner(self, margin: float) -> BatchMpc:
+        """Who plans."""
+        plant = self._problem.plant
+        step = plant.e @ plant.w @ plant.e.T
+        return BatchMpc(self._problem, margin * deviations(self._problem.state_set, step))
 
+    def begin(self, runs: int) -> None:
+        """See `BatchController`."""
+        self._plans = np.zeros((runs, self._problem.horizon, self._problem.plant.n_u))
+        self._made = np.zeros(runs, dtype=np.intp)
+        self._captured = np.full(runs, -1, dtype=np.intp)
 
-class _PartMpc:
-    """One independent part, in deviations from the target: rows of_x x + of_z z <= room, cost |z|²."""
+    def act(self, news: News) -> Array:
+        """See `BatchController`."""
+        (fresh,) = np.nonzero(news.newest > self._captured)
+        # x(0) is always known: every run has a plan from the first step on.
+        self._plans[fresh] = self._mpc.plans(predict(self._problem.plant, news)[fresh])
+        self._made[fresh] = news.step
+        self._captured[fresh] = news.newest[fresh]
+        return self._played(news.step - self._made)
 
-    def __init__(self, problem: Problem, law: Lqr, part: Part, sides_x: Array, sides_u: Array) -> None:
-        self.states, self.inputs, self._steps = part.states, part.inputs, problem.horizon
-        states_of, inputs_of = regulated(problem, law, part)
-        n_x = part.states.size
-        of_x = np.einsum("mi,tij->tmj", problem.state_set.c[np.ix_(part.rows_x, part.states)], states_of[1:])
-        of_u = np.einsum("mi,tij->tmj", problem.input_set.c[np.ix_(part.rows_u, part.inputs)], inputs_of)
-        rows = np.concatenate([of_x.reshape(-1, of_x.shape[2]), of_u.reshape(-1, of_u.shape[2])])
-        self._of_x, self._of_z = rows[:, :n_x], rows[:, n_x:]
-        self._room = np.concatenate([sides_x[1:, part.rows_x].ravel(), sides_u[:, part.rows_u].ravel()])
-        self._plan_x, self._plan_z = np.split(inputs_of.reshape(-1, rows.shape[1]), [n_x], axis=1)
-        soft = np.arange(len(rows)) < problem.horizon * part.rows_x.size
-        self._open = np.full(len(rows), -OPEN)
-        low, high = problem.input_set.bounds
-        self._low, self._high = ((side - problem.u_target)[part.inputs] for side in (low, high))
-        self._program = QuadraticProgram(
-            2.0 * np.eye(self._of_z.shape[1]),
-            np.ascontiguousarray(self._of_z),
-            np.where(soft, SOFT, 0).astype(np.int32),
-            np.where(soft, problem.slack_linear, 0.0),
-            np.where(soft, problem.slack_quadratic, 0.0),
-        )
-
-    def plans(self, x: Array) -> Array:
-        """Deviations of the inputs (M, H, n_u) from states (M, n_x)."""
-        plans = x @ self._plan_x.T
-        room = self._room - x @ self._of_x.T
-        for i in np.flatnonzero(~np.all(room >= 0.0, axis=1)):
-            plans[i] += self._plan_z @ self._steered(room[i])
-        # All that is cut is the program's tolerance.
-        return np.clip(plans.reshape(len(x), self._steps, self.inputs.size), self._low, self._high)
-
-    def _steered(self, room: Array) -> Array:
-        """z, NaN without an optimum."""
-        nothing = np.full(self._of_z.shape[1], np.nan)
-        if not np.isfinite(room).all():
-            return nothing
-        solved = self._program.solve(np.zeros_like(nothing), room, self._open)
-        return nothing if solved is None else solved[0]
+    @abstractmethod
+    def _played(self, index: Index, /) -> Array:
+        """Inputs (N, n_u) of plans that were made `index` (N,) steps ago."""
 
 
-def regulated(problem: Problem, law: Lqr, part: Part) -> tuple[Array, Array]:
-    """Regulated predictions: x_t (H+1, n_x, n_x + H n_u) and u_t (H, n_u, …) as maps of (x, z), z = L'c.
+class PacketisedPredictive(_OnReceipt):
+    """Certainty-equivalent packetised predictive control: the plan is played out, then u_target.
 
-    L L' = R + B'PB, and c is what is added to the regulator's inputs.
+    The receiver's buffer of Quevedo and Nešić (2011, Input-to-state stability of packetized predictive control over
+    unreliable networks), with the losses before the controller in place of behind it.
     """
-    plant, steps = problem.plant, problem.horizon
-    n_x, n_u = part.states.size, part.inputs.size
-    a, b = plant.a[np.ix_(part.states, part.states)], plant.b[np.ix_(part.states, part.inputs)]
-    k = law.k[np.ix_(part.inputs, part.states)]
-    of_z = np.linalg.inv(np.linalg.cholesky(law.weight[np.ix_(part.inputs, part.inputs)])).T
-    states, inputs = np.zeros((steps + 1, n_x, n_x + steps * n_u)), np.zeros((steps, n_u, n_x + steps * n_u))
-    states[0, :, :n_x] = np.eye(n_x)
-    for t in range(steps):
-        own = slice(n_x + t * n_u, n_x + (t + 1) * n_u)
-        inputs[t] = k @ states[t]
-        inputs[t, :, own] += of_z
-        states[t + 1] = a @ states[t] + b @ inputs[t]
-    return states, inputs
+
+    def _played(self, index: Index, /) -> Array:
+        steps = self._problem.horizon
+        inputs = self._plans[np.arange(index.size), np.minimum(index, steps - 1)]
+        return np.where((index < steps)[:, None], inputs, self._problem.u_target)
+
+
+class HoldLast(_OnReceipt):
+    """The plan's first input, held until the next position comes."""
+
+    def _played(self, _index: Index, /) -> Array:
+        return self._plans[:, 0].copy()
+
+
+class ZeroOnLoss(_OnReceipt):
+    """The plan's first input for one step, and u_target until the next position comes."""
+
+    def _played(self, index: Index, /) -> Array:
+        return np.where((index == 0)[:, None], self._plans[:, 0], self._problem.u_target)
+
+
+class MeanQp(PacketisedPredictive):
+    """Packetised predictive control with open-loop back-offs: stage t keeps κ σ_t from the state limits.
+
+    σ_t is the standard deviation of a prediction over t steps, and κ the same at every age, however likely it is.
+
+    Args:
+        cov: Covariance (n_x, n_x) of the newest state known, of a filter to which all comes; None: it is exact.
+
+    Raises:
+        DesignError: The plant has no regulator.
+    """
+
+    def __init__(self, problem: ControlProblem, margin: float, cov: Array | None = None) -> None:
+        self._cov = cov
+        super().__init__(problem, margin)
+
+    def _planner(self, margin: float) -> BatchMpc:
+        problem = self._problem
+        spread = unseen(problem.plant, problem.horizon, self._cov)
+        return BatchMpc(problem, margin * np.array([deviations(problem.state_set, cov) for cov in spread]))
+
+
+# K_ρ is the regulator's for the input weight ρ R: the least ρ by which the spread at the target takes this share of
+# the room, as the full gain asks for more input than there is.
+_SHARE = 0.5
+_INPUT_WEIGHTS = 2.0 ** np.arange(0, 21)
+
+
+class WorstCaseDelay:
+    """Positions wait until they are `delay` steps old; from there the mean is predicted, and each step plans anew.
+
+    Args:
+        delay: d >= 1 [steps].
+        kappa_x: κ of the state rows, see `risk.kappa`.
+
+    Raises:
+        DesignError: The spread leaves no room around the target, or the plant has no regulator.
+    """
+
+    def __init__(self, problem: ControlProblem, delay: int, kappa_x: float, kappa_u: float) -> None:
+        if delay < 1:
+            raise DesignError("smpc.tau", f"{delay} is no delay", "give at least 1 step")
+        self._problem, self._delay = problem, delay
+        self._mpc = BatchMpc(problem, *_backoffs(problem, delay, kappa_x, kappa_u))
+        self.begin(0)
+
+    def begin(self, runs: int) -> None:
+        """See `BatchController`."""
+        n_x = self._problem.plant.n_x
+        # Positions that are not old enough yet, by their capture modulo the length.
+        self._waiting = np.full((runs, self._delay + 1), -1, dtype=np.intp)
+        self._states = np.zeros((runs, self._delay + 1, n_x))
+        self._used, self._state = np.zeros(runs, dtype=np.intp), np.zeros((runs, n_x))
+
+    def act(self, news: News) -> Array:
+        """See `BatchController`."""
+        self._take(news)
+        x = predict(self._problem.plant, News(news.step, self._used, self._state, news.inputs))
+        first: Array = self._mpc.plans(x)[:, 0]
+        return first
+
+    def _take(self, news: News) -> None:
+        """Let the newest position that is old enough be the one that is used; x(0) is known at first."""
+        every, slot = np.arange(len(news.newest)), news.newest % (self._delay + 1)
+        self._waiting[every, slot], self._states[every, slot] = news.newest, news.state
+        if news.step == 0:
+            self._state = news.state.copy()
+            return
+        due = news.step - self._delay
+        old = np.where((self._waiting >= 0) & (self._waiting <= due), self._waiting, -1)
+        best = old.argmax(axis=1)
+        newer = np.flatnonzero(old[every, best] > self._used)
+        self._used[newer] = old[newer, best[newer]]
+        self._state[newer] = self._states[newer, best[newer]]
+
+
+def _backoffs(problem: ControlProblem, delay: int, kappa_x: float, kappa_u: float) -> tuple[Array, Array]:
+    """What is taken off the rows: states (H+1, m_x), inputs (H, m_u)."""
+    plant = problem.plant
+    step = plant.e @ plant.w @ plant.e.T
+    error = np.zeros_like(step)
+    for _ in range(delay):
+        error, step = error + step, plant.a @ step @ plant.a.T
+    k = _prediction_gain(problem, error, step, kappa_x, kappa_u)
+    loop, spread = plant.a + plant.b @ k, np.zeros_like(step)
+    backoff_x, backoff_u = [], []
+    for _ in range(problem.horizon + 1):
+        backoff_x.append(kappa_x * deviations(problem.state_set, error + spread))
+        backoff_u.append(kappa_u * deviations(problem.input_set, k @ spread @ k.T))
+        spread = loop @ spread @ loop.T + step
+    return np.array(backoff_x), np.array(backoff_u[:-1])
+
+
+def _prediction_gain(problem: ControlProblem, error: Array, step: Array, kappa_x: float, kappa_u: float) -> Array:
+    """K_ρ; where no ρ leaves enough room, the one that leaves most of it."""
+    plant, best = problem.plant, (np.inf, np.zeros((problem.plant.n_u, problem.plant.n_x)))
+    room_x, room_u = problem.state_set.margin(problem.target), problem.input_set.margin(problem.u_target)
+    for weight in _INPUT_WEIGHTS:
+        k = lqr(plant, problem.q_x, weight * problem.q_u).k
+        spread = solve_discrete_lyapunov(plant.a + plant.b @ k, step)
+        taken = max(
+            _taken(kappa_x * deviations(problem.state_set, error + spread), room_x),
+            _taken(kappa_u * deviations(problem.input_set, k @ spread @ k.T), room_u),
+        )
+        if taken < best[0]:
+            best = (taken, k)
+        if taken <= _SHARE:
+            break
+    if best[0] >= 1.0:
+        raise DesignError(
+            "smpc.tau",
+            f"a constant delay spreads the state over {best[0]:.3g} times the room that the limits leave at the target",
+            "take a shorter smpc.tau, or wider limits",
+        )
+    return best[1]
+
+
+def _taken(backoff: Array, room: Array) -> float:
+    """Largest share of the room that a back-off takes."""
+    shares = np.divide(backoff, room, out=np.full(room.size, np.inf), where=room > 0.0)
+    return float(shares.max(initial=0.0))

@@ -1,0 +1,425 @@
+"""Topics derived for viewers, as Protobuf."""
+
+from __future__ import annotations
+
+import math
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import msgspec
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from logs.recording.design_view import DesignView, Floats
+from uavctl.records import (
+    Decision,
+    Estimate,
+    LinkEstimate,
+    LinkStats,
+    Matrix,
+    Plan,
+    Record,
+    Setpoint,
+    Timing,
+    Truth,
+    VehicleStatus,
+)
+
+# What people plot, as flat records; NaN where there is no number, which a plot shows as a gap.
+
+
+class Axes(Record, frozen=True, kw_only=True):
+    """One number for each axis of local NED; NaN for an axis that the plant has not."""
+
+    north: float = math.nan
+    east: float = math.nan
+    down: float = math.nan
+
+
+class AgePlot(Record, frozen=True, kw_only=True):
+    """Age of the newest position, and what a tick made of it."""
+
+    age_s: float  # from its capture to this tick
+    age_steps: float  # as the controller counts it
+    limit_steps: float  # the age at which a plan is played out (H)
+    plan_index: float  # of the input that is flown
+    news: bool
+    mode: str
+    reason: str
+
+
+class InputPlot(Record, frozen=True, kw_only=True):
+    """Input that a tick chose, and the limits of plans (an estimated bias may go beyond); in the plant's units."""
+
+    chosen: Axes
+    lower: Axes
+    upper: Axes
+
+
+class SetpointPlot(Record, frozen=True, kw_only=True):
+    """Acceleration that was sent [m/s²]."""
+
+    accel_mps2: Axes
+    limited: bool  # the last gate changed it
+    source: str
+
+
+class StatePlot(Record, frozen=True, kw_only=True):
+    """State estimate."""
+
+    position_m: Axes
+    velocity_mps: Axes
+    position_std_m: Axes
+
+
+class LimitsPlot(Record, frozen=True, kw_only=True):
+    """Limits of position and velocity, and what the newest plan left of them at its end; infinite where open."""
+
+    position_lower_m: Axes
+    position_upper_m: Axes
+    tightened_lower_m: Axes  # with the back-offs of the plan's last stage
+    tightened_upper_m: Axes
+    velocity_lower_mps: Axes
+    velocity_upper_mps: Axes
+
+
+class SolvePlot(Record, frozen=True, kw_only=True):
+    """How a plan was found; how long it took is in `/plot/timing`."""
+
+    status: str
+    method: str
+    iterations: int
+    gap: float
+    cost: float
+    slack: float
+    offset: float
+    terminal_miss: float
+
+
+class TimingPlot(Record, frozen=True, kw_only=True):
+    """Run time of a tick; the ticks that solve are the long ones."""
+
+    lateness_us: float
+    step_us: float  # in the controller
+    send_us: float  # from the deadline to the socket
+    capture_to_send_ms: float
+
+
+class LinkPlot(Record, frozen=True, kw_only=True):
+    """The link that carries the positions: what is believed of it, and what the design counts on."""
+
+    arrival_mean: float
+    arrival_lower: float
+    promised: float
+    below_promise: bool
+    bursts: bool
+    burst_statistic: float
+
+
+class CounterPlot(Record, frozen=True, kw_only=True):
+    """Counters of one connection, and its clock."""
+
+    link: str
+    datagrams: int
+    messages: int
+    samples: int
+    bad: int
+    clock_offset_ms: float
+    clock_rtt_ms: float
+    clock_drift_ppm: float
+
+
+class TruthPlot(Record, frozen=True, kw_only=True):
+    """The simulator's own state."""
+
+    position_m: Axes
+    velocity_mps: Axes
+    sent: int
+    lost: int
+
+
+class VehiclePlot(Record, frozen=True, kw_only=True):
+    """The vehicle as it tells."""
+
+    mode: str
+    armed: bool
+    external: bool
+    battery_v: float
+
+
+def axes_of(design: DesignView, values: Sequence[float] | Floats) -> Axes:
+    """Numbers in the order of the plant's axes, by name."""
+    return Axes(**dict(zip(design.axes, map(float, values), strict=True)))
+
+
+def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
+    """The values at some places."""
+    return [float(values[i]) for i in index]
+
+
+def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
+    """Age in a tick; `captured_ns` is the capture time of the newest position so far."""
+    return AgePlot(
+        age_s=math.nan if captured_ns is None else (decision.at_ns - captured_ns) * 1e-9,
+        age_steps=_number(decision.age_steps),
+        limit_steps=float(design.horizon),
+        plan_index=_number(decision.plan_index),
+        news=decision.news,
+        mode=decision.mode.value,
+        reason=decision.reason,
+    )
+
+
+def input_plot(design: DesignView, decision: Decision) -> InputPlot:
+    """Input of a tick."""
+    box = design.input_box
+    chosen = Axes() if decision.input is None else axes_of(design, decision.input)
+    return InputPlot(chosen=chosen, lower=axes_of(design, box.lower), upper=axes_of(design, box.upper))
+
+
+def setpoint_plot(setpoint: Setpoint) -> SetpointPlot:
+    """What was sent."""
+    north, east, down = setpoint.accel_mps2
+    accel = Axes(north=north, east=east, down=down)
+    return SetpointPlot(accel_mps2=accel, limited=bool(setpoint.limited), source=setpoint.source.value)
+
+
+def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
+    """An estimate by axis."""
+    std = [math.sqrt(max(0.0, estimate.cov[i][i])) for i in design.position_index]
+    return StatePlot(
+        position_m=axes_of(design, pick(estimate.mean, design.position_index)),
+        velocity_mps=axes_of(design, pick(estimate.mean, design.velocity_index)),
+        position_std_m=axes_of(design, std),
+    )
+
+
+def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
+    """Limits and the tightened ones of a plan."""
+    box = design.state_box
+    lower, upper = tightened(design, plan.backoff_x, -1)
+    return LimitsPlot(
+        position_lower_m=axes_of(design, pick(box.lower, design.position_index)),
+        position_upper_m=axes_of(design, pick(box.upper, design.position_index)),
+        tightened_lower_m=axes_of(design, pick(lower, design.position_index)),
+        tightened_upper_m=axes_of(design, pick(upper, design.position_index)),
+        velocity_lower_mps=axes_of(design, pick(box.lower, design.velocity_index)),
+        velocity_upper_mps=axes_of(design, pick(box.upper, design.velocity_index)),
+    )
+
+
+def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
+    """Sides of the state box less the back-offs of a stage: lower and upper (n_x,)."""
+    lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
+    for side, closed in zip((lower, upper), design.closed_sides, strict=True):
+        for state, row, size in closed:
+            side[state] -= kept[row] / size
+    return lower, upper
+
+
+def solve_plot(plan: Plan) -> SolvePlot:
+    """How a plan was found."""
+    return SolvePlot(
+        status=plan.status.value,
+        method=plan.method,
+        iterations=plan.iterations,
+        gap=plan.gap,
+        cost=plan.cost,
+        slack=plan.slack,
+        offset=plan.offset,
+        terminal_miss=plan.terminal_miss,
+    )
+
+
+def timing_plot(timing: Timing) -> TimingPlot:
+    """Run time of a tick."""
+    return TimingPlot(
+        lateness_us=timing.lateness_ns * 1e-3,
+        step_us=timing.step_ns * 1e-3,
+        send_us=timing.send_ns * 1e-3,
+        capture_to_send_ms=_number(timing.capture_to_send_ns) * 1e-6,
+    )
+
+
+def link_plot(link: LinkEstimate) -> LinkPlot:
+    """What is believed of the link."""
+    return LinkPlot(
+        arrival_mean=link.arrival_mean,
+        arrival_lower=link.arrival_lower,
+        promised=link.promised,
+        below_promise=link.below_promise,
+        bursts=link.bursts,
+        burst_statistic=link.burst_statistic,
+    )
+
+
+def counter_plot(stats: LinkStats) -> CounterPlot:
+    """Counters of a connection."""
+    return CounterPlot(
+        link=stats.link,
+        datagrams=stats.datagrams,
+        messages=stats.messages,
+        samples=stats.samples,
+        bad=sum(stats.bad.values()),
+        clock_offset_ms=_number(stats.clock_offset_ns) * 1e-6,
+        clock_rtt_ms=_number(stats.clock_rtt_ns) * 1e-6,
+        clock_drift_ppm=_number(stats.clock_drift_ppm),
+    )
+
+
+def truth_plot(truth: Truth) -> TruthPlot:
+    """The simulator's state."""
+    position, velocity = (Axes(north=v[0], east=v[1], down=v[2]) for v in (truth.position_m, truth.velocity_mps))
+    return TruthPlot(position_m=position, velocity_mps=velocity, sent=truth.sent, lost=truth.lost)
+
+
+def vehicle_plot(status: VehicleStatus) -> VehiclePlot:
+    """The vehicle as it tells."""
+    return VehiclePlot(
+        mode=status.mode, armed=status.armed, external=status.external, battery_v=_number(status.battery_v)
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+# Protobuf messages of records of plain numbers: one definition, the record type, gives both.
+#
+# The descriptor is built here, so that nothing has to be compiled. Fields are numbered in the order
+# in which the type has them.
+
+
+_PACKAGE = "uavctl"
+_SCALARS: Mapping[object, FieldDescriptorProto.Type.ValueType] = {
+    float: FieldDescriptorProto.TYPE_DOUBLE,
+    int: FieldDescriptorProto.TYPE_INT64,
+    bool: FieldDescriptorProto.TYPE_BOOL,
+    str: FieldDescriptorProto.TYPE_STRING,
+}
+
+
+@cache
+def message_class(kind: type[Record]) -> type[Message]:
+    """Message type `uavctl.<name of the record>`.
+
+    Args:
+        kind: its fields are floats, integers, booleans, texts, tuples of one of these, and records of such fields.
+
+    Raises:
+        TypeError: a field has another type; names it.
+    """
+    file = FileDescriptorProto(name=f"{_PACKAGE}/{kind.__name__}.proto", package=_PACKAGE, syntax="proto3")
+    _describe(file.message_type.add(), kind, f".{_PACKAGE}")
+    pool = DescriptorPool()  # its own: what other libraries register has no say in these names
+    pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(f"{_PACKAGE}.{kind.__name__}"))
+
+
+def pack(record: Record) -> bytes:
+    """A record as the message of its type.
+
+    Raises:
+        ValueError: an integer that does not fit 64 bits, or a text that is none.
+        TypeError: a value that is not of its field's type.
+    """
+    return message_class(type(record))(**msgspec.to_builtins(record)).SerializeToString()
+
+
+def schema_of(kind: type[Message]) -> bytes:
+    """Descriptors of a message type and of all that it uses, as MCAP wants them."""
+    return build_file_descriptor_set(kind).SerializeToString()
+
+
+def _describe(message: DescriptorProto, kind: type[msgspec.Struct], scope: str) -> None:
+    """Fill in a message type; types of its fields go inside it, so that no name is taken twice."""
+    message.name = kind.__name__
+    scope = f"{scope}.{message.name}"
+    for number, field in enumerate(msgspec.structs.fields(kind), start=1):
+        entry = message.field.add(name=field.name, number=number, label=FieldDescriptorProto.LABEL_OPTIONAL)
+        part = field.type
+        if typing.get_origin(part) is tuple:
+            entry.label = FieldDescriptorProto.LABEL_REPEATED
+            part = typing.get_args(part)[0]
+        if part in _SCALARS:
+            entry.type = _SCALARS[part]
+        elif isinstance(part, type) and issubclass(part, msgspec.Struct):
+            entry.type = FieldDescriptorProto.TYPE_MESSAGE
+            entry.type_name = f"{scope}.{part.__name__}"
+            if part.__name__ not in {nested.name for nested in message.nested_type}:
+                _describe(message.nested_type.add(), part, scope)
+        else:
+            raise TypeError(f"{kind.__name__}.{field.name}: no protobuf field for {field.type}")
+
+
+# Topics that are made from the records for viewers: one row each. A replay and our own pages never read them.
+
+
+FRAMES, VEHICLE_FRAME = "/view/frames", "/view/vehicle_frame"
+ESTIMATE, MEASURED, TRUTH, TARGET = "/view/estimate", "/view/measured", "/view/truth", "/view/target"
+PLAN, LOG = "/view/plan", "/view/log"
+ROOM_SCENE, PLAN_SCENE = "/view/scene/room", "/view/scene/plan"
+PATH_SCENE, LINK_SCENE = "/view/scene/path", "/view/scene/link"
+
+
+@dataclass(frozen=True)
+class DerivedTopic:
+    """A topic of protobuf messages of one type: a well-known one, or that of a record."""
+
+    name: str
+    kind: type[Message] | type[Record]
+    text: str
+
+    @cached_property
+    def message(self) -> type[Message]:
+        """The message type."""
+        return self.kind if issubclass(self.kind, Message) else message_class(self.kind)
+
+    @property
+    def schema_name(self) -> str:
+        """Full name of the message type."""
+        return str(self.message.DESCRIPTOR.full_name)
+
+    @cached_property
+    def schema(self) -> bytes:
+        """Descriptors, as MCAP wants them."""
+        return schema_of(self.message)
+
+
+VIEWS: tuple[DerivedTopic, ...] = (
+    DerivedTopic(FRAMES, FrameTransforms, "frame `ned` in `room`, whose axes are east, north, up; every 5 s"),
+    DerivedTopic(VEHICLE_FRAME, FrameTransform, "frame `vehicle` in `ned`, from the estimate (no attitude)"),
+    DerivedTopic(ESTIMATE, PoseInFrame, "estimated position"),
+    DerivedTopic(MEASURED, PoseInFrame, "a position as measured; its stamp is the capture time"),
+    DerivedTopic(TRUTH, PoseInFrame, "true position, in simulated flights"),
+    DerivedTopic(TARGET, PoseInFrame, "where the mission wants the vehicle to be"),
+    DerivedTopic(PLAN, PosesInFrame, "predicted positions of a plan"),
+    DerivedTopic(LOG, Log, "events"),
+    DerivedTopic(ROOM_SCENE, SceneUpdate, "limits of the position; every 5 s"),
+    DerivedTopic(PLAN_SCENE, SceneUpdate, "predicted path, confidence ellipsoids, limits less the back-offs"),
+    DerivedTopic(PATH_SCENE, SceneUpdate, "flown and measured path of the last 20 s; once a second"),
+    DerivedTopic(LINK_SCENE, SceneUpdate, "state of the link, at the vehicle"),
+    DerivedTopic("/plot/age", AgePlot, "age of information"),
+    DerivedTopic("/plot/input", InputPlot, "chosen input and its limits"),
+    DerivedTopic("/plot/setpoint", SetpointPlot, "acceleration sent"),
+    DerivedTopic("/plot/state", StatePlot, "estimate by axis"),
+    DerivedTopic("/plot/limits", LimitsPlot, "limits, and what a plan's back-offs leave of them"),
+    DerivedTopic("/plot/solve", SolvePlot, "how a plan was found"),
+    DerivedTopic("/plot/timing", TimingPlot, "run time of a tick"),
+    DerivedTopic("/plot/link", LinkPlot, "belief about the link"),
+    DerivedTopic("/plot/counters", CounterPlot, "counters of a connection"),
+    DerivedTopic("/plot/truth", TruthPlot, "simulator's state, by axis"),
+    DerivedTopic("/plot/vehicle", VehiclePlot, "mode and battery"),
+)
+PLOTS = {view.kind: view.name for view in VIEWS if issubclass(view.kind, Record)}

@@ -1,0 +1,190 @@
+"""What people's pages need to know of a design: limits, weights, target, the meaning of the states."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import itemgetter
+from typing import Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.errors import RecordingError
+from uavctl.labels import Names, names_of
+from uavctl.records import Header, Matrix, Vec3, Vector
+
+Floats = NDArray[np.float64]
+AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
+
+
+class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+    """The part of `Header.design` that people's pages need; other keys are ignored.
+
+    Each field is the key of the same name: admissible sets {x | c_x x <= b_x} and
+    {u | c_u u <= b_u}, full weights q_x (n_x, n_x) and q_u (n_u, n_u), the target equilibrium
+    (n_x,), Δt, H, and where each axis has its position and velocity in the state.
+    """
+
+    c_x: Matrix
+    b_x: Vector
+    c_u: Matrix
+    b_u: Vector
+    q_x: Matrix
+    q_u: Matrix
+    target: Vector
+    dt_s: float
+    horizon: int
+    axes: tuple[str, ...]
+    position_index: tuple[int, ...]
+    velocity_index: tuple[int, ...]
+    state_names: tuple[str, ...] = ()
+    input_unit: str = "m/s²"
+
+    def __post_init__(self) -> None:
+        n_x, n_u, n_axes = len(self.target), len(self.q_u), len(self.axes)
+        shapes = {
+            "c_x": all(len(row) == n_x for row in self.c_x) and len(self.c_x) == len(self.b_x),
+            "c_u": all(len(row) == n_u for row in self.c_u) and len(self.c_u) == len(self.b_u),
+            "q_x": len(self.q_x) == n_x and all(len(row) == n_x for row in self.q_x),
+            "q_u": all(len(row) == n_u for row in self.q_u),
+            "position_index": len(self.position_index) == n_axes and all(0 <= i < n_x for i in self.position_index),
+            "velocity_index": len(self.velocity_index) == n_axes and all(0 <= i < n_x for i in self.velocity_index),
+            "state_names": len(self.state_names) in (0, n_x),
+            "axes": set(self.axes) <= set(AXIS_NUMBER) and n_axes == n_u,
+            "dt_s": self.dt_s > 0,
+        }
+        wrong = [name for name, fits in shapes.items() if not fits]
+        if wrong:
+            raise ValueError(f"shapes do not fit each other: {', '.join(wrong)}")
+
+    @cached_property
+    def names(self) -> Names:
+        """What states and limits are called."""
+        return names_of(self.c_x, len(self.target), self.axes, self.position_index, self.velocity_index)
+
+    @property
+    def dt_ns(self) -> int:
+        """Δt [ns]."""
+        return round(self.dt_s * 1e9)
+
+    @property
+    def target_m(self) -> Vec3:
+        """Target position; axes that the plant has not are 0."""
+        return self.position_of(self.target)
+
+    def position_of(self, state: Sequence[float]) -> Vec3:
+        """Position in local NED [m] within a state (n_x,); axes that the plant has not are 0."""
+        position = [0.0, 0.0, 0.0]
+        for axis, index in zip(self.axes, self.position_index, strict=True):
+            position[AXIS_NUMBER[axis]] = float(state[index])
+        return (position[0], position[1], position[2])
+
+    def positions_of(self, states: Matrix | Floats) -> Floats:
+        """The same of many states (n, n_x): (n, 3)."""
+        positions = np.zeros((len(states), 3))
+        if isinstance(states, np.ndarray):
+            positions[:, self._columns] = states[:, self.position_index]
+        elif len(self.position_index) > 1:  # to turn all of a plan's numbers into an array takes longer
+            positions[:, self._columns] = list(map(itemgetter(*self.position_index), states))
+        else:
+            positions[:, self._columns] = [[state[index] for index in self.position_index] for state in states]
+        return positions
+
+    @cached_property
+    def _columns(self) -> list[int]:
+        """Where each axis stands among north, east, down."""
+        return [AXIS_NUMBER[axis] for axis in self.axes]
+
+    def state_name(self, index: int) -> str:
+        """Name of a state for people, e.g. "north position"."""
+        if self.state_names:
+            return self.state_names[index]
+        for axis, position, velocity in zip(self.axes, self.position_index, self.velocity_index, strict=True):
+            if index in (position, velocity):
+                return f"{axis} {'position' if index == position else 'velocity'}"
+        return f"state {index}"
+
+    @cached_property
+    def state_box(self) -> Box:
+        """Axis-parallel limits of the states."""
+        return Box.of(self.c_x, self.b_x, len(self.target))
+
+    @cached_property
+    def closed_sides(self) -> tuple[tuple[tuple[int, int, float], ...], ...]:
+        """Of the lower sides of the states that are not open, and of the upper ones: state, row, its coefficient."""
+        box = self.state_box
+        return tuple(
+            tuple((state, row, self.c_x[row][state]) for state, row in enumerate(rows.tolist()) if row >= 0)
+            for rows in (box.row_lower, box.row_upper)
+        )
+
+    @cached_property
+    def position_rows(self) -> tuple[tuple[int, int, float], ...]:
+        """Rows that limit a position: state, row, size of the row's coefficient."""
+        box = self.state_box
+        return tuple(
+            (state, row, abs(self.c_x[row][state]))
+            for state in self.position_index
+            for row in (int(box.row_lower[state]), int(box.row_upper[state]))
+            if row >= 0
+        )
+
+    @cached_property
+    def input_box(self) -> Box:
+        """Axis-parallel limits of the inputs."""
+        return Box.of(self.c_u, self.b_u, len(self.q_u))
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Axis-parallel sides of a polytope; open sides are infinite and have row -1."""
+
+    lower: Floats  # (n,)
+    upper: Floats  # (n,)
+    row_lower: NDArray[np.int64]  # (n,) row of the polytope that the side comes from
+    row_upper: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, c: Matrix, b: Vector, n: int) -> Self:
+        """Tightest sides among the rows of {x | c x <= b} that bound a single coordinate."""
+        lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+        row_lower, row_upper = np.full(n, -1), np.full(n, -1)
+        for row, (normal, limit) in enumerate(zip(c, b, strict=True)):
+            used = np.flatnonzero(normal)
+            if len(used) != 1:
+                continue
+            i = int(used[0])
+            side = limit / normal[i]
+            if normal[i] > 0 and side < upper[i]:
+                upper[i], row_upper[i] = side, row
+            elif normal[i] < 0 and side > lower[i]:
+                lower[i], row_lower[i] = side, row
+        return cls(lower, upper, row_lower, row_upper)
+
+
+def design_view(header: Header) -> DesignView:
+    """Read the design of a header.
+
+    Raises:
+        RecordingError: a key is missing or does not fit the others.
+    """
+    try:
+        view = msgspec.convert(header.design, DesignView)
+    except msgspec.ValidationError as error:
+        raise RecordingError(f"the header's design cannot be used: {error}") from error
+    free = _free_input(header)
+    sides = tuple(b + free * sum(map(abs, row)) for row, b in zip(view.c_u, view.b_u, strict=True))
+    return msgspec.structs.replace(view, b_u=sides)
+
+
+def _free_input(header: Header) -> float:
+    """What plans leave of each input to be flown against a bias: flown inputs may use it [input units]."""
+    try:
+        estimator = tomllib.loads(header.config_toml).get("estimator", {})
+    except tomllib.TOMLDecodeError:
+        return 0.0  # the page shows the damaged text, and limits that are cautious
+    return float(estimator.get("bias_max", 0.0))

@@ -1,0 +1,154 @@
+"""The disk under a recording: files that keep what they were given, names of segments, free space."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from uavctl.errors import RecordingError
+
+
+class OutputFile(Protocol):
+    """What a segment asks of a file; every method may raise OSError."""
+
+    def write(self, data: bytes) -> None:
+        """Hand all of `data` to the operating system."""
+        ...
+
+    def truncate(self, size: int) -> None:
+        """Cut the file to `size` bytes and go on writing there."""
+        ...
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+
+class DiskFile:
+    """A new file without a buffer of its own: what `write` took survives the end of the process.
+
+    Raises:
+        FileExistsError: a recording never overwrites.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # What is appended to a file that somebody has cut stays too short, and so can be seen.
+        self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+
+    def write(self, data: bytes) -> None:
+        """Hand all of `data` to the operating system."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(self._fd, rest) :]
+
+    def truncate(self, size: int) -> None:
+        """Cut the file to `size` bytes and go on writing there."""
+        os.ftruncate(self._fd, size)
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Close the file."""
+        # The number may soon be another file's: whatever is asked of this one from now on fails.
+        fd, self._fd = self._fd, -1
+        os.close(fd)
+
+
+def segment_path(path: Path, segment: int) -> Path:
+    """File of a recording's segment; the first is the recording's own name."""
+    return path if segment == 1 else path.with_name(f"{path.stem}-{segment}{path.suffix}")
+
+
+def later_segments(path: Path) -> tuple[Path, ...]:
+    """Existing files named as later segments of the recording `path`, in order."""
+    pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
+    found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
+    return tuple(found[number] for number in sorted(found))
+
+
+def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
+    """Whether a file is where it was made, and holds no less than was written to it.
+
+    Args:
+        opened: what it is, while it is open. Of a closed one some file systems (FAT) change the number.
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True  # nobody knows, and the next write will tell
+    return found.st_size >= size and (opened is None or os.path.samestat(found, opened))
+
+
+def free_bytes(folder: Path) -> int | None:
+    """Free space where a folder is [bytes]; None if it cannot be told."""
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return None
+
+
+class RoomWatch:
+    """Tells when the disk under a recording gets low, when recording should rest, and when it may go on.
+
+    Attributes:
+        low: less than `low_bytes` are free.
+        resting: there was less than `stop_bytes`, and has not been `low_bytes` since.
+        text: what is known, in words.
+
+    Args:
+        free: gives its free space [bytes]; None, which changes nothing, if that cannot be told.
+    """
+
+    def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:
+        self._folder, self._free, self._low_bytes, self._stop_bytes = folder, free, low_bytes, stop_bytes
+        self.low = self.resting = False
+        self.text = ""
+
+    def look(self) -> None:
+        """Ask for the free space."""
+        free = self._free(self._folder)
+        if free is None:
+            return
+        self.low = free < self._low_bytes
+        self.resting = free < self._stop_bytes or (self.resting and self.low)
+        self.text = f"{free} bytes free in {self._folder}" + (
+            f"; recording rests until there are {self._low_bytes}" if self.resting else ""
+        )
+
+
+def check_room(path: Path, free_bytes: int) -> int:
+    """Free space for the new recording `path` [bytes]; its folder is made.
+
+    Raises:
+        RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.
+    """
+    try:
+        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(path.parent).free
+    except OSError as error:
+        raise RecordingError(
+            f"{path.parent}: the folder cannot be made ({error.strerror}); choose another folder for the recording"
+        ) from error
+    if taken:
+        raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another folder")
+    if not os.access(path.parent, os.W_OK):
+        raise RecordingError(f"{path.parent}: not writable; choose another folder for the recording")
+    if free < free_bytes:
+        raise RecordingError(
+            f"{path.parent}: {free} bytes free, log.free_bytes asks for {free_bytes}; "
+            "make room, choose another folder, or lower log.free_bytes"
+        )
+    return free

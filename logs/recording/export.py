@@ -1,0 +1,539 @@
+"""Records as rows of tables: nested values spread over columns, whose number the recording's own values tell.
+
+A field keeps its name, and with it its unit. What it holds follows it:
+
+* three numbers of a place: `position_m_x`, `_y`, `_z` (local NED: north, east, down);
+* a list: `mean_0`, `mean_1` ...; a matrix: `cov_0_0`, `cov_0_1` ...; as many as the longest has;
+* a record or a mapping within: `vehicle.armed`, `bad.crc`;
+* a list of records: a table of its own, one row each; the field's own column counts them.
+
+A missing value, and a place beyond a shorter list's end, is an empty cell.
+"""
+
+from __future__ import annotations
+
+import csv
+import struct
+import types
+import typing
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+from pathlib import Path
+from typing import Any, Protocol, Self
+from urllib.parse import quote
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from logs.recording.outputs import all_or_none, check_free, unfinished
+from logs.recording.reader import RecordedMessage, finished, good_messages, segment_files
+from logs.recording.topics import HEADER, LIBRARY, decode, is_view, record_type
+from uavctl.errors import RecordingError, UsageError
+from uavctl.records import Record, Vec3
+
+Cell = int | float | bool | str | bytes | None
+_AXES = ("x", "y", "z")
+
+
+class ColumnKind(Enum):
+    """What a column holds."""
+
+    INTEGER = "integer"
+    FLOAT = "float"
+    BOOLEAN = "boolean"
+    TEXT = "text"
+    BYTES = "bytes"
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """One column of a table."""
+
+    name: str
+    kind: ColumnKind
+
+
+class _Form(Protocol):
+    """How values of one type stand in columns; told all values first, then asked for the cells of each."""
+
+    def learn(self, value: Any) -> None:
+        """See how many columns a value needs."""
+        ...
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        """The columns that all values need, each beginning with `name`."""
+        ...
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        """Append a value's cells, one for each column."""
+        ...
+
+
+class _Leaf:
+    """One column."""
+
+    def __init__(self, kind: ColumnKind) -> None:
+        self._kind = kind
+
+    def learn(self, value: Any) -> None:
+        """Nothing depends on the value."""
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        yield TableColumn(name, self._kind)
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        row.append(value)
+
+
+class _Choice(_Leaf):
+    """An enumeration, by its values."""
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        row.append(None if value is None else value.value)
+
+
+class _Json(_Leaf):
+    """Anything, as JSON text."""
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        row.append(None if value is None else msgspec.json.encode(value).decode())
+
+
+class _Count(_Leaf):
+    """How many records a list has; they stand in a table of their own."""
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        row.append(None if value is None else len(value))
+
+
+class _Place:
+    """Three numbers: one each axis."""
+
+    def learn(self, value: Any) -> None:
+        """Nothing depends on the value."""
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        yield from (TableColumn(f"{name}_{axis}", ColumnKind.FLOAT) for axis in _AXES)
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        row.extend((None,) * len(_AXES) if value is None else value)
+
+
+class _List:
+    """As many as the longest has."""
+
+    def __init__(self, item: type) -> None:
+        self._item = item
+        self._forms: list[_Form] = []
+
+    def learn(self, value: Any) -> None:
+        for place, one in enumerate(value or ()):
+            if place == len(self._forms):
+                self._forms.append(_form(self._item))
+            self._forms[place].learn(one)
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        for place, form in enumerate(self._forms):
+            yield from form.columns(f"{name}_{place}")
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        held = value or ()
+        for place, form in enumerate(self._forms):
+            form.put(held[place] if place < len(held) else None, row)
+
+
+class _Mapping:
+    """One each key that any of them has, in the keys' order."""
+
+    def __init__(self, item: type) -> None:
+        self._item = item
+        self._forms: dict[str, _Form] = {}
+
+    def learn(self, value: Any) -> None:
+        for key, one in (value or {}).items():
+            if key not in self._forms:
+                self._forms = dict(sorted([*self._forms.items(), (key, _form(self._item))]))
+            self._forms[key].learn(one)
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        for key, form in self._forms.items():
+            yield from form.columns(f"{name}.{key}")
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        held = value or {}
+        for key, form in self._forms.items():
+            form.put(held.get(key), row)
+
+
+class _Fields:
+    """A record, field by field."""
+
+    def __init__(self, kind: type[msgspec.Struct]) -> None:
+        self._forms = {field.name: _form(field.type) for field in msgspec.structs.fields(kind)}
+
+    def learn(self, value: Any) -> None:
+        if value is not None:
+            for name, form in self._forms.items():
+                form.learn(getattr(value, name))
+
+    def columns(self, name: str) -> Iterator[TableColumn]:
+        for field, form in self._forms.items():
+            yield from form.columns(f"{name}.{field}" if name else field)
+
+    def put(self, value: Any, row: list[Cell]) -> None:
+        for name, form in self._forms.items():
+            form.put(None if value is None else getattr(value, name), row)
+
+
+_LEAVES = {
+    int: ColumnKind.INTEGER,
+    float: ColumnKind.FLOAT,
+    bool: ColumnKind.BOOLEAN,
+    str: ColumnKind.TEXT,
+    bytes: ColumnKind.BYTES,
+}
+
+
+def _form(kind: Any) -> _Form:
+    """The form of a field's type; None is an empty cell of any type.
+
+    Raises:
+        TypeError: no table has a place for such values.
+    """
+    kind = _present(kind)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if kind in _LEAVES:
+        return _Leaf(_LEAVES[kind])
+    if kind == Vec3:
+        return _Place()
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return _Count(ColumnKind.INTEGER) if _is_record(arguments[0]) else _List(arguments[0])
+    if origin is dict:
+        return _Json(ColumnKind.TEXT) if arguments[1] is object else _Mapping(arguments[1])
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return _Choice(ColumnKind.TEXT)
+    if _is_record(kind):
+        return _Fields(kind)
+    raise TypeError(f"no column can hold {kind}")
+
+
+def _present(kind: Any) -> Any:
+    """The type without None."""
+    if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+        (rest,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
+        return rest
+    return kind
+
+
+def _is_record(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+class _Table:
+    """Columns and rows of one type of record, after columns of its own."""
+
+    def __init__(self, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> None:
+        self._lead = lead
+        self._form = _Fields(kind)
+        self.lists = tuple(_lists(kind))
+        self.rows = 0
+
+    def learn(self, record: msgspec.Struct) -> None:
+        self._form.learn(record)
+
+    def columns(self) -> tuple[TableColumn, ...]:
+        return (*(TableColumn(name, ColumnKind.INTEGER) for name in self._lead), *self._form.columns(""))
+
+    def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
+        self.rows += 1
+        row: list[Cell] = [*lead]
+        self._form.put(record, row)
+        return row
+
+
+def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struct]]]:
+    """Fields that are lists of records, and what the records are."""
+    for field in msgspec.structs.fields(kind):
+        arguments = typing.get_args(_present(field.type))
+        if arguments and arguments[-1] is Ellipsis and _is_record(arguments[0]):
+            yield field.name, arguments[0]
+
+
+class Tables:
+    """The tables of a recording, by topic; a list of records within has the name `<topic>.<field>`.
+
+    Each table begins with `log_time_ns`. That of a list goes on with `row`, the row (from 0) of the topic's table that
+    the list belongs to, and `place`, the place in the list (from 0).
+    """
+
+    def __init__(self) -> None:
+        self._tables: dict[str, _Table] = {}
+
+    def learn(self, topic: str, record: Record) -> None:
+        """See what columns a record needs. All records are seen before the first row is asked for."""
+        table = self._table(topic, ("log_time_ns",), type(record))
+        table.learn(record)
+        for field, kind in table.lists:
+            for one in getattr(record, field):
+                self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind).learn(one)
+
+    def columns(self) -> dict[str, tuple[TableColumn, ...]]:
+        """Columns of each table, by its name."""
+        return {name: self._tables[name].columns() for name in sorted(self._tables)}
+
+    def rows(self, topic: str, at_ns: int, record: Record) -> Iterator[tuple[str, list[Cell]]]:
+        """A record's rows, each with its table's name; records come in the order of the recording."""
+        table = self._tables[topic]
+        number = table.rows
+        yield topic, table.row((at_ns,), record)
+        for field, _ in table.lists:
+            name = f"{topic}.{field}"
+            for place, one in enumerate(getattr(record, field)):
+                yield name, self._tables[name].row((at_ns, number, place), one)
+
+    def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
+        if name not in self._tables:
+            self._tables[name] = _Table(lead, kind)
+        return self._tables[name]
+
+
+# A recording as tables: CSV, or Parquet with the extra `parquet`.
+#
+# One file for each topic of records (and one for each list of records within); what was made for viewers is left out.
+
+
+_BATCH_ROWS = 4096  # kept in memory for each Parquet table
+CSV_ENCODING = "utf-8"
+
+
+class TableFormat(StrEnum):
+    """Formats of tables; the values are the files' suffixes."""
+
+    CSV = "csv"
+    PARQUET = "parquet"
+
+
+class ExportedTable(msgspec.Struct, frozen=True, kw_only=True):
+    """One file that was written."""
+
+    file: str
+    topic: str  # with the field's name after a dot: a list of records within
+    rows: int
+    columns: int
+
+
+class Exported(msgspec.Struct, frozen=True, kw_only=True):
+    """What was written of a recording."""
+
+    tables: tuple[ExportedTable, ...]
+    unknown: dict[str, int]  # records left out, by topics that this version does not know
+
+
+Watch = Callable[[Iterable[RecordedMessage], int | None, str], Iterable[RecordedMessage]]
+"""Looks at messages as they go by, for a progress bar: given them, their number if it is known, and what is done."""
+
+
+def unwatched(messages: Iterable[RecordedMessage], _total: int | None, _what: str) -> Iterable[RecordedMessage]:
+    """Nobody looks."""
+    return messages
+
+
+def known_number(flight: Path) -> int | None:
+    """How many messages `good_messages` will give, by the recording's own statistics; None of a torn recording.
+
+    Raises:
+        RecordingError: There is no such recording.
+    """
+    if not finished(flight):
+        return None
+    number = 0
+    for place, path in enumerate(segment_files(flight)):
+        left_out = {HEADER, LIBRARY} if place else set()  # which later files repeat
+        try:
+            with path.open("rb") as file:
+                summary = make_reader(file).get_summary()
+        except (OSError, McapError, ValueError, struct.error):
+            return None  # whoever reads on will say what is wrong
+        if summary is None or summary.statistics is None:
+            return None
+        for channel, messages in summary.statistics.channel_message_counts.items():
+            topic = summary.channels[channel].topic if channel in summary.channels else ""
+            if not is_view(topic) and topic not in left_out:
+                number += messages
+    return number
+
+
+def export_tables(
+    flight: Path, folder: Path, kind: TableFormat, *, force: bool = False, watch: Watch = unwatched
+) -> Exported:
+    """Write the tables of a recording into a folder.
+
+    The recording is read twice: first to see what columns its values need. Where the export does not come to its end,
+    nothing new is left behind.
+
+    Raises:
+        RecordingError: It cannot be read, holds no record, or the files cannot be written.
+        UsageError: A file exists and is not to be overwritten, the folder cannot be made, or `pyarrow` is not there.
+    """
+    begin = _writer(kind)
+    tables, unknown, total = _survey(flight, watch)
+    columns = tables.columns()
+    if not columns:
+        raise RecordingError(f"{flight}: no record of this version in it, so there is nothing to export")
+    files = {name: folder / f"{file_stem(name)}.{kind.value}" for name in columns}
+    targets = list(files.values())
+    check_free(targets, force=force)
+    rows: Counter[str] = Counter()
+    with all_or_none(targets), unfinished(targets) as parts, ExitStack() as stack:
+        writers = {name: stack.enter_context(begin(parts[files[name]], columns[name])) for name in columns}
+        for topic, at_ns, record in _decoded(watch(good_messages(flight), total, "writing")):
+            for name, row in tables.rows(topic, at_ns, record):
+                writers[name].write(row)
+                rows[name] += 1
+    return Exported(
+        tables=tuple(
+            ExportedTable(file=str(files[name]), topic=name, rows=rows[name], columns=len(columns[name]))
+            for name in columns
+        ),
+        unknown=dict(sorted(unknown.items())),
+    )
+
+
+def file_stem(table: str) -> str:
+    """File name of a table, without its suffix; two tables never share one."""
+    return ".".join(quote(part, safe="") for part in table.strip("/").split("/"))
+
+
+def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
+    """Columns of all tables; records of unknown topics, counted; and the number of messages."""
+    tables, unknown = Tables(), Counter[str]()
+    total = 0
+
+    def counted() -> Iterator[RecordedMessage]:
+        nonlocal total
+        for message in good_messages(flight):
+            total += 1
+            if not _is_known(message.definition.topic):
+                unknown[message.definition.topic] += 1
+            yield message
+
+    for topic, _, record in _decoded(watch(counted(), known_number(flight), "reading")):
+        tables.learn(topic, record)
+    return tables, unknown, total
+
+
+def _decoded(messages: Iterable[RecordedMessage]) -> Iterator[tuple[str, int, Record]]:
+    for message in messages:
+        topic = message.definition.topic
+        if _is_known(topic):
+            yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
+
+
+def _is_known(topic: str) -> bool:
+    try:
+        record_type(topic)
+    except KeyError:
+        return False
+    return True
+
+
+class _Writer(Protocol):
+    """Writes one table."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None: ...
+
+    def write(self, row: list[Cell]) -> None:
+        """Append a row."""
+        ...
+
+
+def _writer(kind: TableFormat) -> Callable[[Path, tuple[TableColumn, ...]], _Writer]:
+    """What writes a table of a format.
+
+    Raises:
+        UsageError: `pyarrow` is not there.
+    """
+    if kind is TableFormat.CSV:
+        return _CsvFile
+    try:
+        import pyarrow  # noqa: F401 before anything is read or written
+    except ImportError as missing:
+        raise UsageError(
+            "Parquet is written by pyarrow, which is not there; install uavctl[parquet], or take --to csv"
+        ) from missing
+    return _ParquetFile
+
+
+class _CsvFile:
+    """RFC 4180 with a line of names; floats with the digits that give the same float back; bytes in hexadecimal."""
+
+    def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
+        self._file = path.open("w", newline="", encoding=CSV_ENCODING)
+        self._csv = csv.writer(self._file)
+        self._bytes = tuple(place for place, column in enumerate(columns) if column.kind is ColumnKind.BYTES)
+        self._csv.writerow([column.name for column in columns])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
+        self._file.close()
+
+    def write(self, row: list[Cell]) -> None:
+        for place in self._bytes:
+            held = row[place]
+            row[place] = held.hex() if isinstance(held, bytes) else None
+        self._csv.writerow(row)
+
+
+class _ParquetFile:
+    """One row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
+
+    def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        types = {
+            ColumnKind.INTEGER: pa.int64(),
+            ColumnKind.FLOAT: pa.float64(),
+            ColumnKind.BOOLEAN: pa.bool_(),
+            ColumnKind.TEXT: pa.string(),
+            ColumnKind.BYTES: pa.binary(),
+        }
+        self._arrow: Any = pa
+        self._columns = tuple((column.name, types[column.kind]) for column in columns)
+        self._schema = pa.schema(self._columns)
+        self._rows: list[list[Cell]] = []
+        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
+        try:
+            if failed is None:
+                self._flush()
+        finally:
+            self._writer.close()
+
+    def write(self, row: list[Cell]) -> None:
+        self._rows.append(row)
+        if len(self._rows) == _BATCH_ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        pa = self._arrow
+        arrays = []
+        for place, (name, kind) in enumerate(self._columns):
+            try:
+                arrays.append(pa.array([row[place] for row in self._rows], type=kind))
+            except (OverflowError, pa.ArrowInvalid) as error:
+                raise RecordingError(f"column {name}: Parquet has no place for one of its values ({error})") from error
+        self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
+        self._rows.clear()

@@ -1,0 +1,340 @@
+"""A flight in memory: its records by type, and the arrays that summary and report are made from."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from logs.recording.design_view import DesignView, Floats, design_view
+from logs.recording.topics import END, GOES_ON, RecorderNote
+from uavctl.errors import RecordingError
+from uavctl.flight.decision import MISSION_OVER
+from uavctl.flight.envelope import BREACHES
+from uavctl.records import (
+    ORDER_ACCEPTED,
+    Checked,
+    ControlMode,
+    Decision,
+    Ending,
+    Estimate,
+    Event,
+    Header,
+    LinkEstimate,
+    LinkStats,
+    Order,
+    Plan,
+    PositionSample,
+    Record,
+    Setpoint,
+    SolveStatus,
+    StepInput,
+    Timing,
+    Truth,
+    VehicleStatus,
+)
+
+R = TypeVar("R", bound=Record)
+
+FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
+MOVES = 3  # successive boundaries with another target each: it moves, and was not only changed
+FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
+
+
+class Landing(NamedTuple):
+    """When a landing began that was wanted [ns], and whether the operator ordered it or the mission ended in it."""
+
+    at_ns: int
+    ordered: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FlightData:
+    """All records of a flight, by type, in the order in which they were written."""
+
+    header: Header
+    design: DesignView
+    step_inputs: tuple[StepInput, ...]
+    estimates: tuple[Estimate, ...]
+    plans: tuple[Plan, ...]
+    decisions: tuple[Decision, ...]
+    setpoints: tuple[Setpoint, ...]
+    vehicles: tuple[VehicleStatus, ...]
+    events: tuple[Event, ...]
+    timings: tuple[Timing, ...]
+    links: tuple[LinkStats, ...]
+    truths: tuple[Truth, ...]
+    link_estimates: tuple[LinkEstimate, ...] = ()
+    checks: tuple[Checked, ...] = ()  # before arming
+    notes: tuple[RecorderNote, ...] = ()  # the recorder's own account
+    endings: tuple[Ending, ...] = ()  # the daemon's last word; none in older recordings, and in torn ones
+
+    @classmethod
+    def from_records(cls, records: Iterable[tuple[str, int, Record]], path: Path | None = None) -> Self:
+        """Sort (topic, log_time_ns, record) by record type; types that nobody reads here are left out.
+
+        Args:
+            path: The file that they are from, which errors name.
+
+        Raises:
+            RecordingError: no header, no decision, or a design without the keys of `DesignView`.
+        """
+        found: defaultdict[type[Record], list[Record]] = defaultdict(list)
+        for _, _, record in records:
+            found[type(record)].append(record)
+
+        def take(kind: type[R]) -> tuple[R, ...]:
+            return tuple(record for record in found[kind] if isinstance(record, kind))
+
+        headers, decisions = take(Header), take(Decision)
+        where = "" if path is None else f"{path}: "
+        if not headers:
+            raise RecordingError(f"{where}the recording has no header; it is empty, or not one of uavctl")
+        if not decisions:
+            raise RecordingError(
+                f"{where}the recording has no decision: nothing was flown, so there is nothing to report"
+            )
+        return cls(
+            header=headers[0],
+            design=design_view(headers[0]),
+            step_inputs=take(StepInput),
+            estimates=take(Estimate),
+            plans=take(Plan),
+            decisions=decisions,
+            setpoints=take(Setpoint),
+            vehicles=take(VehicleStatus),
+            events=take(Event),
+            timings=take(Timing),
+            links=take(LinkStats),
+            truths=take(Truth),
+            link_estimates=take(LinkEstimate),
+            checks=take(Checked),
+            notes=take(RecorderNote),
+            endings=take(Ending),
+        )
+
+    @property
+    def origin_ns(self) -> int:
+        """Time of the first tick: the zero of every time axis."""
+        return self.decisions[0].at_ns
+
+    @property
+    def samples(self) -> tuple[PositionSample, ...]:
+        """Positions that were accepted, as far as the recording tells.
+
+        A decision counts what it refused without naming it, so ticks that refused any are left out.
+        """
+        refusing = {decision.tick for decision in self.decisions if decision.rejected}
+        return tuple(sample for one in self.step_inputs if one.tick not in refusing for sample in one.samples)
+
+    @cached_property
+    def flown(self) -> tuple[Decision, ...]:
+        """Ticks up to the operator's stop: what comes after it is the hand-over, not the flight."""
+        stopped = self.stopped_ns
+        return tuple(d for d in self.decisions if stopped is None or d.at_ns < stopped)
+
+    @cached_property
+    def stopped_ns(self) -> int | None:
+        """When the operator asked for the hand-over [ns]; None if nobody did."""
+        return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+
+    @cached_property
+    def breach(self) -> Event | None:
+        """What the envelope found that cannot be, for which the vehicle was let go."""
+        return next((one for one in self.events if one.code in BREACHES), None)
+
+    @cached_property
+    def landing(self) -> Landing | None:
+        """The landing that somebody wanted, if one began before the operator's stop and no plan was flown after it."""
+        after_ns = max((d.at_ns for d in self.flown if d.mode is ControlMode.TRACK), default=-1)
+        ordered = [
+            Landing(one.at_ns, ordered=True)
+            for one in self.events
+            if one.code == ORDER_ACCEPTED and one.text == Order.LAND.value
+        ]
+        due = [Landing(one.at_ns, ordered=False) for one in self.flown if one.reason == MISSION_OVER]
+        until_ns = self.decisions[-1].at_ns + 1 if self.stopped_ns is None else self.stopped_ns
+        return min((one for one in ordered + due if after_ns < one.at_ns < until_ns), default=None)
+
+    @cached_property
+    def fallen(self) -> tuple[Decision, ...]:
+        """Flown ticks of the fallback; its braking and holding before a landing that was wanted is none."""
+        wanted = self.landing
+        before = (one for one in self.flown if wanted is None or one.at_ns < wanted.at_ns)
+        return tuple(one for one in before if one.mode in FALLBACK)
+
+    @property
+    def fallback_spans(self) -> list[tuple[float, float]]:
+        """Spans of time [s] in which the fallback flew."""
+        spans = self.spans(FALLBACK)
+        if self.landing is None:
+            return spans
+        until_s = self._second(self.landing.at_ns)
+        return [(begun_s, min(ended_s, until_s)) for begun_s, ended_s in spans if begun_s < until_s]
+
+    @property
+    def part(self) -> bool:
+        """Whether the first ticks are not in it, as in a later file of a recording."""
+        return bool(self.decisions[0].tick)
+
+    @property
+    def breaks_off(self) -> bool:
+        """Whether the recorder was not able to end it: killed, without power, or the file was cut."""
+        return bool(self.notes) and not self.notes[-1].text.startswith((END, GOES_ON))
+
+    @cached_property
+    def virtual_time(self) -> bool:
+        """Whether ticks were measured and none was late by a single nanosecond: no real clock does that."""
+        return bool(self.timings) and not any(timing.lateness_ns for timing in self.timings)
+
+    @cached_property
+    def tick_ns(self) -> int:
+        """Time between two ticks; 0 when there was only one."""
+        first, last = self.decisions[0], self.decisions[-1]
+        return (last.at_ns - first.at_ns) // max(1, last.tick - first.tick)
+
+    @cached_property
+    def duration_s(self) -> float:
+        """From the first tick to the end of the last one [s]."""
+        return (self.decisions[-1].at_ns - self.origin_ns + self.tick_ns) * 1e-9
+
+    @cached_property
+    def flown_plans(self) -> dict[int, Plan]:
+        """Plans that were flown, by their number."""
+        seqs = {decision.plan_seq for decision in self.decisions}
+        return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
+
+    @cached_property
+    def targets(self) -> tuple[Floats, Floats]:
+        """Where the mission wanted the vehicle to be: times (n,) [s] and states (n, n_x), one each boundary.
+
+        A recording without any says what its design was made for.
+        """
+        told = [(d.at_ns, d.target) for d in self.flown if d.boundary and d.target is not None]
+        told = told or [(self.origin_ns, self.design.target)]
+        return self.seconds([at_ns for at_ns, _ in told]), np.array([target for _, target in told])
+
+    @cached_property
+    def moving_target(self) -> bool:
+        """Whether a trajectory was to be followed: a target that moves from one boundary to the next, and on.
+
+        A place that was ordered is no waypoint either, and stays where it is.
+        """
+        targets = [None if d.waypoint is not None else d.target for d in self.flown if d.boundary]
+        runs = zip(*(targets[n:] for n in range(MOVES)), strict=False)
+        return any(None not in run and len(set(run)) == MOVES for run in runs)
+
+    @cached_property
+    def ordered_places(self) -> tuple[tuple[int, tuple[float, ...]], ...]:
+        """When the vehicle was sent to a place by an order, and where that is: (time [ns], target (n_x,))."""
+        if self.moving_target:
+            return ()
+        told = [(d.at_ns, d.target, d.waypoint) for d in self.flown if d.boundary and d.target is not None]
+        before = [(None, 0), *((target, waypoint) for _, target, waypoint in told)]
+        return tuple(
+            (at_ns, target)
+            for (at_ns, target, waypoint), (last, last_waypoint) in zip(told, before, strict=False)
+            if waypoint is None and (target != last or last_waypoint is not None)
+        )
+
+    @cached_property
+    def last_flown(self) -> Estimate | None:
+        """The estimate at the last flown boundary."""
+        at_ns = self.steps.decisions[-1].at_ns if len(self.steps) else None
+        return next((one for one in reversed(self.estimates) if one.at_ns == at_ns), None)
+
+    @cached_property
+    def steps(self) -> Steps:
+        """The flown Δt boundaries."""
+        return Steps.of(self)
+
+    def seconds(self, at_ns: Sequence[int]) -> Floats:
+        """Times on the report's axis (n,) [s]."""
+        return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
+
+    def spans(self, modes: Collection[ControlMode]) -> list[tuple[float, float]]:
+        """Spans of flown time [s], so none after the operator's stop, in which the mode was one of `modes`."""
+        spans: list[tuple[float, float]] = []
+        begun: int | None = None
+        for decision in self.flown:
+            if decision.mode in modes and begun is None:
+                begun = decision.at_ns
+            elif decision.mode not in modes and begun is not None:
+                spans.append((self._second(begun), self._second(decision.at_ns)))
+                begun = None
+        if begun is not None:
+            end_s = self.duration_s if self.stopped_ns is None else self._second(self.stopped_ns)
+            spans.append((self._second(begun), end_s))
+        return spans
+
+    def lost_at_s(self) -> Floats:
+        """When the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
+        times = [b.at_ns for a, b in pairwise(self.truths) for _ in range(b.lost - a.lost)]
+        return self.seconds(times)
+
+    def _second(self, at_ns: int) -> float:
+        return (at_ns - self.origin_ns) * 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """One row for each Δt boundary at which the controller flew (TRACK, BRAKE or HOLD)."""
+
+    decisions: tuple[Decision, ...]
+    t_s: Floats  # (n,)
+    state: Floats  # (n, n_x), the true one if known, else the estimate
+    input: Floats  # (n, n_u), applied during the step; NaN if unknown
+    target: Floats  # (n, n_x), where the mission wanted the vehicle to be
+    from_truth: bool
+
+    def __len__(self) -> int:
+        return len(self.decisions)
+
+    @classmethod
+    def of(cls, flight: FlightData) -> Self:
+        """Collect the flown boundaries of a flight."""
+        decisions = tuple(d for d in flight.flown if d.boundary and d.mode in FLOWN)
+        at_ns = np.array([d.at_ns for d in decisions], dtype=np.int64)
+        n_x, n_u = len(flight.design.target), len(flight.design.q_u)
+        known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
+        states = np.array([one.state if isinstance(one, Truth) else one.mean for one in known]).reshape(-1, n_x)
+        decided = np.array([d.input or (np.nan,) * n_u for d in decisions]).reshape(-1, n_u)
+        applied = _applied(flight, at_ns) if flight.truths else decided
+        near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
+        state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
+        target = np.array([d.target or flight.design.target for d in decisions]).reshape(-1, n_x)
+        return cls(decisions, flight.seconds(at_ns.tolist()), state, applied, target, bool(flight.truths))
+
+    @property
+    def decided(self) -> Floats:
+        """Inputs as decided (n, n_u), before the wire; NaN where there was none."""
+        width = self.input.shape[1]
+        return np.array([d.input or (np.nan,) * width for d in self.decisions]).reshape(-1, width)
+
+
+def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of the known time nearest to each wanted one (0 when nothing is known)."""
+    right = np.clip(np.searchsorted(known, wanted), 0, max(0, len(known) - 1))
+    left = np.maximum(right - 1, 0)
+    if not len(known):
+        return right
+    return np.where(np.abs(known[left] - wanted) < np.abs(known[right] - wanted), left, right)
+
+
+def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
+    """Input of the plant in each step (n, n_u).
+
+    The setpoint reaches the vehicle shortly after the boundary, so the last truth within the step
+    tells what was applied; the one at the boundary may still show the step before.
+    """
+    known = np.array([truth.at_ns for truth in flight.truths], dtype=np.int64)
+    inside = np.searchsorted(known, at_ns + flight.design.dt_ns) - 1
+    index = np.where(known[inside] > at_ns, inside, _nearest(known, at_ns))
+    return np.array([truth.input for truth in flight.truths])[index].reshape(len(at_ns), len(flight.design.q_u))

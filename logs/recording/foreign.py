@@ -1,0 +1,484 @@
+"""MCAP files of other programs: MAVLink out of whatever channels hold it.
+
+There is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a stream
+of
+frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped first.
+The
+file is read from its front to its end, so it needs neither chunks nor a summary.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+
+from logs.recording.segment import MAGIC
+from logs.recording.summary import count
+from logs.recording.tlog import MARKERS, SteadyClock, TlogPacket, frame_length, in_order, is_frame, packet_of
+from uavctl.errors import RecordingError, UsageError
+
+# Messages of ROS read by the definition that their recording brings along, as far as it takes to unwrap MAVLink.
+#
+# Layout of ROS 1: http://wiki.ros.org/msg#Fields, little-endian without gaps. ROS 2: CDR, each number aligned to its
+# size, after 4 bytes that tell the byte order (https://www.omg.org/spec/DDSI-RTPS/2.5, 10.2).
+
+
+ROS1, ROS2 = "ros1", "cdr"  # encodings of messages
+_DEFINITIONS = {ROS1: "ros1msg", ROS2: "ros2msg"}  # and of their schemas
+_NUMBERS = {
+    "bool": "B",
+    "byte": "B",
+    "char": "B",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
+_STAMPS = {"time": "I", "duration": "i", "builtin_interfaces/Time": "i", "builtin_interfaces/Duration": "i"}
+_FIELD = re.compile(
+    r"^(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?(?P<size>\d*)\])?\s+(?P<name>\w+)(?P<rest>.*)$"
+)
+_BORDER = re.compile(r"^=+\s*$", re.MULTILINE)
+_HEAD_BYTES = 4  # of CDR
+_ORDERS = {0: ">", 1: "<", 6: ">", 7: "<"}  # second byte of CDR: XCDR1 and XCDR2, plain
+_ALIGNED_MOST = {0: 8, 1: 8, 6: 4, 7: 4}
+_V1, _V2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_SIGNATURE_BYTES = 13
+_NEEDED = frozenset(("magic", "len", "seq", "sysid", "compid", "msgid", "checksum", "payload64"))
+
+Value = int | float | bytes | list["Value"] | dict[str, "Value"]
+
+
+class _RosField(NamedTuple):
+    type: str
+    name: str
+    size: int | None  # of an array; 0: as many as the message says; None: no array
+
+
+Definitions = dict[str, list[_RosField]]
+
+
+class UnreadableError(Exception):
+    """A message or a definition is not what it should be; says why."""
+
+
+def unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes) -> Callable[[bytes], bytes] | None:
+    """What makes a frame of each message of a channel, if they are MAVLink as ROS wraps it.
+
+    Such messages are known by their fields, those of mavros_msgs/Mavlink, wherever they stand in the definition.
+
+    Returns:
+        None if they are something else. The function raises `UnreadableError` for a message that is damaged.
+    """
+    if _DEFINITIONS.get(encoding) != schema_encoding:
+        return None
+    top = _plain(name)
+    try:
+        types = _parse(top, definition.decode("utf-8", errors="replace"))
+    except UnreadableError:
+        return None
+    if not _NEEDED.issubset(field.name for field in types[top]):
+        return None
+
+    def unwrap(data: bytes) -> bytes:
+        return _frame(_RosReader(data, types, encoding).record(top))
+
+    return unwrap
+
+
+def _plain(name: str) -> str:
+    """A type's name as ROS 1 has it: without `msg` between package and type."""
+    return name.replace("/msg/", "/")
+
+
+def _parse(top: str, text: str) -> Definitions:
+    """Fields of all types of a definition; constants and comments are nothing to a message."""
+    types: Definitions = {}
+    for number, part in enumerate(_BORDER.split(text)):
+        lines = [line.partition("#")[0].strip() for line in part.splitlines()]
+        lines = [line for line in lines if line]
+        owner = top
+        if number:
+            if not lines or not lines[0].startswith("MSG:"):
+                raise UnreadableError("a definition without its name")
+            owner = _plain(lines.pop(0).removeprefix("MSG:").strip())
+        types[owner] = [field for line in lines if (field := _field(line, owner)) is not None]
+    return types
+
+
+def _field(line: str, owner: str) -> _RosField | None:
+    """A field of a definition; None for a constant."""
+    found = _FIELD.match(line)
+    if found is None:
+        raise UnreadableError(f"cannot make sense of {line!r}")
+    if found["rest"].lstrip().startswith("="):
+        return None
+    kind = _plain(found["type"])
+    if kind == "Header":
+        kind = "std_msgs/Header"
+    elif "/" not in kind and kind not in _NUMBERS and kind not in _STAMPS and kind not in ("string", "wstring"):
+        kind = f"{owner.rpartition('/')[0]}/{kind}"
+    size = int(found["size"]) if found["array"] and found["size"] and "<=" not in found["array"] else 0
+    return _RosField(kind, found["name"], size if found["array"] else None)
+
+
+class _RosReader:
+    """Reads one message."""
+
+    def __init__(self, data: bytes, types: Mapping[str, list[_RosField]], encoding: str) -> None:
+        self._types, self._cdr = types, encoding == ROS2
+        self._order, self._aligned_most = "<", 1
+        self._at, self._data = 0, data
+        if self._cdr:
+            if len(data) < _HEAD_BYTES or data[0] or data[1] not in _ORDERS:
+                raise UnreadableError("its first bytes are not those of CDR")
+            self._order, self._aligned_most = _ORDERS[data[1]], _ALIGNED_MOST[data[1]]
+            self._data = data[_HEAD_BYTES:]
+
+    def record(self, kind: str) -> dict[str, Value]:
+        """All fields of a type."""
+        if kind not in self._types:
+            raise UnreadableError(f"its definition says nothing of {kind}")
+        return {field.name: self._field(field) for field in self._types[kind]}
+
+    def _field(self, field: _RosField) -> Value:
+        if field.size is None:
+            return self._one(field.type)
+        length = field.size or self._number("I")
+        letter = _NUMBERS.get(field.type)
+        if letter is None:
+            if length > len(self._data):
+                raise UnreadableError("it is too short")
+            return [self._one(field.type) for _ in range(length)]
+        return list(self._numbers(letter, length))
+
+    def _one(self, kind: str) -> Value:
+        if kind in _NUMBERS:
+            return self._number(_NUMBERS[kind])
+        if kind in _STAMPS:
+            return [self._number(_STAMPS[kind]), self._number("I")]
+        if kind == "string":
+            return self._take(self._number("I"))
+        return self.record(kind)
+
+    def _number(self, letter: str) -> int:
+        (value,) = self._numbers(letter, 1)
+        return value
+
+    def _numbers(self, letter: str, length: int) -> tuple[int, ...]:
+        size = struct.calcsize(f"<{letter}")
+        if length:
+            self._at += -self._at % min(size, self._aligned_most)
+        return struct.unpack(f"{self._order}{length}{letter}", self._take(size * length))
+
+    def _take(self, length: int) -> bytes:
+        data = self._data[self._at : self._at + length]
+        if len(data) < length:
+            raise UnreadableError("it is too short")
+        self._at += length
+        return data
+
+
+def _frame(fields: Mapping[str, Value]) -> bytes:
+    """The frame that was wrapped: https://mavlink.io/en/guide/serialization.html."""
+    magic, length, message_id = _whole(fields, "magic"), _whole(fields, "len"), _whole(fields, "msgid")
+    sender = (_whole(fields, "seq"), _whole(fields, "sysid"), _whole(fields, "compid"))
+    signature = b""
+    try:
+        # The words are the payload's bytes as a little-endian computer sees them, filled up with zeros.
+        payload = struct.pack(f"<{len(_list(fields, 'payload64'))}Q", *_list(fields, "payload64"))[:length]
+        if magic == _V2:
+            flags = (_whole(fields, "incompat_flags"), _whole(fields, "compat_flags"))
+            head = struct.pack("<7B", magic, length, *flags, *sender) + struct.pack("<I", message_id)[:3]
+            if flags[0] & _SIGNED:
+                signature = struct.pack(f"{_SIGNATURE_BYTES}B", *_list(fields, "signature"))
+        elif magic == _V1:
+            head = struct.pack("<6B", magic, length, *sender, message_id)
+        else:
+            raise UnreadableError(f"it begins with {magic}, which no frame does")
+        checksum = struct.pack("<H", _whole(fields, "checksum"))
+    except struct.error as error:
+        raise UnreadableError(f"a field has no place in a frame ({error})") from error
+    if len(payload) < length:
+        raise UnreadableError("it has less payload than it says")
+    return head + payload + checksum + signature
+
+
+def _whole(fields: Mapping[str, Value], name: str) -> int:
+    value = fields.get(name)
+    if not isinstance(value, int):
+        raise UnreadableError(f"it has no number {name}")
+    return value
+
+
+def _list(fields: Mapping[str, Value], name: str) -> list[Value]:
+    value = fields.get(name)
+    if not isinstance(value, list):
+        raise UnreadableError(f"it has no list {name}")
+    return value
+
+
+# Frames out of a stream of bytes that somebody recorded piece by piece, cut anywhere.
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What a stream holds."""
+
+    # Its frames in the order of the stream, each at the time of the piece that its last byte came in
+    packets: tuple[TlogPacket, ...]
+    right: int  # those of a known id with the right checksum
+    left_out_bytes: int  # bytes that are no frame: garbage, and frames that were cut
+
+
+def cut(pieces: list[tuple[int, bytes]]) -> Cut:
+    """Cut a stream into frames.
+
+    Frames with a wrong checksum or of an unknown id are kept where they stand between others: the parser counts them.
+
+    Args:
+        pieces: (time [ns], bytes) in the order of the stream.
+    """
+    data = b"".join(piece for _, piece in pieces)
+    ends, at = [], 0
+    for _, piece in pieces:
+        at += len(piece)
+        ends.append(at)
+    packets: list[TlogPacket] = []
+    at = right = left_out = 0
+    in_step = True  # what is before `at` was a frame
+    while at < len(data):
+        end = at + frame_length(data, at)
+        whole = at < end <= len(data)
+        checked = whole and is_frame(data[at:end])
+        in_step = checked or (whole and in_step and (end == len(data) or data[end] in MARKERS))
+        if not in_step:
+            end = _next_marker(data, at + 1)
+            left_out += end - at
+        else:
+            right += checked
+            packets.append(packet_of(pieces[bisect_right(ends, end - 1)][0], data[at:end]))
+        at = end
+    return Cut(tuple(packets), right, left_out)
+
+
+def _next_marker(data: bytes, start: int) -> int:
+    """Index of the next byte that could begin a frame, or the end."""
+    found = [index for marker in MARKERS if (index := data.find(marker, start)) >= 0]
+    return min(found, default=len(data))
+
+
+_OURS = "/uavctl/"
+_TOLD = 12  # channels that an error names
+_PROBED_BYTES = 65_536  # without a frame in so many a channel holds something else
+# What the library raises on bytes that are no MCAP: its own, and those of the formats within.
+_DAMAGE = (McapError, ValueError, OverflowError, RuntimeError, struct.error, zstandard.ZstdError)
+
+
+@dataclass(frozen=True)
+class ForeignMcap:
+    """MAVLink of an MCAP."""
+
+    packets: tuple[TlogPacket, ...]  # in order of arrival, which is the log time; one frame each
+    topics: tuple[str, ...]  # those that hold them
+    torn: bool  # the file ends in the middle of a record; what was before is here
+    notes: tuple[str, ...] = ()  # what was left out, and what was odd about the times, in sentences
+
+
+class _ChannelStream:
+    """One channel as a stream of bytes.
+
+    Args:
+        schema: Of its messages, if they have one.
+        wanted: It was asked for, so it is read however little MAVLink is in it.
+    """
+
+    def __init__(self, channel: Channel, schema: Schema | None, *, wanted: bool) -> None:
+        self.topic, self.encoding = channel.topic, channel.message_encoding
+        self.kind = "" if schema is None else schema.name
+        self.messages = 0
+        self._unwrap: Callable[[bytes], bytes] | None = None
+        if schema is not None:
+            self._unwrap = unwrapper(self.encoding, schema.encoding, schema.name, schema.data)
+        self._wanted = wanted
+        self._pieces: list[tuple[int, bytes]] = []
+        self._probe: bytearray | None = None if wanted or self._unwrap else bytearray()
+        self._given_up = False
+        self._unreadable, self._why = 0, ""
+
+    def take(self, at_ns: int, data: bytes) -> None:
+        """Take a message of log time `at_ns`."""
+        self.messages += 1
+        if self._given_up:
+            return
+        if self._unwrap is not None:
+            try:
+                data = self._unwrap(data)
+            except UnreadableError as error:
+                self._unreadable, self._why = self._unreadable + 1, str(error)
+                return
+        self._pieces.append((at_ns, data))
+        if self._probe is not None:
+            self._look(data)
+
+    def packets(self) -> tuple[tuple[TlogPacket, ...], tuple[str, ...]]:
+        """Its packets, none if it is no MAVLink, and what there is to say.
+
+        Raises:
+            RecordingError: Its log times are all zero.
+        """
+        clock = SteadyClock()
+        pieces = [(clock.steady(at_ns), data) for at_ns, data in self._pieces]
+        # A recorder of several threads writes not in order; a clock that was set back has been put right.
+        found = cut(sorted(pieces, key=lambda piece: piece[0]))
+        notes = []
+        if self._unreadable:
+            notes.append(f"{self.topic}: {count(self._unreadable, 'message')} left out: {self._why}")
+        mostly = 2 * found.left_out_bytes < sum(len(data) for _, data in pieces)
+        if found.right and not (mostly or self._wanted):
+            notes.append(f"{self.topic}: not taken, most of it is no MAVLink; `--topic {self.topic}` takes it")
+        if not found.right or not (mostly or self._wanted):
+            return (), tuple(notes)
+        clock.check(self.topic)
+        if found.left_out_bytes:
+            notes.append(f"{self.topic}: {count(found.left_out_bytes, 'byte')} left out that are no whole frame")
+        return found.packets, (*notes, *clock.notes(self.topic))
+
+    def listed(self) -> str:
+        """What it holds, for an error."""
+        kind = f", {self.kind}" if self.kind else ""
+        return f"{self.topic} ({self.encoding or 'no encoding'}{kind}, {self.messages})"
+
+    def _look(self, data: bytes) -> None:
+        """Look for a first frame, and keep nothing of a channel that has none for long."""
+        assert self._probe is not None
+        self._probe += data[: _PROBED_BYTES - len(self._probe)]
+        if len(self._probe) < _PROBED_BYTES:
+            return
+        self._given_up = not cut([(0, bytes(self._probe))]).right
+        self._probe = None
+        if self._given_up:
+            self._pieces.clear()
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is an MCAP with messages and none of ours among its topics.
+
+    What cannot be read up to its first topic is left to the reader of our recordings, which says what is wrong.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    found = False
+    try:
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                return False
+            file.seek(0)
+            for record in _records(file, path.stat().st_size):
+                if isinstance(record, Channel):
+                    found = True
+                    if record.topic.startswith(_OURS):
+                        return False
+    except (FileNotFoundError, IsADirectoryError):
+        return False  # a recording of ours may have later segments only; of a folder its reader knows what to do
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    except _DAMAGE:
+        return found
+    return found
+
+
+def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
+    """All MAVLink packets of an MCAP: raw frames, cut into messages anywhere, or wrapped by ROS one by one.
+
+    Args:
+        path: The file; chunks may be stored, or packed with lz4 or zstd.
+        topics: The topics to take; those that hold MAVLink if none is named.
+
+    Raises:
+        RecordingError: Damaged, nothing in it is MAVLink (the message lists what is), or it has no times.
+        UsageError: There is no such topic.
+    """
+    streams: dict[int, _ChannelStream] = {}
+    try:
+        with path.open("rb") as file:
+            torn = _collect(file, path.stat().st_size, topics, streams)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    except _DAMAGE as error:
+        raise RecordingError(f"{path}: damaged, or no MCAP ({error}); mcap's own tool may recover it") from error
+    _check_names(path, topics, streams)
+    packets: list[TlogPacket] = []
+    taken: list[str] = []
+    notes: list[str] = []
+    for stream in streams.values():
+        if topics and stream.topic not in topics:
+            continue
+        found, told = stream.packets()
+        packets += found
+        taken += [stream.topic] if found else []
+        notes += told
+    if not taken:
+        listed = _names(sorted(stream.listed() for stream in streams.values()))
+        raise RecordingError("; ".join([f"{path}: no raw MAVLink in it", listed, *notes]))
+    return ForeignMcap(in_order(packets), tuple(dict.fromkeys(taken)), torn, tuple(notes))
+
+
+def _collect(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
+    """Take the messages of these topics, or of all if there are none; whether the file is torn."""
+    schemas: dict[int, Schema] = {}
+    try:
+        for record in _records(file, size):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and record.id not in streams:
+                streams[record.id] = _ChannelStream(
+                    record, schemas.get(record.schema_id), wanted=record.topic in topics
+                )
+            elif isinstance(record, Message) and record.channel_id in streams:
+                stream = streams[record.channel_id]
+                if not topics or stream.topic in topics:
+                    stream.take(record.log_time or record.publish_time, record.data)
+    except (EndOfFile, struct.error):
+        if file.read(1):
+            raise
+        return True
+    return False
+
+
+def _records(file: BinaryIO, size: int) -> Iterator[object]:
+    """Channels and messages of a file in file order, each chunk by its checksum if it has one."""
+    # A damaged length must not ask for more memory than the file has bytes.
+    yield from StreamReader(file, validate_crcs=True, record_size_limit=size).records
+
+
+def _check_names(path: Path, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> None:
+    there = {stream.topic for stream in streams.values()}
+    for topic in topics:
+        if topic not in there:
+            raise UsageError(f"--topic {topic}: {path} has none of this name; {_names(sorted(there))}")
+
+
+def _names(names: list[str]) -> str:
+    if not names:
+        return "it has no topic at all"
+    more = f", and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    return f"it has: {', '.join(names[:_TOLD])}{more}"

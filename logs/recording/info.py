@@ -1,0 +1,295 @@
+"""What is in a recording: duration, topics, gaps, losses, and how it was made."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+
+import msgspec
+
+from logs.recording.reader import Damage, EndOfFile, RecordedMessage, segment_files, walk
+from logs.recording.topics import END, HEADER, LIBRARY, RECORDER, RecorderNote, decode
+from uavctl.errors import RecordingError
+from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
+
+_OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
+_LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
+_NEWEST_TELLS = ("/uavctl/link_estimate", "/sim/truth")
+_PLAIN_NOTES = ("begin", END)
+
+
+class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """One topic's messages."""
+
+    topic: str
+    encoding: str
+    messages: int
+    bytes: int
+    rate_hz: float  # mean, from first to last message; 0 with one message
+    longest_gap_s: float  # without a message, also before its first and after its last
+    longest_gap_at_s: float  # its start, since the recording's first message
+
+
+class RecordingOrigin(msgspec.Struct, frozen=True, kw_only=True):
+    """How the recording was made, from its header."""
+
+    config: str
+    seed: int
+    command: str
+    started_utc: str
+    design_id: str
+    library_id: str | None  # None if no policy library was flown with
+    versions: dict[str, str]
+    cpu: str
+
+
+class LibraryInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """The policy library that the recording carries."""
+
+    library_id: str
+    bytes: int
+
+
+class SegmentInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """One file of the recording."""
+
+    file: str
+    bytes: int
+    messages: int
+    finished: bool  # it has its index and footer
+
+
+class NoteInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """What the recorder had to say: why a file was begun, that the disk got low, that records were lost."""
+
+    at_s: float  # since the recording's first message
+    text: str
+
+
+class ConnectionInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """What came over one connection, by its last counters."""
+
+    link: str
+    datagrams: int
+    messages: int
+    samples: int  # positions
+    bad: dict[str, int]  # what could not be used, by reason
+    refused: dict[str, int]  # what was dropped unread, by reason
+
+
+class PositionLoss(msgspec.Struct, frozen=True, kw_only=True):
+    """Steps without news on the link that carries the positions."""
+
+    believed: float | None  # at the end: mean of its posterior; None if there was no estimate
+    below_promise: bool  # at the end: worse than the design counts on
+    bursts: bool  # at the end: losses do not come one by one
+    simulated_sent: int | None  # positions that the simulator sent; None for a real flight
+    simulated_lost: int | None  # of which its channel lost
+
+
+class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """Summary of a recording."""
+
+    files: tuple[str, ...]
+    bytes: int
+    finished: bool  # every file has its index and footer
+    damage: tuple[str, ...]  # damaged or torn places, in words
+    messages: int
+    missing: int  # by the messages' running numbers
+    start_ns: int
+    end_ns: int
+    duration_s: float
+    dropped: int  # records that the recorder had to drop
+    refused: int  # records that it could not encode
+    failures: int  # failed writes
+    segments: tuple[SegmentInfo, ...]
+    notes: tuple[NoteInfo, ...]  # without those of every recording, of begin and end
+    connections: tuple[ConnectionInfo, ...]
+    position_loss: PositionLoss
+    topics: tuple[TopicInfo, ...]
+    origin: RecordingOrigin | None  # None without a readable header
+    library: LibraryInfo | None  # None without a readable policy library
+
+
+class _Course:
+    """One topic's times as they go by."""
+
+    def __init__(self, message: RecordedMessage) -> None:
+        self.encoding = message.definition.encoding
+        self.messages = self.bytes = self.gap_ns = 0
+        self.first_ns = self.last_ns = self.gap_at_ns = message.at_ns
+
+    def add(self, message: RecordedMessage) -> None:
+        if message.at_ns - self.last_ns > self.gap_ns:
+            self.gap_ns, self.gap_at_ns = message.at_ns - self.last_ns, self.last_ns
+        self.last_ns = message.at_ns
+        self.messages += 1
+        self.bytes += len(message.data)
+
+    def info(self, topic: str, start_ns: int, end_ns: int) -> TopicInfo:
+        span_s = (self.last_ns - self.first_ns) * 1e-9
+        gaps = [(self.gap_ns, self.gap_at_ns)]
+        if topic not in _OWN:  # what begins late, or falls silent before the end, was missing there
+            gaps += [(self.first_ns - start_ns, start_ns), (end_ns - self.last_ns, self.last_ns)]
+        gap_ns, gap_at_ns = max(gaps, key=itemgetter(0))
+        return TopicInfo(
+            topic=topic,
+            encoding=self.encoding,
+            messages=self.messages,
+            bytes=self.bytes,
+            rate_hz=round((self.messages - 1) / span_s, 6) if span_s > 0 else 0.0,
+            longest_gap_s=gap_ns * 1e-9,
+            longest_gap_at_s=(gap_at_ns - start_ns) * 1e-9,
+        )
+
+
+@dataclass
+class _Segment:
+    path: Path
+    messages: int = 0
+    finished: bool = False
+
+
+class _Account:
+    """What the records of the recording itself and of its links say, as they go by."""
+
+    def __init__(self) -> None:
+        self.note: RecorderNote | None = None
+        self.notes: list[tuple[int, str]] = []
+        self.origin: RecordingOrigin | None = None
+        self.library: LibraryInfo | None = None
+        self._stats: dict[str, LinkStats] = {}
+        self._refused: dict[str, Counter[str]] = {}
+        self._estimate: LinkEstimate | None = None
+        self._truth: Truth | None = None
+
+    def add(self, record: Record) -> None:
+        match record:
+            case RecorderNote():
+                self.note = record
+                if record.text not in _PLAIN_NOTES:
+                    self.notes.append((record.at_ns, record.text))
+            case Header():
+                self.origin = _origin(record)
+            case PolicyLibrary():
+                self.library = LibraryInfo(library_id=record.library_id, bytes=len(record.data))
+            case LinkStats():
+                self._stats[record.link] = record
+            case Refused():
+                self._refused.setdefault(record.link, Counter()).update(record.counts)
+            case LinkEstimate():
+                self._estimate = record
+            case Truth():
+                self._truth = record
+
+    def connections(self) -> tuple[ConnectionInfo, ...]:
+        return tuple(
+            ConnectionInfo(
+                link=link,
+                datagrams=0 if stats is None else stats.datagrams,
+                messages=0 if stats is None else stats.messages,
+                samples=0 if stats is None else stats.samples,
+                bad={} if stats is None else stats.bad,
+                refused=dict(self._refused.get(link, {})),
+            )
+            for link in sorted({*self._stats, *self._refused})
+            for stats in [self._stats.get(link)]
+        )
+
+    def position_loss(self) -> PositionLoss:
+        estimate, truth = self._estimate, self._truth
+        return PositionLoss(
+            believed=None if estimate is None else 1.0 - estimate.arrival_mean,
+            below_promise=estimate is not None and estimate.below_promise,
+            bursts=estimate is not None and estimate.bursts,
+            simulated_sent=None if truth is None else truth.sent,
+            simulated_lost=None if truth is None else truth.lost,
+        )
+
+
+def info(path: Path) -> RecordingInfo:
+    """Summary of a recording, finished, torn or damaged.
+
+    Raises:
+        RecordingError: there is no such recording, it holds nothing, or a file of it is none.
+    """
+    courses: dict[str, _Course] = {}
+    damage: list[str] = []
+    missing = 0
+    following: int | None = None
+    account = _Account()
+    newest: dict[str, RecordedMessage] = {}
+    segments = [_Segment(file) for file in segment_files(path)]
+    ended = 0
+    for item in walk(path):
+        if isinstance(item, Damage):
+            damage.append(str(item))
+            continue
+        if isinstance(item, EndOfFile):
+            segments[ended].finished = item.finished
+            ended += 1
+            continue
+        missing += max(0, item.sequence - (following or 1))
+        following = item.sequence + 1
+        segments[ended].messages += 1
+        topic = item.definition.topic
+        if item.repeated:
+            continue
+        courses.setdefault(topic, _Course(item)).add(item)
+        if topic in _LOOKED_INTO:
+            account.add(decode(topic, item.data, item.at_ns))
+        elif topic in _NEWEST_TELLS:
+            newest[topic] = item
+    for topic, item in newest.items():
+        account.add(decode(topic, item.data, item.at_ns))
+    if not courses and not damage:
+        raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
+    flown = [one for topic, one in courses.items() if topic not in _OWN] or list(courses.values())
+    start_ns = min((one.first_ns for one in flown), default=0)
+    end_ns = max((one.last_ns for one in flown), default=0)
+    note = account.note
+    files = tuple(
+        SegmentInfo(file=str(one.path), bytes=one.path.stat().st_size, messages=one.messages, finished=one.finished)
+        for one in segments
+    )
+    return RecordingInfo(
+        files=tuple(one.file for one in files),
+        bytes=sum(one.bytes for one in files),
+        finished=all(one.finished for one in files),
+        damage=tuple(damage),
+        messages=sum(one.messages for one in courses.values()),
+        missing=missing,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        duration_s=(end_ns - start_ns) / 1e9,
+        dropped=0 if note is None else note.dropped,
+        refused=0 if note is None else note.refused,
+        failures=0 if note is None else note.failures,
+        segments=files,
+        notes=tuple(NoteInfo(at_s=(at_ns - start_ns) * 1e-9, text=text) for at_ns, text in account.notes),
+        connections=account.connections(),
+        position_loss=account.position_loss(),
+        topics=tuple(courses[topic].info(topic, start_ns, end_ns) for topic in sorted(courses)),
+        origin=account.origin,
+        library=account.library,
+    )
+
+
+def _origin(header: Header) -> RecordingOrigin:
+    try:
+        name = str(tomllib.loads(header.config_toml).get("name", ""))
+    except tomllib.TOMLDecodeError:
+        name = ""
+    return RecordingOrigin(
+        config=name,
+        seed=header.seed,
+        command=header.command,
+        started_utc=header.started_utc,
+        design_id=header.design_id,
+        library_id=header.library_id,
+        versions=header.versions,
+        cpu=header.cpu,
+    )

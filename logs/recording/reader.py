@@ -1,0 +1,545 @@
+"""What a recording's file still holds: whole chunks, and where it is damaged.
+
+Nothing of a chunk is used before its checksum was right. After damage the search goes on byte by
+byte for the next whole chunk, since a flipped length would lead astray.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from logs.recording.disk import later_segments
+from logs.recording.segment import MAGIC
+from logs.recording.topics import (
+    END,
+    GOES_ON,
+    HEADER,
+    LIBRARY,
+    NO_END,
+    RECORDER,
+    RECOVERED,
+    Definition,
+    RecorderNote,
+    decode,
+    definition,
+    record_type,
+)
+from uavctl.errors import RecordingError
+from uavctl.records import Header, Record
+
+# Messages of a chunk, and whether they follow each other without a gap.
+
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_IS_MESSAGE = int(Opcode.MESSAGE)  # a plain number: compared for every record
+
+
+class RecordedMessage(NamedTuple):
+    """A message whose chunk has the right checksum."""
+
+    definition: Definition
+    sequence: int
+    at_ns: int
+    data: bytes
+    offset: int  # of its chunk in the file
+    repeated: bool = False  # header or library, once more, at the start of a later segment
+
+
+@dataclass
+class ReadingOrder:
+    """Where a reader is that wants all of a recording or none; goes from file to file with it."""
+
+    path: Path  # the recording, for the error
+    following: int | None = None  # number that the next message has; None before the first
+
+    def broken(self, sequence: int) -> RecordingError:
+        """The error of a message that does not follow."""
+        return RecordingError(
+            f"{self.path}: message {sequence} where {self.following} should be (is a segment file gone?); "
+            f"`uavctl log recover {self.path} OUT` restores the rest"
+        )
+
+
+class Contents:
+    """Messages of chunks; remembers the schemas that it has seen."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, Schema] = {}
+        self._known: dict[bytes, tuple[int, Definition]] = {}
+
+    def messages(self, content: bytes, offset: int, order: ReadingOrder | None = None) -> Iterator[RecordedMessage]:
+        """Messages of one chunk, whose checksum is right.
+
+        Args:
+            order: where the reader is, moved on; then without those for viewers, which are half of a recording.
+
+        Raises:
+            RecordingError: a message is missing that the order wants.
+        """
+        channels: dict[int, Definition] = {}
+        at = 0
+        size = len(content)
+        while at < size:
+            if content[at] != _IS_MESSAGE:
+                at = self._define(content, at, channels)
+                continue
+            _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
+            begin, at = at + _MESSAGE.size, at + _RECORD.size + length
+            definition = channels[channel]
+            if order is not None:
+                if sequence != order.following and order.following is not None:
+                    raise order.broken(sequence)
+                order.following = sequence + 1
+                if definition.for_viewers:
+                    continue
+            yield RecordedMessage(definition, sequence, at_ns, content[begin:at], offset)
+
+    def _define(self, content: bytes, at: int, channels: dict[int, Definition]) -> int:
+        """Take a channel or schema; the place after it."""
+        opcode, length = _RECORD.unpack_from(content, at)
+        at += _RECORD.size
+        if opcode == Opcode.CHANNEL:
+            channel, channels[channel] = self._channel(content[at : at + length])
+        elif opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
+            self._schemas[schema.id] = schema
+        return int(at + length)
+
+    def _channel(self, record: bytes) -> tuple[int, Definition]:
+        if record not in self._known:
+            channel = Channel.read(ReadDataStream(BytesIO(record)))
+            schema = self._schemas.get(channel.schema_id)
+            self._known[record] = (channel.id, _definition(channel, schema))
+        return self._known[record]
+
+
+def _definition(channel: Channel, schema: Schema | None) -> Definition:
+    if schema is not None:
+        return Definition(channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
+    try:
+        return definition(channel.topic)  # the chunk with its schema is damaged
+    except KeyError:
+        return Definition(channel.topic, channel.message_encoding)
+
+
+__all__ = ["Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
+
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
+_CHUNK_FIELDS = _CHUNK.size - _RECORD.size
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
+_DATA_END = struct.Struct("<BQI")
+_CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
+_IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes of a file that cannot be trusted."""
+
+    path: Path
+    offset: int
+    length: int
+    reason: str
+    torn: bool = False  # the file just ends too early
+
+    def __str__(self) -> str:
+        return f"{self.path}, offset {self.offset}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class EndOfFile:
+    """The file is read."""
+
+    finished: bool  # it has its index and footer
+    complete: bool  # the end of the data was there: no chunk is missing after the last one
+
+
+class _BadRecordError(Exception):
+    """What stands here is not the record that it should be."""
+
+
+class _TornRecordError(_BadRecordError):
+    """The record goes on beyond the end of the file."""
+
+
+Buffer = bytes | mmap.mmap
+
+
+def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
+    """Messages and damage of one file in file order, and then its `End`.
+
+    Args:
+        order: where the reader is, moved on; what was made for viewers is then looked at for its number only.
+
+    Raises:
+        RecordingError: the file cannot be read, is no recording at all, or lacks a message that the order wants.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:  # ended between creating and first writing
+                yield EndOfFile(finished=False, complete=False)
+                return
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                yield from _scan(path, data, order)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def last_chunk(path: Path) -> list[RecordedMessage] | None:
+    """Messages of a file's last chunk as its index tells; the others are not looked at.
+
+    Returns:
+        None if the file does not end with an index and footer that are whole; nothing if the chunk is not.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                return None
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                end = _data_end(data)
+                return None if end is None else _last_chunk(data, end + _DATA_END.size)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def _last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
+    """The same, by the summary at `at`, whose checksum is right."""
+    offset = length = 0
+    while data[at] != Opcode.FOOTER:
+        if data[at] == Opcode.CHUNK_INDEX:
+            *_, offset, length = _CHUNK_INDEX.unpack_from(data, at)
+        at += _RECORD.size + _RECORD.unpack_from(data, at)[1]
+    try:
+        return list(Contents().messages(_chunk(data, offset, length), offset)) if length else []
+    except _BadRecordError:
+        return []
+
+
+def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
+    size = len(data)
+    at = len(MAGIC)
+    damaged = False
+    if data[:at] != MAGIC:
+        if MAGIC.startswith(data[:at]):
+            yield Damage(path, 0, size, "torn in the first bytes", torn=True)
+            yield EndOfFile(finished=False, complete=False)
+            return
+        first = _next_chunk(data, 0)
+        if first is None:
+            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){_hint(path)}")
+        yield Damage(path, 0, first, "damaged before the first whole chunk")
+        at, damaged = first, True
+    contents = Contents()
+    while at < size:
+        opcode = data[at]
+        try:
+            length = _whole(data, at)
+            if opcode == Opcode.CHUNK:
+                yield from contents.messages(_chunk(data, at, length), at, order)
+            if opcode == Opcode.DATA_END:
+                stored = _DATA_END.unpack_from(data, at)[2]
+                if not damaged and stored != _crc(data, at):
+                    yield Damage(path, at, 0, "every chunk is whole, but something between them is damaged")
+                finished = _summary_ok(data, at + length)
+                if not finished:
+                    yield Damage(path, at + length, 0, "no record is lost, but the index is damaged", _is_torn(data))
+                yield EndOfFile(finished=finished, complete=True)
+                return
+            at += length
+        except _BadRecordError as error:
+            later = _next_chunk(data, at + 1)
+            if later is None:
+                later = _data_end(data)
+            if later == at:
+                yield Damage(path, at, 0, "no record is lost, but the end of the data is damaged")
+                yield EndOfFile(finished=False, complete=True)
+                return
+            torn = later is None and isinstance(error, _TornRecordError)
+            later = size if later is None else later
+            yield Damage(path, at, later - at, f"chunk or index {error}", torn=torn)
+            at, damaged = later, True
+    yield EndOfFile(finished=False, complete=False)
+
+
+def _hint(path: Path) -> str:
+    return "; `uavctl log replay` and `uavctl identify` read a .tlog" if path.suffix == ".tlog" else ""
+
+
+def _whole(data: Buffer, at: int) -> int:
+    """Length of the record at `at`, its head included, if it may stand between chunks and is not torn."""
+    if at + _RECORD.size > len(data):
+        raise _TornRecordError("is torn")
+    opcode, length = _RECORD.unpack_from(data, at)
+    if at + _RECORD.size + length > len(data):
+        raise _TornRecordError("is torn")
+    inner = at + _RECORD.size
+    if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
+        good = length >= 6 and _INDEX.unpack_from(data, at)[3] == length - 6
+    elif opcode == Opcode.CHUNK:
+        good = length >= _CHUNK_FIELDS
+    elif opcode == Opcode.DATA_END:
+        good = length == _DATA_END.size - _RECORD.size
+    elif opcode == Opcode.HEADER:
+        good = at == len(MAGIC) and _header_length(data, inner, length) == length
+    else:
+        good = False
+    if not good:
+        raise _BadRecordError("is damaged")
+    return int(_RECORD.size + length)
+
+
+def _header_length(data: Buffer, inner: int, length: int) -> int:
+    """Length of a header record as its two strings tell; -1 if they do not fit."""
+    if length < 8:
+        return -1
+    (profile,) = struct.unpack_from("<I", data, inner)
+    if profile > length - 8:
+        return -1
+    return int(8 + profile + struct.unpack_from("<I", data, inner + 4 + profile)[0])
+
+
+def _chunk(data: Buffer, at: int, length: int) -> bytes:
+    """Content of the chunk at `at`, if its checksum is right."""
+    _, _, first, last, size, crc, name, inner = _CHUNK.unpack_from(data, at)
+    if name != 0 or inner != length - _CHUNK.size or size != inner or first > last:
+        raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
+    content = data[at + _CHUNK.size : at + length]
+    if zlib.crc32(content) != crc:
+        raise _BadRecordError("has a wrong checksum")
+    return content
+
+
+def _next_chunk(data: Buffer, start: int) -> int | None:
+    """Offset of the next whole chunk from `start` on."""
+    at = data.find(bytes([Opcode.CHUNK]), start)
+    while 0 <= at <= len(data) - _CHUNK.size:
+        try:
+            _chunk(data, at, _whole(data, at))
+        except _BadRecordError:
+            at = data.find(bytes([Opcode.CHUNK]), at + 1)
+        else:
+            return at
+    return None
+
+
+def _data_end(data: Buffer) -> int | None:
+    """Offset of the end of data as the footer tells, if the footer and what it points to are whole."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < 0:
+        return None
+    opcode, _, start, _, _ = _FOOTER.unpack_from(data, at)
+    end = start - _DATA_END.size
+    if opcode != Opcode.FOOTER or not len(MAGIC) <= end < at or data[end] != Opcode.DATA_END:
+        return None
+    return int(end) if _summary_ok(data, start) else None
+
+
+def _crc(data: Buffer, end: int) -> int:
+    """CRC-32 of everything before `end`."""
+    with memoryview(data) as view:
+        return zlib.crc32(view[:end])
+
+
+def _summary_ok(data: Buffer, start: int) -> bool:
+    """Whether all from `start` to the end is a summary with the right checksum, footer and magic."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < start or data[at + _FOOTER.size :] != MAGIC:
+        return False
+    opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
+    covered = data[start : at + _FOOTER.size - 4]
+    return bool(opcode == Opcode.FOOTER and length == 20 and summary_start == start and crc == zlib.crc32(covered))
+
+
+def _is_torn(data: Buffer) -> bool:
+    """Whether a file without a good summary just ends too early: neither footer nor magic is where it should be."""
+    at = len(data) - len(MAGIC) - _FOOTER.size
+    return data[at + _FOOTER.size :] != MAGIC and _RECORD.unpack_from(data, at) != (Opcode.FOOTER, 20)
+
+
+# Reader of recordings: all segments as one, in file order, nothing without its checksum.
+#
+# A file that was not finished is read to its last whole chunk; a damaged one is refused.
+
+
+R = TypeVar("R", bound=Record)
+
+
+def segment_files(path: Path) -> tuple[Path, ...]:
+    """Files of a recording in order: the named one, and those that go on after a failed write.
+
+    Raises:
+        RecordingError: there is none, or the path is that of a folder.
+    """
+    if path.is_dir():
+        held = set(path.glob("*.mcap"))
+        inside = sorted(held.difference(*map(later_segments, held)))[:3]
+        hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
+        raise RecordingError(f"{path}: is a folder{hint}")
+    files = tuple(one for one in later_segments(path) if _continues(one))
+    if path.exists():
+        files = (path, *files)
+    if not files:
+        raise RecordingError(f"{path}: no such recording")
+    return files
+
+
+def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
+    """Messages and damage of all segments; header and library that later segments repeat are marked.
+
+    Args:
+        order: see `logs.recording.reader.scan`.
+
+    Raises:
+        RecordingError: there is no such recording, a file of it is none, or it is not in order.
+    """
+    first: dict[str, bytes] = {}
+    for file in segment_files(path):
+        for item in scan(file, order):
+            if isinstance(item, RecordedMessage) and item.definition.topic in (HEADER, LIBRARY):
+                yield item._replace(repeated=item.data == first.get(item.definition.topic))
+                first.setdefault(item.definition.topic, item.data)
+            else:
+                yield item
+
+
+def read(path: Path) -> Iterator[tuple[str, int, Record]]:
+    """Topic, log time [ns] and record of each message, in file order; what was made for viewers is left out.
+
+    Raises:
+        RecordingError: no recording, or damaged; names file and offset. What came before is good.
+    """
+    for message in good_messages(path):
+        topic = message.definition.topic
+        yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
+
+
+def finished(path: Path) -> bool:
+    """Whether every file of a recording was closed in order, and the last of them with the recorder's last word.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    return not lacks_end(path)
+
+
+def lacks_end(path: Path) -> str:
+    """Why a recording's end is not there, in words; nothing if it is.
+
+    Only the recorder's last word says that it is: index and footer stand in a file that was full or could not be
+    written on, and in one that was recovered, too.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    files = segment_files(path)
+    ends = [last_chunk(file) for file in files]
+    if None in ends:
+        return "the recording is torn"
+    note = _note(ends[-1])
+    if note is not None and is_end(note):
+        return ""
+    text = "" if note is None else note.text
+    if text.startswith(GOES_ON):
+        return f"the recording goes on after {files[-1].name}, in a file that is missing"
+    if text.startswith(RECOVERED):
+        return f"the recording was {text}"
+    return f"the recording has no end: nothing could be written after {files[-1].name}"
+
+
+def is_end(note: RecorderNote) -> bool:
+    """Whether the end of a recording is there if this is what was noted last."""
+    return note.text.startswith(END) or (note.text.startswith(RECOVERED) and NO_END not in note.text)
+
+
+def last_note(path: Path) -> RecorderNote | None:
+    """What the recorder, or who restored the recording, said last; None where a file was not closed in order.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    return _note(last_chunk(segment_files(path)[-1]))
+
+
+def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
+    """The last one of a file's last chunk."""
+    for message in reversed(end or []):
+        if message.definition.topic == RECORDER:
+            note = decode(RECORDER, message.data, message.at_ns)
+            assert isinstance(note, RecorderNote)  # the topic's type
+            return note
+    return None
+
+
+def records(path: Path, kind: type[R]) -> Iterator[R]:
+    """The records of one type, in file order.
+
+    Raises:
+        RecordingError: as `read`.
+    """
+    for message in good_messages(path):
+        topic = message.definition.topic
+        if _is(topic, kind):
+            record = decode(topic, message.data, message.at_ns)
+            assert isinstance(record, kind)  # the topic's type
+            yield record
+
+
+def header(path: Path) -> Header:
+    """The recording's header.
+
+    Raises:
+        RecordingError: as `read`, or it has none.
+    """
+    for record in records(path, Header):
+        return record
+    raise RecordingError(f"{path}: no header: it was ended before its first chunk was written, or that chunk was lost")
+
+
+def good_messages(path: Path) -> Iterator[RecordedMessage]:
+    """The messages themselves, also of topics that this version does not know; no repetitions, nothing for viewers.
+
+    Raises:
+        RecordingError: as `read`.
+    """
+    for item in walk(path, ReadingOrder(path)):
+        if isinstance(item, RecordedMessage):
+            if not item.repeated:
+                yield item
+        elif isinstance(item, Damage) and not item.torn:
+            raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
+
+
+def _is(topic: str, kind: type[Record]) -> bool:
+    try:
+        return issubclass(record_type(topic), kind)
+    except KeyError:
+        return False
+
+
+def _continues(path: Path) -> bool:
+    """Whether a file goes on with another one (and is no recording of its own with such a name)."""
+    for count, item in enumerate(scan(path)):
+        if not isinstance(item, RecordedMessage):
+            return True  # empty or damaged: better told than passed over
+        if item.definition.topic == RECORDER:
+            note = decode(RECORDER, item.data, item.at_ns)
+            return isinstance(note, RecorderNote) and note.segment > 1
+        if count == 1:
+            break
+    return False

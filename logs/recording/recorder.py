@@ -1,0 +1,516 @@
+"""A recording's bounded queue: what is taken from it, what is made beside it for viewers, and what is noted.
+
+A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing,
+records
+wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and
+recording
+rests. Views take most of the time and are not needed to decide alike, so they may come later than their records.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Protocol
+
+import msgspec
+
+from logs.recording.disk import DiskFile, OutputFile, RoomWatch, free_bytes, later_segments
+from logs.recording.segment import Rotation
+from logs.recording.topics import (
+    END,
+    GOES_ON,
+    HEADER,
+    LIBRARY,
+    RECORDER,
+    Definition,
+    RecorderNote,
+    definition,
+    encode,
+    encode_message,
+)
+from uavctl.config.types import LogConfig
+from uavctl.errors import RecordingError, UsageError
+from uavctl.records import Datagram, Record
+
+# What a recording carries for those who look on: messages for viewers beside each record, and a live view's share.
+
+
+Watcher = Callable[[Definition, int, bytes], None]
+
+
+class ViewMaker(Protocol):
+    """Makes messages for viewers; `logs.recording.views.Views` is one."""
+
+    def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        """Topic and message of all that a record gives rise to."""
+        ...
+
+
+class DerivedTopics:
+    """Makes what is written beside a record, and shows both.
+
+    Args:
+        views: makes the messages for viewers; None: there are none.
+        watch: is given definition, log time [ns] and bytes of each message, soon after its record was taken;
+            returns at once and raises nothing.
+
+    Attributes:
+        unseen: records of which no messages could be made; they are in the recording.
+        reason: of the newest one.
+    """
+
+    def __init__(self, views: ViewMaker | None = None, watch: Watcher | None = None) -> None:
+        self._views, self._watch = views, watch
+        self.unseen = 0
+        self.reason = ""
+
+    def beside(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
+        """Topic, log time [ns] and message of all that goes beside a record, whose own message is `data`."""
+        made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
+        if self._watch is not None:
+            for name, time_ns, message in ((topic, at_ns, data), *made):
+                self._watch(definition(name), time_ns, message)
+        return made
+
+    def _made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        if self._views is None:
+            return []
+        try:
+            return self._views.made(at_ns, record)
+        except (RecordingError, ValueError, TypeError, LookupError, ArithmeticError) as error:
+            self.unseen += 1
+            self.reason = f"{type(record).__name__}: {error}"
+            return []
+
+
+LOOK_S = 1.0  # between two syncs, and looks at the disk's room
+LATE_S = 3.0  # a last completed write that is older means that the disk hangs
+LAST_TRIES = 3  # files that closing may begin on a failing disk
+
+
+class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """How a recorder is doing."""
+
+    ok: bool  # the disk takes records, and none was lost
+    written: int  # records on the disk
+    waiting: int  # records in memory
+    dropped: int  # records that found the queue full, or came after the end
+    refused: int  # records that could not be encoded
+    gone: int  # records in files that somebody has removed or replaced since
+    failures: int  # failed writes
+    reason: str  # what is wrong now, or was last (a failed write, a rest); "" while nothing was
+    refusal: str  # of the newest refused record
+    bytes: int  # on the disk
+    segments: tuple[str, ...]  # files with at least one chunk
+    warning: str = ""  # the disk gets low
+    unwritten_s: float = 0.0  # since the last completed write, while something waits for the disk [s]
+    unseen: int = 0  # records of which no messages for viewers could be made; they are in the recording
+
+
+class WriteQueue:
+    """What comes out of a bounded queue goes into files; nothing raises once it is made.
+
+    `drop` and `status` may be called, and `queue` appended to, beside a thread that runs the other methods.
+
+    Args:
+        path: file of the recording; it and its later segments must not exist yet.
+        log: sizes of chunks, files and queue; free space to keep.
+        free: gives the free space of a folder [bytes], or None.
+        clock: wall time [s].
+        onlookers: makes what is written beside the records for viewers.
+
+    Attributes:
+        queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
+        views_due: the same, with the record's message, of records whose messages for viewers are not made yet.
+        closed: no more records will come.
+        finished: all that could be done is done.
+
+    Raises:
+        RecordingError: the name is taken, or the folder cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        log: LogConfig,
+        open_file: Callable[[Path], OutputFile],
+        free: Callable[[Path], int | None],
+        clock: Callable[[], float],
+        onlookers: DerivedTopics,
+    ) -> None:
+        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        if taken:
+            raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another name")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{path.parent}: {error.strerror}; choose another folder") from error
+        self._room = RoomWatch(path.parent, free, log.low_bytes, log.stop_bytes)
+        self._room.look()
+        self._files = Rotation(path, log, open_file, clock)
+        self._clock = clock
+        self._onlookers = onlookers
+        self._written_s = clock()  # nothing that waited for the disk then does so now
+        self._next_look_s = self._written_s + LOOK_S
+        self._noted = (0, 0)  # dropped and refused, as last written down
+        self._told_low = False
+        self._drop_lock = threading.Lock()
+        self._dropped = 0
+        self._refused = 0
+        self._refusal = ""
+        self.queue: deque[tuple[str, int, Record]] = deque()
+        self.views_due: deque[tuple[str, int, Record, bytes]] = deque()
+        self.closed = self.finished = False
+
+    def drop(self) -> None:
+        """Count a record that found no room in the queue."""
+        with self._drop_lock:
+            self._dropped += 1
+
+    def drain(self, records: int, views: int) -> None:
+        """Write up to so many of the waiting records; once a second see to it that the disk has them.
+
+        Args:
+            views: records whose messages for viewers are made then, these or earlier ones.
+        """
+        due = self._clock() >= self._next_look_s
+        if due:
+            self._next_look_s = self._clock() + LOOK_S
+            self._room.look()
+            self._rest()
+        try:
+            if due:
+                self._files.look()
+            if self._files.unwritten and self._ready():
+                self._files.write_unwritten()
+            if self._files.is_open and self._dropped and not self._noted[0]:
+                self._note_news()  # before all that was put after it: a recording without an end tells of it, too
+            for _ in range(min(records, len(self.queue))):
+                if not self._ready():
+                    return
+                self._take(*self.queue.popleft())
+            for _ in range(min(views, len(self.views_due))):
+                if not self._ready():
+                    return
+                self._show(*self.views_due.popleft())
+            if due and self._files.is_open:
+                self._note_news()
+                self._files.sync()
+            if due:
+                self._written_s = self._clock()
+        except OSError as error:
+            self._files.fail(error)
+
+    def finish(self) -> None:
+        """Write all that waits and close the file; after a failed write, in a new file."""
+        self.closed = True
+        for _ in range(LAST_TRIES):
+            self._files.try_again()
+            self.drain(len(self.queue), len(self.views_due) + len(self.queue))
+            if self._files.is_open:
+                self._finish_file(END)
+        with suppress(OSError):  # None is open
+            self._files.look()
+        self.finished = True
+
+    def status(self) -> RecorderStatus:
+        """How it is doing."""
+        files = self._files
+        parts = files.parts()
+        waiting = len(self.queue) + files.open_messages
+        lost = self._dropped + self._refused + files.gone_records + (waiting if self.closed else 0)
+        stuck = bool(files.reason) and not self.closed and not files.has_chunk
+        hangs = self.closed and not self.finished
+        unwritten_s = max(0.0, self._clock() - self._written_s) if waiting or hangs else 0.0
+        late = hangs or unwritten_s > LATE_S
+        reasons = (
+            (bool(files.gone), f"{', '.join(files.gone)} deleted, moved or replaced"),
+            (late, f"the recording was last written {unwritten_s:.1f} s ago"),
+            (bool(files.reason) and not (files.gone and not stuck), files.reason),
+        )
+        return RecorderStatus(
+            ok=not lost and not stuck and not late,
+            written=sum(messages for _, messages, _ in parts),
+            waiting=waiting,
+            dropped=self._dropped,
+            refused=self._refused,
+            gone=files.gone_records,
+            failures=files.failures,
+            reason="; ".join(text for holds, text in reasons if holds),
+            refusal=self._refusal,
+            bytes=sum(size for _, _, size in parts),
+            segments=tuple(str(path) for path, _, _ in parts),
+            warning=self._room.text if self._room.low else "",
+            unwritten_s=unwritten_s,
+            unseen=self._onlookers.unseen,
+        )
+
+    def _ready(self) -> bool:
+        """Whether there is a file to write to; begins one if something waits for it."""
+        files = self._files
+        if files.is_open and not files.is_full:
+            return True
+        waits = bool(self.queue or self.views_due or files.unwritten)
+        if waits and files.is_full:
+            files.because = f"goes on after {files.name}"
+            self._finish_file(GOES_ON)
+        if files.is_open:
+            return True
+        if not waits or not files.may_begin or (self._room.resting and not self.closed):
+            return False
+        files.begin(self._write_note)
+        return True
+
+    def _rest(self) -> None:
+        """Close the file in order while the disk has room for that."""
+        if not self._room.resting or self.closed:
+            return
+        self._files.reason = self._room.text
+        if self._files.is_open:
+            self._files.because = f"after a rest: {self._room.text}"
+            self._finish_file(self._room.text)
+
+    def _take(self, topic: str, at_ns: int, record: Record) -> None:
+        if isinstance(record, Datagram):
+            at_ns = record.at_ns  # the log time is the only place that keeps it
+        try:
+            data = encode_message(topic, at_ns, record)
+        except RecordingError as error:
+            self._refused += 1
+            self._refusal = str(error)
+            return
+        self.views_due.append((topic, at_ns, record, data))
+        self._files.write_record(topic, at_ns, data)
+        if topic == HEADER:
+            self._write_note("begin")
+        if topic in (HEADER, LIBRARY):
+            self._files.commit()
+
+    def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
+        """Write what viewers want beside a record."""
+        self._files.unwritten.extend(self._onlookers.beside(topic, at_ns, record, data))
+        self._files.write_unwritten()
+
+    def _note_news(self) -> None:
+        if (self._dropped, self._refused) != self._noted:
+            self._tell_note("records lost" + (f"; newest refusal: {self._refusal}" if self._refusal else ""))
+        if self._room.low != self._told_low:
+            self._told_low = self._room.low
+            self._tell_note(f"disk {'gets low' if self._told_low else 'has room again'}: {self._room.text}")
+
+    def _tell_note(self, text: str) -> None:
+        """Write a note that those who look on see, too."""
+        note = self._write_note(text)
+        self._show(RECORDER, note.at_ns, note, encode(note))
+
+    def _write_note(self, text: str) -> RecorderNote:
+        self._noted = (self._dropped, self._refused)
+        note = RecorderNote(
+            at_ns=self._files.at_ns,
+            segment=self._files.number,
+            written=self._files.written,
+            dropped=self._dropped,
+            refused=self._refused,
+            failures=self._files.failures,
+            text=text,
+        )
+        self._files.write(RECORDER, note.at_ns, encode(note))
+        return note
+
+    def _finish_file(self, text: str) -> None:
+        blind = self._onlookers
+        try:
+            self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text)
+            self._files.finish()
+        except OSError as error:
+            self._files.fail(error)
+
+
+# The topics of a flight served to a viewer while it lasts: Foxglove's WebSocket protocol, on this machine only.
+#
+# It is fed where recordings are written. The server keeps the newest `BACKLOG` messages for each viewer
+# and drops the oldest, so a viewer that does not read costs memory up to that, and no time.
+
+
+HOST = "127.0.0.1"
+BACKLOG = 1024  # messages: about four seconds of a flight
+STOP_S = 1.0  # for viewers to take their leave
+
+
+@contextmanager
+def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: None) -> Iterator[Watcher | None]:
+    """Serve every message that the watcher is given, but raw bytes and the policy library.
+
+    Args:
+        port: TCP port on the loopback address, 0 for a free one; None: nobody looks, and nothing is imported.
+        on_open: told the port once viewers can connect.
+
+    Raises:
+        UsageError: foxglove-sdk is not installed, or the port cannot be had.
+    """
+    if port is None:
+        yield None
+        return
+    if not 0 <= port <= 65535:
+        raise UsageError(f"--live-port {port}: ports are 1 to 65535; 0 takes one that is free")
+    foxglove = _sdk()
+    context = foxglove.Context()
+    try:
+        server = foxglove.start_server(
+            name="uavctl", host=HOST, port=port, context=context, message_backlog_size=BACKLOG
+        )
+    except RuntimeError as error:
+        raise UsageError(f"--live: port {port} cannot be had ({error}); choose another with --live-port") from error
+    try:
+        on_open(server.port)
+        yield _watcher(foxglove, context)
+    finally:
+        # It waits for every viewer to take its leave; one that has stalled never does.
+        stopping = threading.Thread(target=server.stop, name="live view's end", daemon=True)
+        stopping.start()
+        stopping.join(STOP_S)
+
+
+def _sdk() -> ModuleType:
+    try:
+        return import_module("foxglove")
+    except ImportError as error:
+        raise UsageError("--live needs foxglove-sdk: pip install 'uavctl[live]'") from error
+
+
+def _watcher(foxglove: ModuleType, context: object) -> Watcher:
+    logs: dict[str, Callable[..., None]] = {}  # a channel's entrance, by topic
+
+    def watch(definition: Definition, at_ns: int, data: bytes) -> None:
+        if definition.schema_encoding == "" or definition.topic == LIBRARY:
+            return
+        if definition.topic not in logs:
+            schema = foxglove.Schema(
+                name=definition.schema_name, encoding=definition.schema_encoding, data=definition.schema
+            )
+            channel = foxglove.Channel(
+                definition.topic, schema=schema, message_encoding=definition.encoding, context=context
+            )
+            logs[definition.topic] = channel.log
+        logs[definition.topic](data, log_time=at_ns)
+
+    return watch
+
+
+# Recorders: sinks that never block the control loop and never raise into it, whatever the disk does.
+
+
+POLL_S = 0.02
+# What a round may take, so that the interpreter, which a tick waits for, is free again after 3 ms at most. Records come
+# first, at 8 us each: unless more than RECORDS waited, the queue then holds nothing that was there when the round
+# began, and a kill loses little of what a busy computer has left behind. Their messages for viewers, three times as
+# dear, can wait. A round every POLL_S makes 1600 records a second with views, several times what a flight has. Of a
+# larger backlog, which a slow disk has left, a share.
+RECORDS = 256
+VIEWS = 32
+BACKLOG_SHARE = 8
+
+
+class _Base:
+    """A journal and how it is begun; arguments and errors are those of `Journal`."""
+
+    def __init__(
+        self,
+        path: Path,
+        log: LogConfig | None = None,
+        *,
+        open_file: Callable[[Path], OutputFile] = DiskFile,
+        free: Callable[[Path], int | None] = free_bytes,
+        clock: Callable[[], float] = time.monotonic,
+        onlookers: DerivedTopics | None = None,
+    ) -> None:
+        self._log = log or LogConfig()
+        self._journal = WriteQueue(path, self._log, open_file, free, clock, onlookers or DerivedTopics())
+        self._queue = self._journal.queue
+        self._most = self._log.queue  # records in the queue; 0 from the end on
+        self._begin()
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Queue one value under a topic, or count it as dropped; whatever goes wrong is in `status()`."""
+        # Each tick comes here after a rest, when nothing of this is in the processor's caches: so it is one function,
+        # that looks at little, takes no lock and wakes no thread.
+        queue = self._queue
+        if len(queue) < self._most:
+            queue.append((topic, at_ns, record))
+        else:
+            self._journal.drop()
+
+    def _begin(self) -> None:
+        """What has to run beside the journal."""
+        return
+
+
+class SyncRecorder(_Base):
+    """Recorder that writes in `put`: for virtual time, where the disk may hold up the caller."""
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Record one value under a topic; whatever goes wrong is in `status()`."""
+        super().put(topic, at_ns, record)
+        self._journal.drain(self._log.queue, self._log.queue)
+
+    def close(self) -> RecorderStatus:
+        """Write the rest, the index and the footer; later records are dropped."""
+        self._most = 0
+        if not self._journal.closed:
+            self._journal.finish()
+        return self.status()
+
+    def status(self) -> RecorderStatus:
+        """How it is doing."""
+        return self._journal.status()
+
+
+class Recorder(_Base):
+    """Recorder with a thread of its own, which encodes and writes; `put` only queues.
+
+    A process that is killed loses the open chunk, and what was put since the thread last began a round: every `POLL_S`,
+    later where the computer does not let it run or the disk holds it up. That can be `log.queue` records and no more.
+    """
+
+    def catch_up(self) -> None:
+        """Begin a round now: right after a tick, when the control loop has the longest time until it needs anything."""
+        self._due.set()
+
+    def _begin(self) -> None:
+        self._stop, self._due = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def close(self, timeout_s: float = 5.0) -> RecorderStatus:
+        """Stop taking records and write those that wait; gives up after `timeout_s` on a disk that hangs."""
+        self._most = 0
+        self._journal.closed = True
+        self._stop.set()
+        self._due.set()
+        self._thread.join(timeout_s)
+        return self.status()
+
+    def status(self) -> RecorderStatus:
+        """How it is doing."""
+        status = self._journal.status()
+        return msgspec.structs.replace(status, ok=status.ok and (self._thread.is_alive() or self._journal.closed))
+
+    def _run(self) -> None:
+        journal = self._journal
+        while not self._stop.is_set():
+            self._due.wait(POLL_S)
+            self._due.clear()
+            journal.drain(portion(len(journal.queue), RECORDS), portion(len(journal.views_due), VIEWS))
+        journal.finish()
+
+
+def portion(waiting: int, at_once: int) -> int:
+    """How many of `waiting` are taken in a round: up to `at_once`, or a share of a large backlog."""
+    return max(at_once, waiting // BACKLOG_SHARE)

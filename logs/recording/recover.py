@@ -1,0 +1,160 @@
+"""Restores what a torn or damaged recording still holds into a clean one."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import msgspec
+
+from logs.recording.disk import DiskFile
+from logs.recording.reader import Damage, EndOfFile, RecordedMessage, is_end, walk
+from logs.recording.segment import QueuedMessage, Segment
+from logs.recording.topics import HOLES, NO_END, RECORDER, RECOVERED, RecorderNote, decode, definition, encode
+from uavctl.errors import RecordingError
+
+CHUNK_BYTES = 16384
+
+
+class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What was restored, and what was not."""
+
+    messages: int  # restored
+    messages_lost: int  # by their running numbers; those after the last restored one cannot be known
+    lost_bytes: int  # damaged bytes that held messages, or may have
+    chunks_bad: int  # damaged places, a torn end included
+    finished: bool  # every file of the recording had been closed in order
+    ended: bool  # the recorder's last word is there, so that nothing is missing after it
+    damage: tuple[str, ...]  # in words: file, offset, reason; and if losses at the end cannot be counted
+
+    @property
+    def lossless(self) -> bool:
+        """Whether everything that the files held is restored."""
+        return self.messages_lost == 0 and self.lost_bytes == 0
+
+
+class _Tally:
+    """Counts losses while the messages go by."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self.messages_lost = 0
+        self.lost_bytes = 0
+        self.damage: list[Damage] = []
+        self.finished = True
+        self.ended = False  # the newest message is the recorder's last word
+        self._next: int | None = None
+        self._doubtful_bytes = 0  # damaged since the last message
+
+    def message(self, item: RecordedMessage) -> None:
+        # A first message of another number than 1 means that those before it are gone.
+        missing = item.sequence - (self._next or 1)
+        if missing != 0:
+            self.messages_lost += max(0, missing)
+            self.lost_bytes += self._doubtful_bytes
+        self._doubtful_bytes = 0  # without a gap nothing was in them: an index, or the file's head
+        self._next = item.sequence + 1
+        self.messages += not item.repeated
+        self.ended = item.definition.topic == RECORDER and _is_end(item)
+
+    def damaged(self, item: Damage) -> None:
+        self.damage.append(item)
+        self._doubtful_bytes += item.length
+
+    def file_ended(self, item: EndOfFile) -> None:
+        self.finished &= item.finished
+
+    def end(self) -> None:
+        if self.ended:
+            self._doubtful_bytes = 0  # no message comes after the last word
+        self.lost_bytes += self._doubtful_bytes
+        self._doubtful_bytes = 0
+
+
+def recover(src: Path, dst: Path) -> RecoverResult:
+    """Write all whole chunks' messages of `src` (with its later segments) to the new file `dst`.
+
+    Messages keep their bytes, times and order; they are numbered anew. If anything was lost, or the end of
+    the recording is not there, the last message, from the recorder, says so.
+
+    Raises:
+        RecordingError: `src` is no recording or holds no whole chunk, `dst` exists, or it cannot be
+            written (what was written of it is removed).
+    """
+    try:
+        file = DiskFile(dst)
+    except FileExistsError as error:
+        raise RecordingError(f"{dst} exists and a recording is never overwritten; choose another name") from error
+    except OSError as error:
+        raise RecordingError(f"{dst}: {error.strerror}; choose another place") from error
+    try:
+        result = _copy(src, Segment(file, CHUNK_BYTES))
+        if result.messages == 0:
+            raise RecordingError(f"{src}: no whole chunk in it; nothing can be restored")
+    except BaseException as error:
+        # Also after Ctrl-C: half of it would look like a shorter flight.
+        with contextlib.suppress(OSError):
+            dst.unlink()
+        if isinstance(error, OSError):
+            raise RecordingError(f"{dst}: {error.strerror}; make room or choose another place") from error
+        raise
+    return result
+
+
+def _copy(src: Path, segment: Segment) -> RecoverResult:
+    tally = _Tally()
+    at_ns = 0
+    for item in walk(src):
+        if isinstance(item, Damage):
+            tally.damaged(item)
+        elif isinstance(item, EndOfFile):
+            tally.file_ended(item)
+        else:
+            tally.message(item)
+            at_ns = item.at_ns
+            if not item.repeated:
+                segment.add(QueuedMessage(item.definition, tally.messages, item.at_ns, item.data))
+    tally.end()
+    damage = [str(one) for one in tally.damage]
+    if not tally.ended:
+        damage.append(f"{src}: the end is missing: messages after the last restored one cannot be counted")
+    result = RecoverResult(
+        messages=tally.messages,
+        messages_lost=tally.messages_lost,
+        lost_bytes=tally.lost_bytes,
+        chunks_bad=len(tally.damage),
+        finished=tally.finished,
+        ended=tally.ended,
+        damage=tuple(damage),
+    )
+    if not (result.lossless and result.ended):
+        segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(_note(src, result, at_ns))))
+    segment.finish()
+    return result
+
+
+def _note(src: Path, result: RecoverResult, at_ns: int) -> RecorderNote:
+    return RecorderNote(
+        at_ns=at_ns,
+        segment=1,
+        written=result.messages,
+        dropped=0,
+        refused=0,
+        failures=0,
+        text=f"{RECOVERED}{src.name}: {_losses(result)}",
+    )
+
+
+def _losses(result: RecoverResult) -> str:
+    parts = (
+        (result.messages_lost > 0, f"{result.messages_lost} {HOLES}"),
+        (result.lost_bytes > 0, f"{result.lost_bytes} bytes lost"),
+        (not result.ended, NO_END),
+    )
+    return ", ".join(text for given, text in parts if given)
+
+
+def _is_end(message: RecordedMessage) -> bool:
+    note = decode(RECORDER, message.data, message.at_ns)
+    assert isinstance(note, RecorderNote)  # the topic's type
+    return is_end(note)

@@ -1,0 +1,536 @@
+"""Replay: a recording's inputs through the same control loop, everything that it says compared.
+
+The raw bytes go through parser, clock offset and frames again; the ticks through the same
+`step()`. Each record that comes out (step inputs, estimates, plans, decisions, setpoints, bytes
+to send) must be the recorded one, bit for bit. Where one is not, the replay goes on, so that it can be
+told what becomes of the difference: what is recorded stays the input.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from logs.recording.reader import records
+from logs.recording.topics import RecorderNote, alike, decode, raw_link, record_type, says
+from uavctl.errors import RecordingError
+from uavctl.labels import names_of
+from uavctl.loop import ControlLoop
+from uavctl.records import (
+    Command,
+    Datagram,
+    Decision,
+    Event,
+    PolicyLibrary,
+    PositionSample,
+    Record,
+    Refused,
+    Sink,
+    StepInput,
+    VehicleStatus,
+)
+from uavctl.smpc.plant import Plant
+
+# Where a replay parts from its recording: the field, what the tick knew, and how the difference goes on.
+
+
+DECISION = "/uavctl/decision"
+NOTHING = "nothing"
+Leaf = tuple[str, object, object]  # path, recorded, replayed
+
+# What the records of a tick say one after the other: those before the first one that differs are the same.
+_SAID_BY = {
+    "/uavctl/step_input": "of the same bytes the tick was given something else: parser, clock or frame",
+    "/uavctl/vehicle": "the vehicle's messages are understood otherwise",
+    "/uavctl/estimate": "the tick was given the same: estimator, or how far positions are believed",
+    "/uavctl/link_estimate": "the tick was given the same: what is believed of the link",
+    "/uavctl/plan": "the estimate is the same: design, target or solver",
+    DECISION: "estimate and plan (if there is a new one) are the same: a rule of the decision, fallback or last gate",
+    "/uavctl/setpoint": "the decision is the same: hand-over or last gate",
+    "/uavctl/event": "nothing before it differs: what is told",
+    "/uavctl/link": "nothing before it differs: counters or clock of a connection",
+}
+_SENT = "the decision is the same: hand-over, relay or encoding"
+_STATES = {
+    ("/uavctl/estimate", "mean"),
+    ("/uavctl/plan", "states"),
+    ("/uavctl/plan", "reference"),
+    (DECISION, "target"),
+}
+_INPUTS = {("/uavctl/estimate", "bias"), ("/uavctl/plan", "inputs"), ("/uavctl/plan", "bias"), (DECISION, "input")}
+_AXES = ("north", "east", "down")  # of what is a vector in local NED
+_UNITS = {"ns": "ns", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "v": "V", "ppm": "ppm"}
+_NUMBER = re.compile(r"\[(\d+)\]")
+_STAGE = {"inputs": "stage", "states": "stage", "backoff_x": "stage", "backoff_u": "stage"}
+
+
+class ReplayDifference(msgspec.Struct, frozen=True, kw_only=True):
+    """One place where recording and replay part."""
+
+    topic: str
+    at_ns: int  # log time
+    flight_s: float  # since the first tick
+    tick: int | None  # the last one that had begun; None before the first
+    field: str  # path in the record; empty if there is a record on one side only
+    meaning: str  # of the field, in words; empty if its name says it all
+    unit: str  # empty if it has none, or it is not known
+    recorded: str
+    replayed: str
+    change: float | None  # replayed − recorded, of numbers
+    fields: int  # that differ in this record
+    stage: str  # what comes into question, in words
+
+
+class Chosen(msgspec.Struct, frozen=True, kw_only=True):
+    """What a tick decided."""
+
+    mode: str
+    age_steps: int | None
+    solve: str | None
+    plan_seq: int | None
+    plan_index: int | None
+    reason: str
+
+
+class Context(msgspec.Struct, frozen=True, kw_only=True):
+    """The tick of the first difference: what came before, what it was given, what it decided."""
+
+    decisions_before: int  # identical ones
+    records_before: int  # of those compared, likewise
+    positions: int  # that were new to the tick
+    position_m: tuple[float, float, float] | None  # the newest of them, local NED
+    position_age_s: float | None  # at the tick, since it was captured
+    vehicle: str  # mode and arming; empty if nothing was known of one
+    orders: tuple[str, ...]
+    missed_ticks: int
+    stop: bool
+    recorded: Chosen | None  # None if the tick's decision is not there
+    replayed: Chosen | None
+
+
+class FieldDivergence(msgspec.Struct, frozen=True, kw_only=True):
+    """One field from the first difference on; entries of a vector are taken together."""
+
+    topic: str
+    field: str  # empty: there is a record on one side only
+    entry: str  # of a vector: the one that differs most, in words
+    unit: str  # of that
+    differing: int  # records in which it differs
+    records: int  # of its topic, from the first difference on
+    first_s: float  # of the flight
+    largest: float | None  # difference; None of what is no number
+    largest_s: float | None
+
+
+class FieldNames:
+    """Names and units of fields, as far as they are known.
+
+    Args:
+        plant: of the controller; its states and inputs have names.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._states = names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index).states
+        self._inputs = tuple(
+            (f"{axis} input", "m/s²" if one == 1.0 else "")
+            for axis, one in zip(plant.axes, plant.accel_per_input, strict=True)
+        )
+
+    def meaning(self, topic: str, path: str) -> tuple[str, str]:
+        """What a leaf is, and its unit; either may be empty."""
+        numbers = [int(one) for one in _NUMBER.findall(path)]
+        name = plain(path)
+        if not numbers:
+            return "", _unit(name)
+        staged = f" in stage {numbers[0]}" if name in _STAGE and len(numbers) > 1 else ""
+        for kind, known in ((_STATES, self._states), (_INPUTS, self._inputs)):
+            if (topic, name) in kind and numbers[-1] < len(known):
+                meaning, unit = known[numbers[-1]]
+                return meaning + staged, unit
+        unit = _unit(name)
+        return (_AXES[numbers[-1]] if unit.startswith("m") and numbers[-1] < len(_AXES) else ""), unit
+
+
+def plain(path: str) -> str:
+    """A path without numbers of entries."""
+    return _NUMBER.sub("", path)
+
+
+def _unit(name: str) -> str:
+    return _UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
+
+
+def stage(topic: str) -> str:
+    """What comes into question if this topic is the first that differs."""
+    return _SAID_BY.get(topic, _SENT if raw_link(topic) is not None else "")
+
+
+def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
+    """Leaves where two records of a topic differ in any bit."""
+    return list(_unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed), ""))
+
+
+def _unequal(left: object, right: object, path: str) -> Iterator[Leaf]:
+    if isinstance(left, dict) and isinstance(right, dict):
+        for key in dict.fromkeys([*left, *right]):
+            yield from _unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
+    elif isinstance(left, list | tuple) and isinstance(right, list | tuple) and len(left) == len(right):
+        for index, (one, other) in enumerate(zip(left, right, strict=True)):
+            yield from _unequal(one, other, f"{path}[{index}]")
+    elif not _same_bits(left, right):
+        yield path, left, right
+
+
+def _same_bits(left: object, right: object) -> bool:
+    if isinstance(left, float) and isinstance(right, float):
+        return left.hex() == right.hex()
+    return type(left) is type(right) and left == right
+
+
+def close(left: object, right: object, tolerance: float) -> bool:
+    """Whether two leaves that differ count as the same: numbers, relative to the larger of 1 and their size."""
+    if not isinstance(left, int | float) or not isinstance(right, int | float) or tolerance == 0.0:
+        return False
+    return math.isclose(left, right, rel_tol=tolerance, abs_tol=tolerance)
+
+
+def change(recorded: object, replayed: object) -> float | None:
+    """Difference of two numbers; None of anything else."""
+    numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (recorded, replayed))
+    return float(replayed - recorded) if numbers else None  # type: ignore[operator]  # both are numbers
+
+
+def brief(record: Record | None) -> str:
+    """A record in a few words."""
+    match record:
+        case None:
+            return NOTHING
+        case Event():
+            return f"{record.code}: {record.text}"
+        case Datagram():
+            return f"{len(record.data)} bytes, {record.data[:24].hex()}"
+        case _:
+            return f"a record ({type(record).__name__})"
+
+
+def chosen(record: Record | None) -> Chosen | None:
+    """What a decision says."""
+    if not isinstance(record, Decision):
+        return None
+    return Chosen(
+        mode=record.mode.value,
+        age_steps=record.age_steps,
+        solve=None if record.solve is None else record.solve.value,
+        plan_seq=record.plan_seq,
+        plan_index=record.plan_index,
+        reason=record.reason,
+    )
+
+
+def context(
+    inp: StepInput, decisions_before: int, records_before: int, recorded: Record | None, replayed: Record | None
+) -> Context:
+    """The tick `inp` and the decisions that it led to."""
+    newest: PositionSample | None = max(inp.samples, key=lambda one: one.captured_ns, default=None)
+    return Context(
+        decisions_before=decisions_before,
+        records_before=records_before,
+        positions=len(inp.samples),
+        position_m=None if newest is None else newest.position_m,
+        position_age_s=None if newest is None else (inp.at_ns - newest.captured_ns) * 1e-9,
+        vehicle="" if inp.vehicle is None else _vehicle(inp.vehicle),
+        orders=tuple(map(_order, inp.commands)),
+        missed_ticks=inp.missed_ticks,
+        stop=inp.stop,
+        recorded=chosen(recorded),
+        replayed=chosen(replayed),
+    )
+
+
+def _order(command: Command) -> str:
+    given = command.position_m if command.height_m is None else command.height_m
+    return command.order.value if given is None else f"{command.order.value} {given}"
+
+
+def _vehicle(status: VehicleStatus) -> str:
+    return f"{status.mode}, {'armed' if status.armed else 'disarmed'}"
+
+
+COMPARED = frozenset(
+    {
+        "/uavctl/step_input",
+        "/uavctl/estimate",
+        "/uavctl/link_estimate",
+        "/uavctl/plan",
+        "/uavctl/decision",
+        "/uavctl/setpoint",
+        "/uavctl/vehicle",
+        "/uavctl/event",
+        "/uavctl/link",
+    }
+)
+Labels = frozenset[tuple[str, str]]
+# What a plan says of who made it, which a changed controller need not repeat to decide alike.
+MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
+
+
+class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a replay found; the four before the last are there if there is a difference."""
+
+    decisions: int
+    compared: int
+    identical: bool
+    first_difference: ReplayDifference | None
+    first_decision: ReplayDifference | None = None  # the first decision that differs; None if all are alike
+    context: Context | None = None  # of the first difference; None before the first tick
+    decisions_differing: int = 0
+    course: tuple[FieldDivergence, ...] = ()  # field by field, in the order in which they began to differ
+    dropped: int = 0  # records that the recorder had to drop: what came after the first of them cannot be compared
+
+
+def recorded_library(path: Path) -> PolicyLibrary:
+    """The policy library that a recording was flown with.
+
+    Raises:
+        RecordingError: it cannot be read, or carries none.
+    """
+    for record in records(path, PolicyLibrary):
+        return record
+    raise RecordingError(
+        f"{path}: flown with a policy library, but carries none, so it cannot be decided alike; "
+        "was it cut, or the chunk lost? `uavctl log info` tells"
+    )
+
+
+class _Produced:
+    """Sink that keeps what the replayed loop says until the recording's word is read."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[tuple[str, int, Record]] = deque()
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        if _is_compared(topic):
+            self.waiting.append((topic, at_ns, record))
+
+    def take(self, topic: str, at_ns: int) -> Record | None:
+        """The next record said under this topic and time."""
+        for place, (its_topic, its_ns, record) in enumerate(self.waiting):  # nearly always the first
+            if its_ns == at_ns and its_topic == topic:
+                del self.waiting[place]
+                return record
+        return None
+
+    def unsaid(self) -> list[tuple[str, int, Record]]:
+        """What the loop has said and the recording has not; it is forgotten."""
+        found = [*self.waiting]
+        self.waiting.clear()
+        return found
+
+
+@dataclass
+class _Field:
+    """How one field's difference goes on."""
+
+    first_s: float
+    before: int  # records of its topic before it differed
+    differing: int = 0
+    largest: float | None = None
+    largest_s: float | None = None
+    path: str = ""  # of the entry that differs most
+
+    def add(self, parts: Iterable[Leaf], at_s: float) -> None:
+        self.differing += 1
+        for path, recorded, replayed in parts:
+            size = change(recorded, replayed)
+            if size is not None and (self.largest is None or abs(size) > self.largest):
+                self.largest, self.largest_s, self.path = abs(size), at_s, path
+
+
+@dataclass
+class _Findings:
+    """What has been compared, and where it parts."""
+
+    places: FieldNames
+    tolerance: float
+    ignored: Labels
+    compared: int = 0
+    decisions: int = 0
+    decisions_differing: int = 0
+    first: ReplayDifference | None = None
+    first_decision: ReplayDifference | None = None
+    context: Context | None = None
+    dropped: int = 0
+    _before: tuple[int, int] = (0, 0)  # decisions and records before the first difference
+    _tick: StepInput | None = None
+    _begun_ns: int | None = None
+    _fields: dict[tuple[str, str], _Field] = field(default_factory=dict)
+    _records: dict[str, int] = field(default_factory=lambda: defaultdict(int))  # by topic, since the first difference
+
+    def begin(self, inp: StepInput) -> None:
+        """A tick begins."""
+        self._tick = inp
+        self._begun_ns = inp.at_ns if self._begun_ns is None else self._begun_ns
+
+    def same(self, topic: str) -> None:
+        """Take one record that is alike, while all were."""
+        self.compared += 1
+        self.decisions += topic == DECISION
+
+    def compare(self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None) -> None:
+        """Take one record of the recording and what the loop says in its place; either may be missing."""
+        parts: list[Leaf] = []
+        if recorded is not None and replayed is not None and not alike(recorded, replayed):
+            parts = [
+                one
+                for one in leaves(recorded, replayed)
+                if (topic, plain(one[0])) not in self.ignored and not close(one[1], one[2], self.tolerance)
+            ]
+        differs = bool(parts) or recorded is None or replayed is None
+        if differs:
+            self._differs(topic, at_ns, recorded, replayed, parts)
+        if recorded is not None:
+            self.compared += 1
+            self.decisions += topic == DECISION
+        if self.first is None:
+            return
+        self._records[topic] += 1
+        self.decisions_differing += differs and topic == DECISION
+        of_tick = topic == DECISION and self._tick is not None and at_ns == self._tick.at_ns
+        if of_tick and self.context is None and self._tick is not None:
+            self.context = context(self._tick, *self._before, recorded, replayed)
+
+    def _differs(
+        self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None, parts: list[Leaf]
+    ) -> None:
+        at_s = 0.0 if self._begun_ns is None else (at_ns - self._begun_ns) * 1e-9
+        path, left, right = parts[0] if parts else ("", None, None)
+        meaning, unit = self.places.meaning(topic, path)
+        found = ReplayDifference(
+            topic=topic,
+            at_ns=at_ns,
+            flight_s=at_s,
+            tick=None if self._tick is None else self._tick.tick,
+            field=path,
+            meaning=meaning,
+            unit=unit,
+            recorded=repr(left) if parts else brief(recorded),
+            replayed=repr(right) if parts else brief(replayed),
+            change=change(left, right),
+            fields=len(parts),
+            stage=stage(topic),
+        )
+        if self.first is None:
+            self.first, self._before = found, (self.decisions, self.compared)
+        if topic == DECISION:
+            self.first_decision = self.first_decision or found
+        fields: dict[str, list[Leaf]] = defaultdict(list)
+        for one in parts or [("", None, None)]:
+            fields[plain(one[0])].append(one)
+        for name, those in fields.items():
+            known = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
+            known.add(those, at_s)
+
+    def result(self, *, finished: bool) -> ReplayResult:
+        """All of it; of a recording with an end it is to be more than nothing."""
+        return ReplayResult(
+            decisions=self.decisions,
+            compared=self.compared,
+            identical=self.first is None and (self.decisions > 0 or not finished),
+            first_difference=self.first,
+            first_decision=self.first_decision,
+            context=self.context,
+            decisions_differing=self.decisions_differing,
+            course=tuple(
+                FieldDivergence(
+                    topic=topic,
+                    field=name,
+                    entry=self.places.meaning(topic, one.path)[0],
+                    unit=self.places.meaning(topic, one.path or name)[1],
+                    differing=one.differing,
+                    records=self._records[topic] - one.before,
+                    first_s=one.first_s,
+                    largest=one.largest,
+                    largest_s=one.largest_s,
+                )
+                for (topic, name), one in self._fields.items()
+            ),
+            dropped=self.dropped,
+        )
+
+
+def replay(
+    messages: Iterable[tuple[str, int, Record | bytes]],
+    make_loop: Callable[[Sink], ControlLoop],
+    tolerance: float = 0.0,
+    *,
+    finished: bool = True,
+    ignored: Labels = frozenset(),
+) -> ReplayResult:
+    """Drive a loop with the recorded inputs and compare all that it says, and that it says no more.
+
+    Args:
+        messages: (topic, log time [ns], record or the bytes that it is recorded as) in the order of recording.
+        make_loop: builds the loop from the recording's configuration, around the given sink.
+        tolerance: largest difference of two numbers that counts as none, relative to the larger
+            of 1 and their size; 0 compares bit for bit. For a recording of another CPU type.
+        finished: the recording was closed in order; a torn one's last tick may lack records.
+        ignored: (topic, field) that may differ; of a vector all entries.
+    """
+    produced = _Produced()
+    loop = make_loop(produced)
+    found = _Findings(FieldNames(loop.plant), tolerance, ignored)
+    for topic, at_ns, message in messages:
+        record = _decoded(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
+        if isinstance(record, StepInput):
+            # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
+            _unsaid(found, produced)
+            found.begin(record)
+            for command in record.commands:
+                loop.order(command)
+            deque(loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop), maxlen=0)
+        elif isinstance(record, Datagram) and not record.outgoing:
+            loop.receive(record.link, record.data, record.at_ns)
+        elif isinstance(record, Refused):
+            loop.refused(record.link, record.counts, record.at_ns)
+        elif isinstance(record, RecorderNote):
+            found.dropped = record.dropped
+        if _is_compared(topic):
+            replayed = produced.take(topic, at_ns)
+            if found.first is None and isinstance(message, bytes) and replayed is not None and says(replayed, message):
+                found.same(topic)
+            else:
+                found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
+    if finished:
+        _unsaid(found, produced)
+    return found.result(finished=finished)
+
+
+def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:
+    return decode(topic, message, at_ns) if isinstance(message, bytes) else message
+
+
+def _unsaid(found: _Findings, produced: _Produced) -> None:
+    for topic, at_ns, record in produced.unsaid():
+        found.compare(topic, at_ns, None, record)
+
+
+@cache
+def _is_compared(topic: str) -> bool:
+    return topic in COMPARED or (topic.startswith("/raw/") and topic.endswith("/out"))
+
+
+@cache
+def _is_input(topic: str) -> bool:
+    """Whether the loop is driven by what is recorded here, or the result tells it."""
+    link = raw_link(topic)
+    try:
+        return record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
+    except KeyError:
+        return True  # decoding says that nobody knows it

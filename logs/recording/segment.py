@@ -1,0 +1,523 @@
+"""One MCAP file of a recording, written a chunk at a time.
+
+Every chunk is one write of the operating system, so that a process killed between two of them
+leaves whole chunks only. Every chunk repeats the channels that it uses, so that it can be read when
+any other is damaged, and is stored uncompressed: its CRC-32 then catches each flipped byte for
+certain, and the writer's thread takes no time for packing from the control loop.
+
+The records are those of `mcap.records`. `mcap.writer.Writer` is not used: it names a channel in one
+chunk only, lets a chunk grow past its size by a message, and counts a chunk that failed to reach
+the disk into the checksum of the file, which could then not be closed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import struct
+import zlib
+from collections import Counter, deque
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, DataEnd, Footer, Header, McapRecord, Schema, Statistics
+from mcap.records import SummaryOffset as Group
+
+from logs.recording.disk import OutputFile, is_there, segment_path
+from logs.recording.topics import HEADER, LIBRARY, Definition, definition, is_view
+from uavctl.config.types import LogConfig
+
+MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_MESSAGE_FIELDS = 22  # bytes of a message record besides its data
+_OPCODE = int(Opcode.MESSAGE)
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+# Both are written for every chunk, without compression, whose name is an empty text: a length of 0.
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first time, last time, size, CRC-32, compression, size
+_CHUNK_FIELDS = 40
+_CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, start, length, bytes of offsets
+_OFFSET = struct.Struct("<HQ")  # channel, where its index is
+_CHUNK_INDEX_END = struct.Struct("<QIQQ")  # bytes of the indexes, compression, compressed size, size
+_CHUNK_INDEX_FIELDS = 64
+_FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
+
+
+class QueuedMessage(NamedTuple):
+    """A message on its way to the disk."""
+
+    definition: Definition
+    sequence: int
+    at_ns: int
+    data: bytes
+
+
+class _Channel(NamedTuple):
+    """A topic's channel."""
+
+    number: int
+    record: bytes
+
+
+class Segment:
+    """Writer of one MCAP file.
+
+    Args:
+        chunk_bytes: largest chunk [bytes]; only a single larger message makes a larger chunk.
+    """
+
+    def __init__(self, file: OutputFile, chunk_bytes: int) -> None:
+        self._file = file
+        self._chunk_bytes = chunk_bytes
+        self._channels: dict[str, _Channel] = {}
+        self._schemas: dict[str, Schema] = {}
+        # Of a long recording there are many chunks: what the footer says of them is kept as its bytes.
+        self._chunk_indexes = bytearray()
+        self._chunks = 0
+        self._times_ns: tuple[int, int] | None = None  # first and last
+        self._counts: Counter[int] = Counter()
+        self._crc = 0
+        self._begin_chunk()
+        self.open_entries: list[QueuedMessage] = []  # not on the disk yet
+        self.messages = 0  # on the disk
+        self.bytes = 0  # on the disk
+
+    @property
+    def records(self) -> int:
+        """Messages on the disk that were not made for viewers."""
+        counts = self._counts.copy()
+        return sum(counts[one.number] for topic, one in [*self._channels.items()] if not is_view(topic))
+
+    def add(self, entry: QueuedMessage) -> None:
+        """Take a message; writes the open chunk first if it would grow too large.
+
+        Raises:
+            OSError: the chunk could not be written; its messages and this one are in `open_entries`.
+        """
+        channel = self._channels.get(entry.definition.topic)
+        if channel is None:
+            channel, head = self._new_channel(entry.definition)
+        else:
+            head = b"" if channel.number in self._indexes else channel.record
+        size = len(head) + _MESSAGE.size + len(entry.data)
+        full = bool(self.open_entries) and self._size + size > self._chunk_bytes
+        self.open_entries.append(entry)
+        if full:
+            self._commit(self.open_entries[:-1])
+            self.open_entries = [entry]
+            head = head or channel.record
+        self._put(entry, channel.number, head)
+
+    def commit(self) -> None:
+        """Write the open chunk, if there is anything in it.
+
+        Raises:
+            OSError: it could not be written; the file holds what it held before, or part of a chunk.
+        """
+        if self.open_entries:
+            self._commit(self.open_entries)
+            self.open_entries = []
+
+    def sync(self) -> None:
+        """Write the open chunk and wait for the disk."""
+        self.commit()
+        self._file.sync()
+
+    def finish(self) -> None:
+        """Write the open chunk, the index and the footer, wait for the disk, and close the file.
+
+        Raises:
+            OSError: not all of it could be done; `abandon` does what is left.
+        """
+        self.commit()
+        self._file.write(self._tail())
+        self._file.sync()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """After a failed write: cut off what it left behind, add index and footer if there is room, close.
+
+        Raises:
+            OSError: not all of it could be done; the chunks written before are readable all the same.
+        """
+        try:
+            self._file.truncate(self.bytes)
+            try:
+                self._file.write(self._tail())
+            except OSError:
+                self._file.truncate(self.bytes)
+                raise
+        finally:
+            self._file.close()
+
+    def leave(self) -> None:
+        """Close a file that nobody can find any more.
+
+        Raises:
+            OSError: that could not be done.
+        """
+        self._file.close()
+
+    def _begin_chunk(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
+
+    def _new_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
+        """Channel of a new topic, and what must be before its first message."""
+        schema = self._schemas.get(definition.schema_name)
+        head = b""
+        if schema is None and definition.schema_encoding != "":
+            schema = Schema(
+                id=len(self._schemas) + 1,
+                name=definition.schema_name,
+                encoding=definition.schema_encoding,
+                data=definition.schema,
+            )
+            self._schemas[definition.schema_name] = schema
+            head = _bytes(schema)
+        record = Channel(
+            id=len(self._channels) + 1,
+            topic=definition.topic,
+            message_encoding=definition.encoding,
+            schema_id=0 if schema is None else schema.id,
+            metadata={},
+        )
+        channel = self._channels[definition.topic] = _Channel(record.id, _bytes(record))
+        return channel, head + channel.record
+
+    def _put(self, entry: QueuedMessage, channel: int, head: bytes) -> None:
+        data, at_ns, place = entry.data, entry.at_ns, self._size + len(head)
+        index = self._indexes.get(channel)
+        if index is None:
+            self._indexes[channel] = [at_ns, place]
+        else:
+            index += (at_ns, place)
+        fields = _MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel, entry.sequence, at_ns, at_ns)
+        self._parts += (head, fields, data)
+        self._size = place + _MESSAGE.size + len(data)
+
+    def _commit(self, entries: list[QueuedMessage]) -> None:
+        content = b"".join(self._parts)
+        times_ns = [one.at_ns for one in entries]
+        first, last = min(times_ns), max(times_ns)
+        size = len(content)
+        head = _CHUNK.pack(Opcode.CHUNK, _CHUNK_FIELDS + size, first, last, size, zlib.crc32(content), 0, size)
+        length = len(head) + size
+        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        start = self.bytes + len(prefix)
+        at, offsets = start + length, []
+        indexes = []
+        for channel_id, flat in self._indexes.items():
+            offsets.append(_OFFSET.pack(channel_id, at))
+            indexes.append(
+                _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
+                + struct.pack(f"<{len(flat)}Q", *flat)
+            )
+            at += len(indexes[-1])
+        block = b"".join([prefix, head, content, *indexes])
+        self._file.write(block)
+        self._crc = zlib.crc32(block, self._crc)
+        self.bytes += len(block)
+        places = b"".join(offsets)
+        fields = _CHUNK_INDEX_FIELDS + len(places)
+        self._chunk_indexes += _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, fields, first, last, start, length, len(places))
+        self._chunk_indexes += places
+        self._chunk_indexes += _CHUNK_INDEX_END.pack(at - start - length, 0, size, size)
+        self._chunks += 1
+        before = self._times_ns or (first, last)
+        self._times_ns = min(before[0], first), max(before[1], last)
+        self.messages += len(entries)
+        self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
+        self._begin_chunk()
+
+    def _tail(self) -> bytes:
+        """End of the data, summary, footer."""
+        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
+        start = self.bytes + len(data_end)
+        groups = (
+            (Opcode.SCHEMA, _bytes(*self._schemas.values())),
+            (Opcode.CHANNEL, b"".join(channel.record for channel in self._channels.values())),
+            (Opcode.STATISTICS, _bytes(self._statistics())),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+        )
+        summary, offsets = b"", b""
+        for opcode, data in groups:
+            if data:
+                offsets += _bytes(Group(group_opcode=opcode, group_start=start + len(summary), group_length=len(data)))
+            summary += data
+        offset_start = start + len(summary)
+        crc = zlib.crc32(summary + offsets + _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start))
+        footer = _bytes(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
+        return data_end + summary + offsets + footer + MAGIC
+
+    def _statistics(self) -> Statistics:
+        first, last = self._times_ns or (0, 0)
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=self._chunks,
+            message_count=self.messages,
+            message_start_time=first,
+            message_end_time=last,
+            metadata_count=0,
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]  # not annotated in mcap
+    return data
+
+
+@cache
+def _library() -> str:
+    return f"uavctl mcap-records-{version('mcap')}"
+
+
+# A recording's files, one after the other: when the next one is begun, and what goes over to it.
+#
+# A file that has grown to its size is closed and the next one begun (name-2.mcap ...). So it is after a failed write,
+# as well as possible and once the disk takes it; what the failed chunk held goes to the next file.
+
+
+RETRY_S = 1.0  # between tries to begin a file after a failed write
+
+
+class _SegmentPart(NamedTuple):
+    """A file with what was written to it."""
+
+    path: Path
+    messages: int
+    bytes: int
+    records: int  # messages that were not made for viewers
+
+
+class Rotation:
+    """Writer of a recording's files.
+
+    Args:
+        clock: wall time [s].
+
+    Attributes:
+        unwritten: topic, log time [ns] and message of what goes first into the next file.
+        because: why the next file is begun.
+        number: of the file that is open, or comes next.
+        written: messages so far, repeated ones included.
+        at_ns: log time of the newest record.
+        failures: failed writes.
+        reason: of the newest one, or why recording rests.
+        gone: names of files that were written and are no longer there.
+        gone_records: that were in them.
+    """
+
+    def __init__(
+        self, path: Path, log: LogConfig, open_file: Callable[[Path], OutputFile], clock: Callable[[], float]
+    ) -> None:
+        self._path, self._log, self._open_file, self._clock = path, log, open_file, clock
+        self._segment: Segment | None = None
+        self._preface = 0  # records at the start of this segment that only repeat
+        self._repeats: dict[str, bytes] = {}  # header and library, for each segment
+        self._repeats_bytes = 0
+        self._retry_s = clock()
+        self._opened: os.stat_result | None = None  # what the open file is
+        self._done: list[_SegmentPart] = []
+        self.gone: list[str] = []
+        self.gone_records = 0
+        self.unwritten: deque[tuple[str, int, bytes]] = deque()
+        self.because = ""
+        self.number = 1
+        self.written = 0
+        self.at_ns = 0
+        self.failures = 0
+        self.reason = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a file to write to."""
+        return self._segment is not None
+
+    @property
+    def name(self) -> str:
+        """Of the file that is open, or comes next."""
+        return segment_path(self._path, self.number).name
+
+    @property
+    def has_chunk(self) -> bool:
+        """Whether the open file has a chunk on the disk."""
+        segment = self._segment  # asked beside the thread that writes
+        return segment is not None and bool(segment.bytes)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the open file has its bytes beside what every file begins with."""
+        return self._segment is not None and self._segment.bytes >= self._log.segment_bytes + self._repeats_bytes
+
+    @property
+    def may_begin(self) -> bool:
+        """Whether enough time has gone by since a failed write."""
+        return self._clock() >= self._retry_s
+
+    @property
+    def open_messages(self) -> int:
+        """Messages that are in memory only."""
+        segment = self._segment
+        return len(self.unwritten) + (0 if segment is None else len(segment.open_entries))
+
+    def parts(self) -> list[tuple[Path, int, int]]:
+        """Files with at least one chunk: path, messages and bytes on the disk."""
+        segment, done = self._segment, [*self._done]
+        if segment is not None and segment.bytes:
+            done.append(self._part(segment))
+        return [(one.path, one.messages, one.bytes) for one in done]
+
+    def look(self) -> None:
+        """See whether what was written is still where it was made.
+
+        Raises:
+            OSError: the open file is not; closed ones are remembered as gone.
+        """
+        for part in [*self._done]:
+            if not is_there(part.path, part.bytes):
+                self._done.remove(part)
+                self._lose(part)
+        if self._segment is not None and not self._is_there(self._segment):
+            raise FileNotFoundError(errno.ENOENT, "the file was deleted, moved or replaced", self.name)
+
+    def try_again(self) -> None:
+        """A file may be begun at once."""
+        self._retry_s = self._clock()
+
+    def begin(self, tell: Callable[[str], object]) -> None:
+        """Open the next file; a later one than the first repeats header and library.
+
+        Raises:
+            OSError: it cannot be opened or written.
+        """
+        path = segment_path(self._path, self.number)
+        path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
+        self._segment = Segment(self._open_file(path), self._log.chunk_bytes)
+        self._opened = path.stat()
+        self._preface = 0
+        if self.number > 1:
+            self._preface = 1 + len(self._repeats)
+            self._repeat(HEADER)
+            tell(self.because)
+            self._repeat(LIBRARY)
+
+    def write(self, topic: str, at_ns: int, data: bytes) -> None:
+        """Add a message to the open file.
+
+        Raises:
+            OSError: a chunk could not be written; `fail` keeps what it held, this message included.
+        """
+        self.written += 1
+        self._open_segment().add(QueuedMessage(definition(topic), self.written, at_ns, data))
+
+    def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
+        """Add a record's message; header and library are kept for later files.
+
+        Raises:
+            OSError: as `write`.
+        """
+        self.at_ns = at_ns
+        if topic in (HEADER, LIBRARY):
+            self._repeats[topic] = data
+            self._repeats_bytes = sum(map(len, self._repeats.values()))
+        self.write(topic, at_ns, data)
+
+    def write_unwritten(self) -> None:
+        """Add what has to go first.
+
+        Raises:
+            OSError: as `write`.
+        """
+        while self.unwritten:
+            self.write(*self.unwritten.popleft())
+
+    def commit(self) -> None:
+        """Hand the open chunk to the operating system.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        self._open_segment().commit()
+
+    def sync(self) -> None:
+        """Write the open chunk and wait until the disk has it.
+
+        Raises:
+            OSError: that could not be done.
+        """
+        self._open_segment().sync()
+
+    def finish(self) -> None:
+        """Close the open file with index and footer.
+
+        Raises:
+            OSError: not all of it could be done.
+        """
+        segment = self._open_segment()
+        segment.finish()
+        self._retire(segment, there=self._is_there(segment))
+
+    def fail(self, error: OSError) -> None:
+        """After a failed write: keep what the open chunk held, and close the file as well as possible."""
+        self.failures += 1
+        self.reason = str(error)
+        self.because = f"after a failed write: {self.reason}"
+        self._retry_s = self._clock() + RETRY_S
+        segment = self._segment
+        if segment is None:
+            return  # it could not even be opened
+        self.written -= len(segment.open_entries)  # they are numbered anew
+        kept = segment.open_entries[max(0, self._preface - segment.messages) :]
+        self.unwritten.extendleft((one.definition.topic, one.at_ns, one.data) for one in reversed(kept))
+        # what abandon cannot do is no second alarm: whole chunks are readable without it
+        there = self._is_there(segment)
+        with contextlib.suppress(OSError):
+            segment.abandon() if there else segment.leave()
+        self._retire(segment, there=there)
+
+    def _repeat(self, topic: str) -> None:
+        if topic in self._repeats:
+            self.write(topic, self.at_ns, self._repeats[topic])
+
+    def _open_segment(self) -> Segment:
+        assert self._segment is not None  # who calls has asked is_open
+        return self._segment
+
+    def _part(self, segment: Segment) -> _SegmentPart:
+        return _SegmentPart(segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records)
+
+    def _lose(self, part: _SegmentPart) -> None:
+        self.gone.append(part.path.name)
+        self.gone_records += part.records
+
+    def _is_there(self, segment: Segment) -> bool:
+        return is_there(segment_path(self._path, self.number), segment.bytes, self._opened)
+
+    def _retire(self, segment: Segment, *, there: bool) -> None:
+        part = self._part(segment)
+        if segment.bytes:
+            if there:
+                self._done.append(part)
+            else:
+                self._lose(part)
+            self.number += 1
+        else:
+            try:
+                part.path.unlink(missing_ok=True)
+            except OSError:
+                self.number += 1  # the name stays taken
+        self._segment = None

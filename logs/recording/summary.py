@@ -1,0 +1,421 @@
+"""Summary: figures of a flight; how it ended."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from logs.recording.design_view import Box, Floats
+from logs.recording.flight import FLOWN, FlightData
+from uavctl.config.mission import FenceConfig
+from uavctl.labels import duration, number, percent_above
+from uavctl.outcome import Cause, lacking, make_ending
+from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
+
+# How a recorded flight ended: the daemon's own last word, or what its records tell where there is none.
+
+
+_LANDED = frozenset({Cause.FALLBACK, Cause.ORDERED, Cause.MISSION})
+_IN_FLIGHT = {
+    ControlMode.BRAKE: "the recording ends while the fallback was braking",
+    ControlMode.HOLD: "the recording ends while the fallback held zero acceleration",
+}
+
+
+def ending_of(flight: FlightData) -> Ending:
+    """How a flight ended; older recordings, torn ones and parts of a flight do not say it themselves."""
+    if flight.endings:
+        return flight.endings[-1]
+    cause = _cause(flight)
+    return make_ending(cause, _sentence(flight, cause))
+
+
+def _cause(flight: FlightData) -> Cause:
+    modes = [decision.mode for decision in flight.flown]
+    if flight.breach is not None:
+        return Cause.LET_GO
+    if ControlMode.LAND in modes:  # for one tick; nobody flies after it
+        if flight.landing is None:
+            return Cause.FALLBACK
+        return Cause.ORDERED if flight.landing.ordered else Cause.MISSION
+    if not modes or modes[-1] is ControlMode.WAIT:
+        return Cause.WAITING
+    return Cause.IN_FLIGHT if flight.stopped_ns is None else Cause.OPERATOR
+
+
+def _sentence(flight: FlightData, cause: Cause) -> str:
+    last = (flight.flown or flight.decisions)[-1]
+    if flight.breach is not None:
+        return f"{cause.value} after {_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}"
+    if cause in _LANDED:
+        landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
+        return f"{cause.value} after {_seconds(flight, landed_ns)}"
+    if cause is Cause.WAITING:
+        return f"at the end the controller was waiting: {last.reason}"
+    if flight.stopped_ns is not None:
+        return f"{cause.value} after {_seconds(flight, flight.stopped_ns)}; {_hand_over(flight)}"
+    if flight.landing is not None and last.mode in _IN_FLIGHT:
+        return "the recording ends while the vehicle was brought to rest, to land"
+    return _IN_FLIGHT.get(last.mode, "at the end a plan was being flown")
+
+
+def _hand_over(flight: FlightData) -> str:
+    """What the controller did after the operator's stop."""
+    modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
+    if ControlMode.LAND in modes:
+        return "the vehicle was handed over to its own landing"
+    if ControlMode.STOPPED in modes:
+        return "the vehicle was handed over"
+    return "the recording ends before the vehicle was handed over"
+
+
+def _seconds(flight: FlightData, at_ns: int) -> str:
+    return f"{number(float(flight.seconds([at_ns])[0]))} s"
+
+
+# The limits of the state over a flight: constant ones, and fences that closed in.
+
+
+def limits_at(flight: FlightData, t_s: Floats) -> Floats:
+    """Right sides of the state set's rows (n, m_x) at times of the report (n,) [s]."""
+    design, begun_s = flight.design, flight.targets[0][0]
+    limits = np.tile(np.array(design.b_x), (len(t_s), 1))
+    for fence in _fences(flight):
+        state, box = fence.state, design.state_box
+        if isinstance(state, str):
+            state = design.position_index[design.axes.index(state)]
+        row = int((box.row_upper if fence.side == "upper" else box.row_lower)[state])
+        moving = np.interp(t_s - begun_s, fence.times_s, fence.values) * design.c_x[row][state]
+        limits[:, row] = np.minimum(limits[:, row], moving)
+    return limits
+
+
+def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
+    """Axis-parallel limits of the states, lower and upper (n, n_x); infinite where a side is open."""
+    design, limits = flight.design, limits_at(flight, t_s)
+    sides = []
+    box: Box = design.state_box
+    for rows, constant in ((box.row_lower, box.lower), (box.row_upper, box.upper)):
+        side = np.tile(constant, (len(t_s), 1))
+        for state in np.flatnonzero(rows >= 0):
+            row = int(rows[state])
+            side[:, state] = limits[:, row] / design.c_x[row][state]
+        sides.append(side)
+    return sides[0], sides[1]
+
+
+def _fences(flight: FlightData) -> Iterator[FenceConfig]:
+    """Fences of the configuration that the flight was made with; none if it cannot be read any more."""
+    try:
+        found = tomllib.loads(flight.header.config_toml).get("fence", [])
+        yield from msgspec.convert(found, tuple[FenceConfig, ...])
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError):
+        return
+
+
+# What a flight came to: the figures that people and scripts look at.
+
+
+RELATIVE_TOLERANCE = 1e-9
+# MAVLink carries setpoints as 32-bit floats: an input at its limit may come out one rounding beyond.
+WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
+SLACK_TOLERANCE = 1e-6
+SETTLED_SHARE = 0.25
+BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, what is told of the place is a prediction
+
+
+class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles of a duration [µs]; None when nothing was measured."""
+
+    p50: float | None = None
+    p99: float | None = None
+    max: float | None = None
+
+
+class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one flight; the field names are the keys of `--json`.
+
+    A step is flown when the controller is in charge at its Δt boundary (tracking, braking or
+    holding); waiting, the vehicle's own landing and the time after the hand-over do not count.
+    """
+
+    steps: int  # flown Δt boundaries
+    duration_s: float  # first tick to the end of the last
+    received: int  # positions: sent - lost when simulated, else samples accepted; in a part of a flight, those of it
+    lost: int | None  # positions that the simulated channel lost; None for a real flight
+    max_age: int  # largest age of information at a flown boundary [steps]
+    fallbacks: int  # entries into braking, holding or landing that nobody wanted
+    state_violations: int  # flown boundaries with the state outside its set
+    input_violations: int  # flown boundaries with the input outside its set
+    slack_used: int  # flown plans in which a constraint or the terminal equality gave way
+    cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru, with the target of the moment
+    recording: str | None
+    report: str | None
+    wall_s: float | None  # None when it is not known any more
+    decision_us: Percentiles  # time in the core, ticks with a solve (all ticks if there was none)
+    tick_lateness_us: Percentiles
+    state_source: str  # "truth", or "estimate" when the true state is unknown
+    real_time_factor: float | None  # duration_s / wall_s
+    accepted: int  # samples that the estimator took
+    rejected: int  # samples that it refused
+    solves: int
+    failed_solves: int  # ended otherwise than optimal
+    methods: dict[str, int]  # plans by how they were found
+    largest_gap: float | None  # of a plan's cost above its certified lower bound, relative; None without a plan
+    missed_ticks: int
+    max_age_s: float  # largest age of the newest sample at a flown tick
+    dt_s: float  # length of a step
+    trajectory: bool  # whether the target of the moment was a trajectory's; else a waypoint, or an ordered place
+    settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
+    final_error_m: float | None  # distance from the target at the last flown boundary
+    final_age_s: float | None  # age of the newest position there
+    final_std_m: float | None  # largest standard deviation of the estimated position there, in any direction
+    recorder_dropped: int  # records that the disk was too slow for
+    ended: str  # the cause of its end, in a phrase
+    ending: Ending  # the whole of it: cause, whether as ordered, in one sentence, and the exit code
+    let_go: str | None  # why the envelope let the vehicle go
+    breaks_off: bool = False  # the recording was not closed in order
+
+
+def summarise(
+    flight: FlightData,
+    *,
+    wall_s: float | None,
+    recording: str | None = None,
+    report: str | None = None,
+    recorder_dropped: int = 0,
+    ending: Ending | None = None,
+) -> FlightSummary:
+    """Figures of a flight.
+
+    `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day, and so
+    is `ending`, which the recording tells then.
+    """
+    if ending is None:
+        ending = lacking(ending_of(flight), recorder_dropped, "")
+    steps = flight.steps
+    flown = [d for d in flight.flown if d.mode in FLOWN]
+    flown_ns = {d.at_ns for d in flown}
+    accepted = sum(d.accepted for d in flight.decisions)
+    received, lost = _channel(flight)
+    solves = [d.solve for d in flight.decisions if d.solve is not None]
+    error_m = position_error_m(flight)
+    settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
+    return FlightSummary(
+        steps=len(steps),
+        duration_s=round(flight.duration_s, 9),
+        received=max(received, accepted),  # the last truth may be older than the last position
+        lost=lost,
+        max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
+        fallbacks=_fallback_entries(flight),
+        state_violations=int(np.count_nonzero(state_outside(flight))),
+        input_violations=int(np.count_nonzero(input_outside(flight))),
+        slack_used=sum(
+            plan.slack > SLACK_TOLERANCE or plan.terminal_miss > SLACK_TOLERANCE for plan in flight.flown_plans.values()
+        ),
+        cost=_cost(flight),
+        recording=recording,
+        report=report,
+        wall_s=wall_s,
+        decision_us=spread(decision_times_us(flight)),
+        tick_lateness_us=spread(np.array([timing.lateness_ns for timing in flight.timings]) * 1e-3),
+        state_source="truth" if steps.from_truth else "estimate",
+        real_time_factor=flight.duration_s / wall_s if wall_s else None,
+        accepted=accepted,
+        rejected=sum(d.rejected for d in flight.decisions),
+        solves=len(solves),
+        failed_solves=sum(status is not SolveStatus.OPTIMAL for status in solves),
+        methods=dict(sorted(Counter(plan.method for plan in flight.plans).items())),
+        largest_gap=max((plan.gap for plan in flight.plans if np.isfinite(plan.gap)), default=None),
+        missed_ticks=sum(d.missed_ticks for d in flight.decisions),
+        max_age_s=max((e.age_s for e in flight.estimates if e.at_ns in flown_ns), default=0.0),
+        dt_s=flight.design.dt_s,
+        trajectory=flight.moving_target,
+        settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
+        final_error_m=float(error_m[-1]) if len(error_m) else None,
+        final_age_s=None if flight.last_flown is None else flight.last_flown.age_s,
+        final_std_m=_position_std_m(flight),
+        recorder_dropped=recorder_dropped,
+        ended=ending.cause,
+        ending=ending,
+        let_go=None if flight.breach is None else flight.breach.text,
+        breaks_off=flight.breaks_off,
+    )
+
+
+def _position_std_m(flight: FlightData) -> float | None:
+    """Largest standard deviation of the position at the last flown boundary, by the estimate itself [m]."""
+    if flight.last_flown is None:
+        return None
+    index = list(flight.design.position_index)
+    cov = np.array(flight.last_flown.cov)[np.ix_(index, index)]
+    return float(np.sqrt(max(np.linalg.eigvalsh(cov)[-1], 0.0)))
+
+
+def predicted_only(summary: FlightSummary) -> str:
+    """Why the last distance is a prediction, and how far it is trusted; empty where a position is behind it."""
+    s = summary
+    if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
+        return ""
+    trusted = "" if s.final_std_m is None else f", standard deviation {number(s.final_std_m)} m by its own account"
+    return f"predicted only: the newest position was {number(s.final_age_s)} s old{trusted}"
+
+
+def _channel(flight: FlightData) -> tuple[int, int | None]:
+    """Positions that the simulated channel brought and lost, in this part of the flight; 0 and None without one."""
+    if not flight.truths:
+        return 0, None
+    first, last = flight.truths[0], flight.truths[-1]
+    sent, lost = (last.sent - first.sent, last.lost - first.lost) if flight.part else (last.sent, last.lost)
+    return sent - lost, lost
+
+
+def _methods(s: FlightSummary) -> str:
+    """How plans were found, and how far from the optimum the worst is certified to be."""
+    if not s.methods:
+        return "none"
+    certified = "" if s.largest_gap is None else f"; certified gap at most {percent_above(s.largest_gap)} of the cost"
+    return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
+
+
+def position_error_m(flight: FlightData) -> Floats:
+    """Distance from the target of the moment at each flown boundary (n,) [m]."""
+    index = list(flight.design.position_index)
+    return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
+
+
+def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which flown boundaries have the state outside its set or beyond a fence (n,); no number is outside."""
+    limits = limits_at(flight, flight.steps.t_s)
+    return _outside(flight.steps.state, flight.design.c_x, limits, RELATIVE_TOLERANCE)
+
+
+def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which flown boundaries have the input, as decided or as applied, outside its set (n,)."""
+    design, steps = flight.design, flight.steps
+    given = ~np.isnan(steps.decided).any(axis=1)
+    outside = given & _outside(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
+    if steps.from_truth:
+        outside |= _outside(steps.input, design.c_u, design.b_u, WIRE_TOLERANCE)
+    return outside
+
+
+def decision_times_us(flight: FlightData) -> Floats:
+    """Time in the core (n,) [µs] of the ticks that solved; of all ticks if none did."""
+    solved = {d.tick for d in flight.decisions if d.solve is not None}
+    times = [timing.step_ns for timing in flight.timings if timing.tick in solved]
+    return np.array(times or [timing.step_ns for timing in flight.timings]) * 1e-3
+
+
+def spread(values_us: Floats) -> Percentiles:
+    """Median, 99th percentile and maximum."""
+    if not len(values_us):
+        return Percentiles()
+    p50, p99 = np.percentile(values_us, [50, 99])
+    # To the nanosecond that was measured: more digits are the division's.
+    return Percentiles(p50=round(float(p50), 3), p99=round(float(p99), 3), max=round(float(values_us.max()), 3))
+
+
+def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
+    """The summary as a table for a terminal, followed by other (name, value)."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in (*rows(summary), *more):
+        table.add_row(name, Text(value))  # paths and names may look like markup
+    return table
+
+
+def rows(summary: FlightSummary) -> list[tuple[str, str]]:
+    """The summary as (name, value) for people."""
+    s = summary
+    lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
+    seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
+    found = [
+        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
+        ("Ended", f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
+        *((("Relay", s.ending.relay),) if s.ending.relay else ()),
+        *(() if s.let_go is None else (("Let go", s.let_go),)),
+        ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
+        ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
+        ("Fallbacks", str(s.fallbacks)),
+        ("State outside limits", f"{count(s.state_violations, 'step')}{_share(s.state_violations, s.steps)}{seen}"),
+        ("Input outside limits", f"{count(s.input_violations, 'step')}{_share(s.input_violations, s.steps)}"),
+        ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
+        ("Plans found", _methods(s)),
+        ("Cost", f"{s.cost:.6g}{seen}"),
+        (f"Distance from {'trajectory' if s.trajectory else 'target'}", _distance(s)),
+        ("Decision time", _times(s.decision_us)),
+        _punctuality(s),
+    ]
+    if s.recorder_dropped:
+        found.append(("Recording", f"{s.recorder_dropped} records dropped: the disk was too slow"))
+    found += [(name, path) for name, path in (("Recorded in", s.recording), ("Report", s.report)) if path]
+    return found
+
+
+def _pace(s: FlightSummary) -> str:
+    if s.wall_s is None:
+        return ""
+    speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
+    return f" in {number(s.wall_s)} s{speed}"
+
+
+def _punctuality(s: FlightSummary) -> tuple[str, str]:
+    if s.tick_lateness_us.max == 0 and not s.missed_ticks:
+        return "Clock", "virtual time"
+    return "Tick lateness", f"{_times(s.tick_lateness_us)}; {s.missed_ticks} ticks missed"
+
+
+def _distance(s: FlightSummary) -> str:
+    if s.final_error_m is None or s.settled_error_m is None:
+        return "not flown"
+    final, settled = number(s.final_error_m), number(s.settled_error_m)
+    blind = predicted_only(s)
+    final = f"{final} m at the last flown step{f' ({blind})' if blind else ''}"
+    return f"{final}; {settled} m over the last quarter (rms)"
+
+
+def _share(part: int, whole: int) -> str:
+    return f" ({100 * part / whole:.3g} %)" if part and whole else ""
+
+
+def _times(times: Percentiles) -> str:
+    if times.p50 is None or times.p99 is None or times.max is None:
+        return "not measured"
+    return f"median {duration(times.p50)}, 99 % {duration(times.p99)}, largest {duration(times.max)}"
+
+
+def count(amount: int, noun: str) -> str:
+    """An amount with its noun, e.g. "1 step"."""
+    return f"{amount} {noun}{'' if amount == 1 else 's'}"
+
+
+def _fallback_entries(flight: FlightData) -> int:
+    fallen = {d.tick for d in flight.fallen}
+    inside = [d.tick in fallen for d in flight.flown]
+    return sum(b and not a for a, b in pairwise([False, *inside]))
+
+
+def _outside(
+    values: Floats, c: Matrix, b: Vector | Floats, tolerance: float
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Rows of `values` (n, m) outside {v | c v <= b}, b one for all or for each, by more than a relative tolerance."""
+    normals = np.array(c).reshape(-1, values.shape[1])
+    limit = np.array(b)
+    return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
+
+
+def _cost(flight: FlightData) -> float:
+    """Closed-loop cost (3), summed over the flown boundaries."""
+    design, steps = flight.design, flight.steps
+    x = steps.state - steps.target
+    u = steps.input
+    return float(np.sum((x @ np.array(design.q_x)) * x) + np.sum((u @ np.array(design.q_u)) * u))

@@ -1,0 +1,473 @@
+""".tlog: read, written, replayed; clocks of other programs."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import tomllib
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from logs.recording.export import Watch, known_number, unwatched
+from logs.recording.outputs import all_or_none, check_free, unfinished
+from logs.recording.reader import RecordedMessage, good_messages, header
+from logs.recording.summary import count
+from logs.recording.topics import raw_link
+from uavctl.errors import RecordingError, UsageError
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import STREAM_SCHEMES
+from uavctl.mavlink.framing import scan
+from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput
+
+# The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
+
+
+# Clocks are set by hand, by a GPS or by a server; what is no more than this is order, or a silence.
+FARTHEST_BACK_NS = 1_000_000_000
+LONGEST_SILENCE_NS = 3600 * 1_000_000_000
+_TOLD_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
+
+
+class SteadyClock:
+    """Times that go on where the recorder's clock leaps.
+
+    After a leap time goes on from the last one before it. When the stamps come back to what they were (a single one
+    was wrong), so do the times. A stamp of zero among others is none: the time is that of the last.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns = self._former_ns = 0
+        self._last_ns: int | None = None  # the latest time given
+        self._stamps = self._zeros = self._missing = self._backward = self._leaps = 0
+        self._farthest_ns = self._silence_ns = 0
+
+    def expects(self, stamp_ns: int) -> bool:
+        """Whether a stamp may follow the others without a leap; not before the first."""
+        return self._fitting(stamp_ns) is not None
+
+    def steady(self, stamp_ns: int) -> int:
+        """The time of what was stamped so, in the order of the recording [ns]."""
+        self._stamps += 1
+        self._zeros += stamp_ns == 0
+        if self._last_ns is None:
+            self._last_ns = stamp_ns
+        offset_ns = self._fitting(stamp_ns)
+        if offset_ns is None and stamp_ns == 0:
+            self._missing += 1
+            return self._last_ns
+        if offset_ns is None:
+            offset_ns = self._last_ns - stamp_ns
+        if offset_ns != self._offset_ns:
+            self._leaps += 1
+            self._farthest_ns = max(self._farthest_ns, abs(offset_ns - self._offset_ns))
+            self._former_ns, self._offset_ns = self._offset_ns, offset_ns
+        at_ns = stamp_ns + offset_ns
+        self._backward += at_ns < self._last_ns
+        self._silence_ns = max(self._silence_ns, at_ns - self._last_ns)
+        self._last_ns = max(self._last_ns, at_ns)
+        return at_ns
+
+    def check(self, name: str) -> None:
+        """Refuse stamps that say nothing.
+
+        Raises:
+            RecordingError: There are several, and all are zero.
+        """
+        if self._zeros == self._stamps > 1:
+            raise RecordingError(f"{name}: all {self._stamps} time stamps are zero, so nobody knows what came when")
+
+    def notes(self, name: str) -> tuple[str, ...]:
+        """What was odd about the stamps, in sentences."""
+        found = []
+        if self._leaps:
+            found.append(
+                f"{name}: its clock leaps ({count(self._leaps, 'time')}, by up to {self._farthest_ns * 1e-9:.0f} s); "
+                "taken as if it had gone on"
+            )
+        if self._missing:
+            found.append(f"{name}: {count(self._missing, 'time stamp')} of zero; taken for the time before")
+        if self._backward:
+            found.append(f"{name}: {count(self._backward, 'time stamp')} not in order; put in order")
+        if self._silence_ns > _TOLD_SILENCE_NS:
+            found.append(f"{name}: nothing in it for {self._silence_ns * 1e-9:.0f} s")
+        return tuple(found)
+
+    def _fitting(self, stamp_ns: int) -> int | None:
+        """Which of the last two offsets a stamp goes with [ns]; None if neither."""
+        if self._last_ns is None:
+            return None
+        for offset_ns in (self._offset_ns, self._former_ns):
+            if -FARTHEST_BACK_NS <= stamp_ns + offset_ns - self._last_ns <= LONGEST_SILENCE_NS:
+                return offset_ns
+        return None
+
+
+# Reader of `.tlog` files: 8 bytes of big-endian microseconds since the epoch before each packet.
+
+
+GROUND_SYSTEMS = frozenset({245, 255})  # our own system id, and that of ground stations
+_STAMP = struct.Struct(">Q")
+_STX_V1, _STX_V2 = MARKERS = 0xFE, 0xFD  # first byte of a frame
+_SIGNED = 0x01
+_LAST_STAMP_US = 2**63 // 1000  # later ones have no place in 64 bits of nanoseconds
+
+
+@dataclass(frozen=True)
+class TlogPacket:
+    """One packet; `outgoing` is guessed from its system id (a ground station's counts as ours)."""
+
+    at_ns: int  # since the epoch, up to a leap of the recorder's clock
+    data: bytes
+    outgoing: bool
+
+
+@dataclass(frozen=True)
+class Tlog:
+    """Packets of a `.tlog` in order of time, and what of the file they are not."""
+
+    packets: tuple[TlogPacket, ...]
+    torn_bytes: int  # of an unfinished packet at the end
+    skipped_bytes: int  # between packets
+    clock_notes: tuple[str, ...] = ()
+
+    def __iter__(self) -> Iterator[TlogPacket]:
+        return iter(self.packets)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, and what was odd about the clock, in sentences."""
+        found = list(self.clock_notes)
+        if self.skipped_bytes:
+            found.append(f"{count(self.skipped_bytes, 'byte')} between its packets left out: no packet with a stamp")
+        if self.torn_bytes:
+            found.append(f"the recording is torn within a packet: its last {count(self.torn_bytes, 'byte')} left out")
+        return tuple(found)
+
+
+def read_tlog(path: Path) -> Tlog:
+    """All packets of a file; unknown message ids are kept, checksums are the parser's affair.
+
+    Raises:
+        RecordingError: The file cannot be read, holds no packet, or no time stamp but zero.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    packets: list[TlogPacket] = []
+    clock = SteadyClock()
+    at = skipped = 0
+    while at + _STAMP.size + 3 <= len(data):
+        begin = at + _STAMP.size
+        length = frame_length(data, begin)
+        end = begin + length
+        expected = bool(length) and clock.expects(_stamp_us(data, at) * 1000)
+        if expected and end > len(data):
+            break
+        if expected or (length and _believed(data, at, end)):
+            packets.append(packet_of(clock.steady(_stamp_us(data, at) * 1000), data[begin:end]))
+            at = end
+        else:
+            at += 1
+            skipped += 1
+    if not packets:
+        raise RecordingError(f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?")
+    clock.check(str(path))
+    return Tlog(in_order(packets), torn_bytes=len(data) - at, skipped_bytes=skipped, clock_notes=clock.notes(path.name))
+
+
+def frame_length(data: bytes, at: int) -> int:
+    """Bytes of the frame that begins at `at`, by its head; 0 if none does."""
+    if at + 3 > len(data):
+        return 0
+    if data[at] == _STX_V2:
+        return 12 + data[at + 1] + (13 if data[at + 2] & _SIGNED else 0)
+    if data[at] == _STX_V1:
+        return 8 + data[at + 1]
+    return 0
+
+
+def packet_of(at_ns: int, data: bytes) -> TlogPacket:
+    """A packet with its direction guessed; one that is too short to name a system is taken for incoming."""
+    place = 5 if data[0] == _STX_V2 else 3
+    return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > place and data[place] in GROUND_SYSTEMS)
+
+
+def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
+    """The packets in order of time; those of the same time as they were."""
+    return tuple(sorted(packets, key=lambda packet: packet.at_ns))
+
+
+def is_frame(data: bytes) -> bool:
+    """Whether bytes are one frame of a known id with the right checksum."""
+    frames = scan(data, final=True).frames
+    return len(frames) == 1 and len(frames[0].data) == len(data)
+
+
+def _stamp_us(data: bytes, at: int) -> int:
+    return int(_STAMP.unpack_from(data, at)[0])
+
+
+def _believed(data: bytes, at: int, end: int) -> bool:
+    """Whether a packet is one whose stamp does not go with the last: by its checksum, or by the packet after it."""
+    if end > len(data) or _stamp_us(data, at) >= _LAST_STAMP_US:
+        return False
+    if is_frame(data[at + _STAMP.size : end]):
+        return True
+    follows = frame_length(data, end + _STAMP.size) > 0
+    return follows and abs(_stamp_us(data, end) - _stamp_us(data, at)) * 1000 <= LONGEST_SILENCE_NS
+
+
+# The raw MAVLink of a recording as a `.tlog`: each packet after 8 bytes of big-endian microseconds since the epoch.
+
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_HEAD_BYTES = 3  # of a packet: enough to know its length
+_OUT_OF_ORDER_NS = 1_000_000_000  # packets are put in order of time over such a span
+
+
+class ExportedTlog(msgspec.Struct, frozen=True, kw_only=True):
+    """What was written of a recording."""
+
+    file: str
+    packets: dict[str, int]  # by connection and direction
+    left_out_bytes: int  # that are no packet: garbage, and packets that were cut
+
+
+def export_tlog(
+    flight: Path, file: Path, *, link: str | None = None, force: bool = False, watch: Watch = unwatched
+) -> ExportedTlog:
+    """Write the packets of all connections, or of one, in both directions.
+
+    Packets with a wrong checksum or an unknown id are kept: a recording holds what crossed the connection.
+
+    Raises:
+        RecordingError: The recording cannot be read, has no header (which maps its times to UTC) or no packet, or the
+            file cannot be written.
+        UsageError: There is no such connection, or the file exists and is not to be overwritten.
+    """
+    first = header(flight)
+    began_us = _began_us(flight, first)
+    check_free([file], force=force)
+    packets: Counter[str] = Counter()
+    raw = _Raw(_streams(first))
+    with all_or_none([file]), unfinished([file]) as parts, parts[file].open("wb") as out:
+        messages = watch(good_messages(flight), known_number(flight), "writing")
+        for at_ns, topic, packet in _in_order(raw.packets(messages, link)):
+            out.write(_STAMP.pack(began_us + (at_ns - first.started_ns) // 1000) + packet)
+            packets[topic] += 1
+        if link is not None and link not in raw.links:
+            there = f"it has {', '.join(sorted(raw.links))}" if raw.links else "it has none"
+            raise UsageError(f"{flight}: no bytes of a connection {link!r} in it; {there}")
+        if not packets:
+            raise RecordingError(f"{flight}: no MAVLink packet in it, so there is nothing to export")
+    return ExportedTlog(file=str(file), packets=dict(sorted(packets.items())), left_out_bytes=raw.left_out_bytes)
+
+
+class _Raw:
+    """Cuts the raw bytes of connections into packets.
+
+    Args:
+        streams: connections that carry a stream of bytes, whose chunks end anywhere.
+    """
+
+    def __init__(self, streams: frozenset[str]) -> None:
+        self._streams = streams
+        self._rest: dict[str, bytes] = {}  # of a stream: the packet that its last chunk ended in
+        self._skipped_bytes = 0
+        self.links: set[str] = set()
+
+    @property
+    def left_out_bytes(self) -> int:
+        """Bytes so far that were no packet."""
+        return self._skipped_bytes + sum(map(len, self._rest.values()))
+
+    def packets(self, messages: Iterable[RecordedMessage], wanted: str | None) -> Iterator[tuple[int, str, bytes]]:
+        """Time [ns], topic and bytes of each packet of the wanted connection, or of all."""
+        for message in messages:
+            topic = message.definition.topic
+            raw = raw_link(topic)
+            if raw is None:
+                continue
+            link, _ = raw
+            self.links.add(link)
+            if wanted in (None, link):
+                data = self._rest.pop(topic, b"") + message.data
+                yield from ((message.at_ns, topic, packet) for packet in self._cut(topic, data, link in self._streams))
+
+    def _cut(self, topic: str, data: bytes, goes_on: bool) -> Iterator[bytes]:
+        at = 0
+        while at < len(data):
+            end = _packet_end(data, at)
+            if end is None and goes_on:
+                self._rest[topic] = data[at:]
+                return
+            if end is not None and end > at:
+                yield data[at:end]
+                at = end
+            else:
+                self._skipped_bytes += 1
+                at += 1
+
+
+def _packet_end(data: bytes, at: int) -> int | None:
+    """Where the packet that begins at `at` ends; `at` if none does, None if it goes on beyond the data.
+
+    It is believed to be one if another follows, or nothing; else only by its checksum.
+    """
+    if data[at] not in MARKERS:
+        return at
+    if at + _HEAD_BYTES > len(data):
+        return None
+    end = at + frame_length(data, at)
+    if end > len(data):
+        return None
+    good = end == len(data) or data[end] in MARKERS or bool(scan(data[at:end], final=True).frames)
+    return end if good else at
+
+
+def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, bytes]]:
+    """The packets in order of time: what comes in and what goes out is recorded each by itself."""
+    waiting: list[tuple[int, int, str, bytes]] = []
+    for number, (at_ns, topic, packet) in enumerate(packets):
+        heapq.heappush(waiting, (at_ns, number, topic, packet))
+        while waiting[0][0] < at_ns - _OUT_OF_ORDER_NS:
+            first = heapq.heappop(waiting)
+            yield first[0], first[2], first[3]
+    yield from ((first[0], first[2], first[3]) for first in sorted(waiting))
+
+
+def _began_us(flight: Path, first: Header) -> int:
+    """When the recording began [µs since the epoch]."""
+    try:
+        began = datetime.fromisoformat(first.started_utc)
+    except ValueError as error:
+        raise RecordingError(f"{flight}: its header has no usable start time ({error})") from error
+    return ((began if began.tzinfo else began.replace(tzinfo=UTC)) - _EPOCH) // timedelta(microseconds=1)
+
+
+def _streams(first: Header) -> frozenset[str]:
+    """Connections that carry a stream of bytes, by the configuration that was flown with."""
+    try:
+        urls = tomllib.loads(first.config_toml).get("daemon", {})
+    except tomllib.TOMLDecodeError:
+        return frozenset()
+    return frozenset(name for name, url in urls.items() if isinstance(url, str) and url.startswith(STREAM_SCHEMES))
+
+
+# A foreign flight as input: a `.tlog` through parser, clock offset, estimator and controller.
+
+
+class DelayQuantiles(msgspec.Struct, frozen=True, kw_only=True):
+    """Spread of a figure."""
+
+    min: float
+    p05: float
+    p50: float
+    p95: float
+    max: float
+
+
+class ForeignReplay(msgspec.Struct, frozen=True, kw_only=True):
+    """What the controller made of somebody else's recording."""
+
+    datagrams: int
+    positions: int
+    out_of_order: int
+    accepted: int
+    rejected: int
+    ticks: int
+    decisions: int
+    solves: dict[str, int]
+    modes: dict[str, int]
+    left_out: dict[str, int]  # what the connection did not take, by reason
+    age_ms: DelayQuantiles | None  # capture -> arrival, after clock conversion
+    age_steps: dict[str, int]  # at Δt boundaries
+
+
+class _Collector:
+    """Sink that keeps the figures and forgets the records."""
+
+    def __init__(self) -> None:
+        self.samples: list[PositionSample] = []
+        self.decisions: list[Decision] = []
+        self.stats: dict[str, LinkStats] = {}  # the last of each connection
+        self.over = False  # the flight is, and only the counters are waited for
+
+    def put(self, _topic: str, _at_ns: int, record: Record) -> None:
+        if isinstance(record, LinkStats):
+            self.stats[record.link] = record
+        elif self.over:
+            return
+        elif isinstance(record, StepInput):
+            self.samples.extend(record.samples)
+        elif isinstance(record, Decision):
+            self.decisions.append(record)
+
+
+def replay_tlog(
+    packets: Iterable[tuple[int, bytes]], make_loop: Callable[[Sink], ControlLoop], *, link: str, tick_ns: int
+) -> ForeignReplay:
+    """Feed incoming packets to a loop on a virtual grid of ticks.
+
+    Args:
+        packets: (arrival [ns], bytes) in order of arrival, without the client's own.
+        make_loop: builds the loop around the given sink.
+        link: name of the connection that they came over.
+        tick_ns: grid of the control loop [ns].
+    """
+    collector = _Collector()
+    loop = make_loop(collector)
+    datagrams = tick = 0
+    start_ns: int | None = None
+    for at_ns, data in packets:
+        start_ns = at_ns if start_ns is None else start_ns
+        while start_ns + tick * tick_ns < at_ns:
+            deque(loop.tick(tick, start_ns + tick * tick_ns), maxlen=0)
+            tick += 1
+        loop.receive(link, data, at_ns)
+        datagrams += 1
+    if start_ns is None:
+        return _figures(collector, link, datagrams, tick)
+    end_ns = start_ns + tick * tick_ns
+    deque(loop.tick(tick, end_ns), maxlen=0)  # sees the last packets
+    tick += 1
+    collector.over, later = True, tick
+    while collector.stats[link].at_ns < end_ns:  # they are told once a second
+        deque(loop.tick(later, start_ns + later * tick_ns), maxlen=0)
+        later += 1
+    return _figures(collector, link, datagrams, tick)
+
+
+def _figures(collector: _Collector, link: str, datagrams: int, ticks: int) -> ForeignReplay:
+    captured = np.array([s.captured_ns for s in collector.samples], dtype=np.int64)
+    age_ms = np.array([(s.received_ns - s.captured_ns) * 1e-6 for s in collector.samples])
+    boundaries = [d for d in collector.decisions if d.boundary]
+    ages = Counter(d.age_steps for d in boundaries if d.age_steps is not None)
+    return ForeignReplay(
+        datagrams=datagrams,
+        positions=len(captured),
+        out_of_order=int(np.count_nonzero(np.diff(captured) < 0)),
+        accepted=sum(d.accepted for d in collector.decisions),
+        rejected=sum(d.rejected for d in collector.decisions),
+        ticks=ticks,
+        decisions=len(boundaries),
+        solves=dict(Counter(d.solve.value for d in collector.decisions if d.solve is not None)),
+        modes=dict(Counter(d.mode.value for d in collector.decisions)),
+        left_out=dict(sorted(collector.stats[link].bad.items())) if link in collector.stats else {},
+        age_ms=_quantiles(age_ms),
+        age_steps={str(age): count for age, count in sorted(ages.items())},
+    )
+
+
+def _quantiles(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> DelayQuantiles | None:
+    if not len(values):
+        return None
+    low, p05, p50, p95, high = (float(q) for q in np.quantile(values, [0.0, 0.05, 0.5, 0.95, 1.0]))
+    return DelayQuantiles(min=low, p05=p05, p50=p50, p95=p95, max=high)

@@ -1,0 +1,451 @@
+"""The topics of a recording: one row each.
+
+Raw MAVLink bytes have one topic a connection and direction; everything else is one record type,
+written as JSON with its JSON Schema. Beside these stand the topics made for viewers, as protobuf
+(`logs.recording.derived_topics`); nothing is decided, replayed or reported from them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+import typing
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from typing import cast
+
+import msgspec
+import numpy as np
+
+from logs.recording.derived_topics import VIEWS, DerivedTopic
+from uavctl.errors import RecordingError
+from uavctl.records import (
+    Checked,
+    Datagram,
+    Decision,
+    Ending,
+    Estimate,
+    Event,
+    Header,
+    LinkEstimate,
+    LinkStats,
+    Plan,
+    PolicyLibrary,
+    Record,
+    Refused,
+    RelayStats,
+    Setpoint,
+    StepInput,
+    Timing,
+    Truth,
+    VehicleStatus,
+    raw_topic,
+)
+
+HEADER = "/uavctl/header"
+LIBRARY = "/uavctl/library"
+ENDED = "/uavctl/end"
+RECORDER = "/uavctl/recorder"
+# How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
+# process was killed, the power failed, the disk took no more, or the file was cut.
+END = "end"  # all is in it that was not told as dropped or refused
+GOES_ON = "goes on in the next file"  # the file was full
+RECOVERED = "recovered from "  # by a recovery, of a recording with holes or without an end
+HOLES = "messages lost"  # in that: some are missing before the last one
+NO_END = "its end is missing"  # in that: some may be missing after the last one
+
+
+class RecorderNote(Record, frozen=True, kw_only=True):
+    """What the recorder says of itself: at the start of a segment, after drops, and at the end."""
+
+    at_ns: int
+    segment: int  # 1 is the first file
+    written: int  # records in the segments so far
+    dropped: int  # records so far that found the queue full
+    refused: int  # records so far that could not be encoded
+    failures: int  # failed writes so far
+    text: str
+
+
+@dataclass(frozen=True)
+class Definition:
+    """How a topic is written: message encoding, and a schema unless the bytes speak for themselves."""
+
+    topic: str
+    encoding: str
+    schema_name: str = ""
+    schema_encoding: str = ""
+    schema: bytes = b""
+
+    @cached_property
+    def for_viewers(self) -> bool:
+        """Whether the topic was made for viewers: it holds nothing that the records do not."""
+        return is_view(self.topic)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of JSON records of one type."""
+
+    name: str
+    record: type[Record]
+    text: str
+
+    @cached_property
+    def definition(self) -> Definition:
+        """Encoding and JSON Schema; the schema's top level is the object itself, as viewers want it."""
+        return Definition(
+            topic=self.name,
+            encoding="json",
+            schema_name=f"uavctl.{self.record.__name__}",
+            schema_encoding="jsonschema",
+            schema=msgspec.json.encode(_schema(self.record)),
+        )
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic(HEADER, Header, "configuration, design, seed, versions; first message of every segment"),
+    Topic(LIBRARY, PolicyLibrary, "policies that are decided with, as base64; again in every segment"),
+    Topic("/uavctl/step_input", StepInput, "all that a tick knew; replay starts from here"),
+    Topic("/uavctl/estimate", Estimate, "state estimate of a tick"),
+    Topic("/uavctl/plan", Plan, "answer of the predictive controller, when one was made"),
+    Topic("/uavctl/decision", Decision, "what a tick chose, and why"),
+    Topic("/uavctl/setpoint", Setpoint, "acceleration setpoint after the last gate"),
+    Topic("/uavctl/vehicle", VehicleStatus, "the vehicle's mode and state, as it tells"),
+    Topic("/uavctl/event", Event, "something worth telling a person"),
+    Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
+    Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
+    Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
+    Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
+    Topic("/uavctl/relay", RelayStats, "positions that were passed on to the vehicle, once a second, if any are"),
+    Topic("/uavctl/link_estimate", LinkEstimate, "what is believed of the link that carries the positions"),
+    Topic(ENDED, Ending, "how the flight ended, once, before the recording is closed"),
+    Topic("/sim/truth", Truth, "the simulator's own state, in simulated flights"),
+    Topic(RECORDER, RecorderNote, "the recorder's own account: segments, drops, failed writes"),
+)
+_BY_NAME = {topic.name: topic for topic in TOPICS}
+_VIEW_BY_NAME = {view.name: view for view in VIEWS}
+_RAW = re.compile(r"/raw/([^/]+)/(in|out)")
+_RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
+
+
+@lru_cache(maxsize=256)
+def raw_link(topic: str) -> tuple[str, bool] | None:
+    """Connection name and whether outgoing, of a raw topic; None for any other topic."""
+    match = _RAW.fullmatch(topic)
+    return None if match is None else (match[1], match[2] == "out")
+
+
+def is_view(topic: str) -> bool:
+    """Whether a topic was made for viewers: it holds nothing that the records do not."""
+    return topic in _VIEW_BY_NAME
+
+
+def record_type(topic: str) -> type[Record]:
+    """Record type of a topic.
+
+    Raises:
+        KeyError: there is no such topic.
+    """
+    return Datagram if raw_link(topic) is not None else _BY_NAME[topic].record
+
+
+@lru_cache(maxsize=256)
+def definition(topic: str) -> Definition:
+    """How a topic is written.
+
+    Raises:
+        KeyError: there is no such topic.
+    """
+    if raw_link(topic) is not None:
+        return Definition(topic=topic, encoding="mavlink")
+    if topic in _VIEW_BY_NAME:
+        view = _VIEW_BY_NAME[topic]
+        return Definition(topic, "protobuf", view.schema_name, "protobuf", view.schema)
+    return _BY_NAME[topic].definition
+
+
+def topics_page() -> str:
+    """The page docs/topics.md, made from the rows."""
+    lines = [
+        "# Topics of a recording",
+        "",
+        "MCAP, log times in nanoseconds of the recorder's monotonic clock. Numbers are written with the digits",
+        'that give the same float back; NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`;',
+        "`null` is only ever a missing value.",
+        "",
+        "| topic | record | encoding | what it is |",
+        "|---|---|---|---|",
+        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | mavlink | {_RAW_TEXT} |",
+        *(f"| `{topic.name}` | `{topic.record.__name__}` | json | {topic.text} |" for topic in TOPICS),
+        "",
+    ]
+    for topic in TOPICS:
+        lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
+        properties = cast("dict[str, dict[str, object]]", _schema(topic.record)["properties"])
+        lines += [f"| `{name}` | {_type_text(schema)} |" for name, schema in properties.items()]
+        lines.append("")
+    return "\n".join([*lines, *_views_section()])
+
+
+def _views_section() -> list[str]:
+    lines = [
+        "# Topics for viewers",
+        "",
+        "Made from the records above while they are written, for programs that show recordings",
+        "([viewers.md](viewers.md) says how to open one); protobuf, with the schemas inside the file. A replay and a",
+        "report never read them. Places are local NED, in the frame `ned`; the frame `room` (axes: east, north, up)",
+        "is the one to look from. Log times are those of the records. NaN: there is no number.",
+        "",
+        "| topic | schema | what it is |",
+        "|---|---|---|",
+        *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
+        "",
+    ]
+    for view in VIEWS:
+        if issubclass(view.kind, Record):
+            lines += _message_section(view, view.kind)
+    return lines
+
+
+def _message_section(view: DerivedTopic, kind: type[Record]) -> list[str]:
+    fields = msgspec.structs.fields(kind)
+    return [
+        f"## `{view.name}`",
+        "",
+        (kind.__doc__ or "").strip(),
+        "",
+        "| field | type |",
+        "|---|---|",
+        *(f"| `{field.name}` | `{field.type.__name__}` |" for field in fields),
+        "",
+    ]
+
+
+def _schema(record: type[Record]) -> dict[str, object]:
+    (reference,), parts = msgspec.json.schema_components([record], schema_hook=_anything, ref_template="#/$defs/{name}")
+    name = cast("str", reference["$ref"]).rpartition("/")[2]
+    top: dict[str, object] = parts.pop(name)
+    return {**top, "$defs": parts} if parts else top
+
+
+def _anything(kind: type) -> dict[str, object]:
+    """Schema of a value of any type, which msgspec cannot make itself."""
+    if kind is object:
+        return {"description": "any JSON value"}
+    raise NotImplementedError(kind)
+
+
+def _type_text(schema: dict[str, object]) -> str:
+    """One field's type in words."""
+    if "$ref" in schema:
+        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`"
+    if "anyOf" in schema:
+        return " or ".join(_type_text(one) for one in cast("list[dict[str, object]]", schema["anyOf"]))
+    kind = cast("str", schema.get("type", "any"))
+    if kind == "array":
+        return f"array of {_type_text(_items(schema))}"
+    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
+        return f"object of {_type_text(cast('dict[str, object]', schema['additionalProperties']))}"
+    return kind
+
+
+def _items(schema: dict[str, object]) -> dict[str, object]:
+    fixed = cast("list[dict[str, object]]", schema.get("prefixItems", []))
+    return fixed[0] if fixed else cast("dict[str, object]", schema["items"])
+
+
+# Records as exact JSON.
+#
+# Floats keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
+# and no infinity (msgspec would write null, which reads back as "missing"), so these are the strings
+# "NaN", "Infinity" and "-Infinity", read back as floats wherever the record's type has a float. Where
+# it has any value at all (`Header.design`) they stay strings.
+
+
+_MAX_TIME_NS = 2**64 - 1
+_NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
+
+class EncodingError(RecordingError):
+    """A value cannot be written so that it reads back the same."""
+
+
+def _plain(value: object) -> object:
+    """Plain numbers of a numpy value that slipped into a record."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise NotImplementedError
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+# MessagePack keeps the eight bytes of each float behind 0xcb: where the exponent has all bits set, it is not finite.
+# Other values may have such bytes too, which costs time only.
+_BINARY = msgspec.msgpack.Encoder(enc_hook=_plain)
+_NON_FINITE_BYTES = re.compile(rb"\xcb[\x7f\xff][\xf0-\xff]", re.DOTALL)
+
+
+def encode(record: Record) -> bytes:
+    """Bytes of a record: a datagram's own, JSON of any other.
+
+    Raises:
+        EncodingError: the record holds something that JSON cannot give back.
+    """
+    if isinstance(record, Datagram):
+        return record.data
+    try:
+        if not _is_seen_to_be_non_finite(record):
+            data = _ENCODER.encode(record)
+            # msgspec writes every non-finite float as null: without one, all is said.
+            if b"null" not in data or not _may_be_non_finite(record):
+                return data
+        return _ENCODER.encode({field: _spelled(getattr(record, field)) for field in record.__struct_fields__})
+    except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
+        raise EncodingError(f"{type(record).__name__}: {error}") from error
+
+
+def alike(one: Record, other: Record) -> bool:
+    """Whether two records of a type are surely the same in every bit; cheaper than to look where they differ."""
+    binary = _exact(one)
+    return binary is not None and binary == _exact(other)
+
+
+def says(record: Record, message: bytes) -> bool:
+    """Whether a message is surely this record, in every bit: its bytes are those that it would be recorded as."""
+    try:
+        return encode(record) == message
+    except EncodingError:
+        return False
+
+
+def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
+    """Bytes of a record that a reader will get back from under this topic and log time [ns].
+
+    Raises:
+        RecordingError: it would not, and why.
+    """
+    try:
+        expected = record_type(topic)
+    except KeyError:
+        raise RecordingError(f"there is no topic {topic}") from None
+    if type(record) is not expected:
+        raise RecordingError(f"topic {topic} takes {expected.__name__}, not {type(record).__name__}")
+    if isinstance(record, Datagram) and topic != raw_topic(record.link, outgoing=record.outgoing):
+        raise RecordingError(f"topic {topic} is not that of connection {record.link}")
+    if not 0 <= at_ns <= _MAX_TIME_NS:
+        raise RecordingError(f"topic {topic}: time {at_ns} ns does not fit a recording")
+    return encode(record)
+
+
+def decode(topic: str, data: bytes, at_ns: int) -> Record:
+    """Record of a message.
+
+    Args:
+        at_ns: its log time, which is a datagram's time [ns].
+
+    Raises:
+        RecordingError: no such topic, or the bytes are no record of its type.
+    """
+    raw = raw_link(topic)
+    if raw is not None:
+        return Datagram(at_ns=at_ns, link=raw[0], outgoing=raw[1], data=data)
+    try:
+        kind = record_type(topic)
+        if b'NaN"' not in data and b'Infinity"' not in data:
+            return _decoder(kind).decode(data)
+        return msgspec.convert(_restore(msgspec.json.decode(data), kind), kind)
+    except KeyError as error:
+        raise RecordingError(f"topic {topic} is not known to this version") from error
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"topic {topic}, log time {at_ns} ns: {error}") from error
+
+
+@cache
+def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
+    return msgspec.json.Decoder(kind)
+
+
+def _exact(value: object) -> bytes | None:
+    """A value's bytes with those of its floats; None if an integer is too large for that."""
+    try:
+        return _BINARY.encode(value)
+    except OverflowError:
+        return None
+
+
+def _is_seen_to_be_non_finite(record: Record) -> bool:
+    """Whether a field that is a float says so at once, as the gap of most plans does."""
+    values = [getattr(record, name) for name in _float_fields(type(record))]
+    return any(type(value) is float and not math.isfinite(value) for value in values)
+
+
+@cache
+def _float_fields(kind: type[Record]) -> tuple[str, ...]:
+    return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is float)
+
+
+def _may_be_non_finite(value: object) -> bool:
+    binary = _exact(value)
+    return binary is None or _NON_FINITE_BYTES.search(binary) is not None
+
+
+def _spelled(value: object) -> object:
+    """A record's field with non-finite floats spelled out; the numbers of a plan without any are not gone through."""
+    if isinstance(value, tuple) and not _may_be_non_finite(value):
+        return value
+    return _spell(msgspec.to_builtins(value, enc_hook=_plain))
+
+
+def _spell(value: object) -> object:
+    """The same tree with non-finite floats spelled out."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    if isinstance(value, dict):
+        return {key: _spell(one) for key, one in value.items()}
+    if isinstance(value, tuple | list):
+        return [_spell(one) for one in value]
+    return value
+
+
+def _restore(value: object, kind: object) -> object:
+    """The tree with spelled floats put back, where the type has a float (text stays text)."""
+    if isinstance(value, str):
+        return _NON_FINITE.get(value, value) if float in _alternatives(kind) else value
+    if isinstance(value, list):
+        return [_restore(one, item) for one, item in zip(value, _item_types(kind, len(value)), strict=True)]
+    if isinstance(value, dict):
+        return {key: _restore(one, _field_type(kind, key)) for key, one in value.items()}
+    return value
+
+
+@cache
+def _alternatives(kind: object) -> tuple[object, ...]:
+    """Members of a union; the type itself if it is none."""
+    if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+        return typing.get_args(kind)
+    return (kind,)
+
+
+def _item_types(kind: object, count: int) -> tuple[object, ...]:
+    for one in _alternatives(kind):
+        if typing.get_origin(one) is tuple:
+            args = typing.get_args(one)
+            items = args[:1] * count if args[-1] is Ellipsis else args
+            # a wrong length is told by the conversion that follows
+            return items if len(items) == count else (object,) * count
+    return (object,) * count
+
+
+def _field_type(kind: object, key: str) -> object:
+    for one in _alternatives(kind):
+        if typing.get_origin(one) is dict:
+            return typing.get_args(one)[1]
+        if isinstance(one, type) and issubclass(one, msgspec.Struct):
+            return _fields(one).get(key, object)
+    return object
+
+
+@cache
+def _fields(kind: type[msgspec.Struct]) -> dict[str, object]:
+    return {field.encode_name: field.type for field in msgspec.structs.fields(kind)}

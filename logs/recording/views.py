@@ -1,0 +1,452 @@
+"""3D scenes of a flight in Foxglove's messages. All of it is local NED; viewers turn it (topic /view/frames).
+
+The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each
+depth.
+Those of which there is one a stage are filled in (`Many`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import product
+from typing import Any, TypeVar
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from logs.recording import derived_topics as plots
+from logs.recording import derived_topics as topics
+from logs.recording.derived_topics import pack, tightened
+from logs.recording.design_view import AXIS_NUMBER, DesignView, design_view
+from logs.recording.topics import RecorderNote
+from uavctl.frames import axes_turn, from_axes
+from uavctl.records import (
+    ControlMode,
+    Datagram,
+    Decision,
+    Estimate,
+    Event,
+    Header,
+    LinkEstimate,
+    LinkStats,
+    Matrix,
+    Plan,
+    Record,
+    Setpoint,
+    Severity,
+    SolveStatus,
+    StepInput,
+    Timing,
+    Truth,
+    Vec3,
+    VehicleStatus,
+)
+
+# Many parts of a message that differ by their numbers alone: made by filling in the bytes of one of them.
+
+
+Floats = NDArray[np.float64]
+
+
+class Many:
+    """Bytes of a repeated field, to be merged into the message that has it.
+
+    Args:
+        made: A message with the field once, and nothing else; the argument is the part's numbers (k,), doubles all.
+    """
+
+    def __init__(self, made: Callable[[Sequence[float]], Message], count: int) -> None:
+        marks = [math.pi * (1 + i) for i in range(count)]
+        data = made(marks).SerializeToString()
+        self._one = np.frombuffer(data, dtype=np.uint8)
+        starts = [data.index(np.array(mark, dtype="<f8").tobytes()) for mark in marks]
+        self._at = np.add.outer(starts, np.arange(8)).ravel()
+
+    def of(self, numbers: Floats) -> bytes:
+        """The field with a part for each row of the numbers (n, k)."""
+        rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
+        rows[:] = self._one
+        rows[:, self._at] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
+        return rows.tobytes()
+
+
+Fields = dict[str, Any]  # of a message within another
+M = TypeVar("M", bound=Message)
+
+ROOM, NED, VEHICLE = "room", "ned", "vehicle"  # east-north-up; local NED; at the vehicle's estimated place
+OPEN_M = 5.0  # an open side of the room is drawn so far from the target
+# Square root of the 0.95 quantile of chi squared with three degrees of freedom: what an estimate's ellipsoid holds.
+STD_95 = 2.7955
+
+
+def _colour(red: float, green: float, blue: float, alpha: float) -> Fields:
+    return {"r": red, "g": green, "b": blue, "a": alpha}
+
+
+_LIMITS, _TIGHT = _colour(0.9, 0.9, 0.9, 0.9), _colour(1.0, 0.65, 0.1, 0.8)
+_PLANNED, _SPREAD = _colour(0.25, 0.6, 1.0, 1.0), _colour(0.25, 0.6, 1.0, 0.15)
+_FLOWN, _MEASURED = _colour(0.2, 0.85, 0.4, 1.0), _colour(0.85, 0.3, 0.85, 0.8)
+_NEWS, _SILENCE, _FALLBACK = _colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _colour(0.95, 0.2, 0.2, 0.9)
+_LEVEL: Fields = {"w": 1.0}
+_LABEL_M = (0.0, 0.0, -0.35)  # above the vehicle: down is positive
+_IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
+_LEVELS = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
+_EDGES = [  # corners whose numbers differ in one bit
+    corner for first, second in product(range(8), repeat=2) if first < second and (first ^ second) in (1, 2, 4)
+    for corner in (first, second)
+]  # fmt: skip
+
+
+def _made(kind: Callable[..., M], **fields: Any) -> M:
+    """A message of its fields; the types of constructors know only of messages in messages."""
+    return kind(**fields)
+
+
+def stamp(at_ns: int) -> Fields:
+    """A time of our clock."""
+    return {"seconds": at_ns // 1_000_000_000, "nanos": at_ns % 1_000_000_000}
+
+
+def vector(at_m: Sequence[float]) -> Fields:
+    """Three numbers, as a vector or a point."""
+    return {"x": at_m[0], "y": at_m[1], "z": at_m[2]}
+
+
+def pose(at_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
+    """A place [m] and a turn."""
+    return {"position": vector(at_m), "orientation": turn}
+
+
+def quaternion(turn: Sequence[float]) -> Fields:
+    """A turn (w, x, y, z)."""
+    w, x, y, z = turn
+    return {"x": x, "y": y, "z": z, "w": w}
+
+
+def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
+    """A place in local NED [m]."""
+    return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
+
+
+def poses_in_frame(at_ns: int, places_m: Floats) -> PosesInFrame:
+    """Places in local NED [m] (n, 3), in order."""
+    message = _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED)
+    message.MergeFromString(_POSES.of(places_m))
+    return message
+
+
+def frames(at_ns: int) -> FrameTransforms:
+    """How local NED lies in the room's frame, whose z axis points up as viewers want it."""
+    turned: Fields = {
+        "timestamp": stamp(at_ns),
+        "parent_frame_id": ROOM,
+        "child_frame_id": NED,
+        "translation": {},
+        "rotation": quaternion(axes_turn("enu")),
+    }
+    return _made(FrameTransforms, transforms=[turned])
+
+
+def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
+    """Where the vehicle is estimated to be; its attitude is not known, so the axes stay those of local NED."""
+    return _made(
+        FrameTransform,
+        timestamp=stamp(at_ns),
+        parent_frame_id=NED,
+        child_frame_id=VEHICLE,
+        translation=vector(at_m),
+        rotation=_LEVEL,
+    )
+
+
+def log_line(event: Event) -> Log:
+    """An event."""
+    times = "" if event.count == 1 else f" ({event.count} times)"
+    return _made(
+        Log, timestamp=stamp(event.at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
+    )
+
+
+def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
+    """Limits of the position, as a box."""
+    lower, upper = _sides(design, design.state_box.lower, design.state_box.upper)
+    return _update(_entity(at_ns, "limits", lines=[_box(lower, upper, _LIMITS)]))
+
+
+def plan_scene(
+    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Floats | None = None
+) -> SceneUpdate:
+    """A plan's predicted path, its confidence ellipsoids, and what its back-offs leave of the limits.
+
+    A stage's ellipsoid has the back-offs of the position limits as semi-axes: what the plan keeps
+    from them so that they hold with the promised probability. The estimate's is from its covariance.
+    `places` are the positions of the plan's states, where they are at hand.
+    """
+    places = design.positions_of(plan.states) if places is None else places
+    spread = np.concatenate([places, 2.0 * _reach(design, plan.backoff_x)], axis=1)
+    lower, upper = _sides(design, *tightened(design, plan.backoff_x, -1))
+    entities = [
+        _entity(at_ns, "predicted path", lines=[_line((), _PLANNED, 3.0)]),
+        _entity(at_ns, "predicted spread"),
+        _entity(at_ns, "limits less back-offs", lines=[_box(lower, upper, _TIGHT)]),
+    ]
+    if estimate is not None:
+        entities.append(_entity(at_ns, "estimate, 95 %", spheres=[_estimate_sphere(design, estimate)]))
+    scene = _update(*entities)
+    scene.entities[0].lines[0].MergeFromString(_POINTS.of(places))
+    scene.entities[1].MergeFromString(_SPHERES.of(spread))
+    return scene
+
+
+def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
+    """What was flown and measured lately."""
+    return _update(
+        _entity(at_ns, "flown path", lines=[_line(flown_m, _FLOWN, 3.0)]),
+        _entity(at_ns, "measured path", lines=[_line(measured_m, _MEASURED, 1.5)]),
+    )
+
+
+def link_scene(design: DesignView, decision: Decision) -> SceneUpdate:
+    """The link's state at the vehicle: green with news, amber in silence, red in the fallback; and in words."""
+    colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
+    age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
+    label: Fields = {
+        "pose": pose(_LABEL_M),
+        "billboard": True,
+        "font_size": 14.0,
+        "scale_invariant": True,
+        "color": colour,
+        "text": f"{decision.mode.value}, {age}",
+    }
+    ball: Fields = {"pose": pose((0.0, 0.0, 0.0)), "size": vector((0.2, 0.2, 0.2)), "color": colour}
+    return _update(_entity(decision.at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
+
+
+def _update(*entities: Fields) -> SceneUpdate:
+    return _made(SceneUpdate, entities=entities)
+
+
+def _entity(
+    at_ns: int,
+    name: str,
+    frame: str = NED,
+    *,
+    lines: Sequence[Fields] = (),
+    spheres: Sequence[Fields] = (),
+    texts: Sequence[Fields] = (),
+) -> Fields:
+    return {
+        "timestamp": stamp(at_ns),
+        "frame_id": frame,
+        "id": name,
+        "frame_locked": True,
+        "lines": lines,
+        "spheres": spheres,
+        "texts": texts,
+    }
+
+
+def _line(places_m: Iterable[Sequence[float]], colour: Fields, pixels: float) -> Fields:
+    return {
+        "type": LinePrimitive.LINE_STRIP,
+        "pose": pose((0.0, 0.0, 0.0)),
+        "thickness": pixels,
+        "scale_invariant": True,
+        "points": [vector(at_m) for at_m in places_m],
+        "color": colour,
+    }
+
+
+def _box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
+    line = _line(product(*zip(lower, upper, strict=True)), colour, 1.5)
+    return {**line, "type": LinePrimitive.LINE_LIST, "indices": _EDGES}
+
+
+def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3]:
+    """Sides of the room in local NED; open ones near the target, and flat in axes that the plant has not."""
+    centre = np.array(design.target)
+    return (
+        design.position_of(np.where(np.isfinite(lower), lower, centre - OPEN_M).tolist()),
+        design.position_of(np.where(np.isfinite(upper), upper, centre + OPEN_M).tolist()),
+    )
+
+
+def _reach(design: DesignView, backoff: Matrix) -> Floats:
+    """Semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
+    rows = np.array(backoff)
+    reach = np.zeros((len(rows), len(design.target)))
+    for state, row, size in design.position_rows:
+        np.maximum(reach[:, state], rows[:, row] / size, out=reach[:, state])
+    return design.positions_of(reach)
+
+
+def _sphere(at: Fields, semi_axes_m: Sequence[float]) -> Fields:
+    return {"pose": at, "size": vector([2 * one for one in semi_axes_m]), "color": _SPREAD}
+
+
+def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
+    """Ellipsoid that holds the position with 95 %, from the covariance."""
+    cov = [[0.0] * 3 for _ in range(3)]
+    places = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
+    for row, i in places:
+        for column, j in places:
+            cov[row][column] = estimate.cov[i][j]
+    variances, directions = np.linalg.eigh(cov)
+    semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
+    turn = quaternion(from_axes(directions.T.tolist()))
+    return _sphere(pose(design.position_of(estimate.mean), turn), semi_axes_m.tolist())
+
+
+_POSES = Many(lambda at_m: _made(PosesInFrame, poses=[pose(at_m)]), 3)
+_POINTS = Many(lambda at_m: _made(LinePrimitive, points=[vector(at_m)]), 3)
+_SPHERES = Many(
+    lambda of: _made(SceneEntity, spheres=[{"pose": pose(of[:3]), "size": vector(of[3:]), "color": _SPREAD}]), 6
+)
+
+
+# Makes the topics for viewers from the records of a flight, as they come.
+#
+# It runs where recordings are written, never in the control thread.
+
+
+STILL_NS = 5_000_000_000  # what does not move is told again: for viewers that come late, and files begun later
+TRAIL_NS = 1_000_000_000
+TRAIL_S = 20.0
+_TRAIL_POINTS = 200  # at most, however fast positions come
+_Item = tuple[str, Message]
+
+
+class Views:
+    """Makes messages for viewers; one for each recording, since paths and the newest estimate are remembered."""
+
+    def __init__(self) -> None:
+        self._design: DesignView | None = None
+        self._estimate: Estimate | None = None
+        self._flown = _Trail()
+        self._measured = _Trail()
+        self._true_path = False
+        self._still_ns = self._trail_ns = 0
+
+    def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        """Topic and message of what a record gives rise to, in order; nothing before a header.
+
+        Args:
+            at_ns: log time of the record, and of what is made of it [ns].
+
+        Raises:
+            RecordingError: a header whose design cannot be used: no views come of this recording.
+            ValueError, TypeError: the record holds something that has no place in a view.
+            LookupError: its arrays do not fit the design.
+        """
+        if isinstance(record, Header):
+            self._design, self._still_ns = design_view(record), at_ns
+        if self._design is None or isinstance(record, Datagram):  # half of all records
+            return []
+        views = [*self._views(self._design, at_ns, record)]
+        made = [(topic, view.SerializeToString()) for topic, view in views]
+        made += [(topics.PLOTS[type(plot)], pack(plot)) for plot in self._plots(self._design, record)]
+        return made
+
+    def _plots(self, design: DesignView, record: Record) -> Iterator[Record]:
+        match record:
+            case Decision():
+                captured_ns = None if self._estimate is None else self._estimate.captured_ns
+                yield plots.age_plot(design, record, captured_ns)
+                yield plots.input_plot(design, record)
+            case Estimate():
+                yield plots.state_plot(design, record)
+            case Setpoint():
+                yield plots.setpoint_plot(record)
+            case Timing():
+                yield plots.timing_plot(record)
+            case Plan():
+                yield plots.solve_plot(record)
+                if record.status is SolveStatus.OPTIMAL:
+                    yield plots.limits_plot(design, record)
+            case LinkEstimate():
+                yield plots.link_plot(record)
+            case LinkStats():
+                yield plots.counter_plot(record)
+            case Truth():
+                yield plots.truth_plot(record)
+            case VehicleStatus():
+                yield plots.vehicle_plot(record)
+
+    def _views(self, design: DesignView, at_ns: int, record: Record) -> Iterator[_Item]:
+        match record:
+            case Header() | Decision():
+                yield from self._still(design, at_ns)
+                if isinstance(record, Decision):
+                    yield from self._decision(design, record)
+            case Estimate():
+                self._estimate = record
+                at_m = design.position_of(record.mean)
+                if not self._true_path:
+                    self._flown.add(record.at_ns, at_m)
+                yield topics.ESTIMATE, pose_in_frame(record.at_ns, at_m)
+                yield topics.VEHICLE_FRAME, vehicle_frame(record.at_ns, at_m)
+            case Truth():
+                self._true_path = True
+                self._flown.add(record.at_ns, record.position_m)
+                yield topics.TRUTH, pose_in_frame(record.at_ns, record.position_m)
+            case StepInput():
+                for sample in record.samples:
+                    self._measured.add(record.at_ns, sample.position_m)
+                    yield topics.MEASURED, pose_in_frame(sample.captured_ns, sample.position_m)
+            case Plan() if record.status is SolveStatus.OPTIMAL:
+                places = design.positions_of(record.states)
+                yield topics.PLAN, poses_in_frame(at_ns, places)
+                yield topics.PLAN_SCENE, plan_scene(at_ns, design, record, self._estimate, places)
+            case Event():
+                yield topics.LOG, log_line(record)
+            case RecorderNote():
+                told = Event(at_ns=at_ns, severity=Severity.WARNING, code="recording", text=record.text)
+                yield topics.LOG, log_line(told)
+
+    def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
+        """What does not move, when it is due."""
+        if at_ns >= self._still_ns:
+            self._still_ns = at_ns + STILL_NS
+            yield topics.FRAMES, frames(at_ns)
+            yield topics.ROOM_SCENE, room_scene(at_ns, design)
+
+    def _decision(self, design: DesignView, decision: Decision) -> Iterator[_Item]:
+        if decision.boundary:
+            yield topics.LINK_SCENE, link_scene(design, decision)
+            if decision.target is not None:
+                target_m = design.position_of(decision.target)
+                yield topics.TARGET, pose_in_frame(decision.at_ns, target_m)
+        if decision.at_ns >= self._trail_ns:
+            self._trail_ns = decision.at_ns + TRAIL_NS
+            since_ns = decision.at_ns - round(TRAIL_S * 1e9)
+            yield (
+                topics.PATH_SCENE,
+                path_scene(decision.at_ns, self._flown.since(since_ns), self._measured.since(since_ns)),
+            )
+
+
+class _Trail:
+    """Places of the last while."""
+
+    def __init__(self) -> None:
+        self._places: deque[tuple[int, Vec3]] = deque(maxlen=_TRAIL_POINTS)
+
+    def add(self, at_ns: int, at_m: Vec3) -> None:
+        """Take a place, unless the last one was there only just before."""
+        if not self._places or at_ns - self._places[-1][0] >= TRAIL_S * 1e9 / _TRAIL_POINTS:
+            self._places.append((at_ns, at_m))
+
+    def since(self, at_ns: int) -> list[Vec3]:
+        """Places since a time."""
+        return [at_m for told_ns, at_m in self._places if told_ns >= at_ns]

@@ -1,0 +1,1 @@
+"""Pages of flights: verdicts, plots, sentences."""

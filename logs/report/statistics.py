@@ -1,0 +1,113 @@
+"""Tests of what a flight shows against what was promised: exact where there is an exact one, never simulated."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from scipy.special import betainc, betaincinv, chdtrc, gammaincc, gammaincinv, ndtr, ndtri
+
+from logs.recording.design_view import Floats
+
+# Confidence of all intervals of one table together: a right promise is called broken in one flight of a hundred.
+LEVEL = 0.99
+
+
+class Share(msgspec.Struct, frozen=True, kw_only=True):
+    """How often something happened, with the exact interval of its probability (Clopper and Pearson, 1934)."""
+
+    hits: int
+    trials: int
+    low: float
+    high: float
+
+    @property
+    def rate(self) -> float:
+        """Hits over trials; 0 without trials."""
+        return self.hits / self.trials if self.trials else 0.0
+
+
+def share(hits: int, trials: int, tests: int = 1, worth: float = 1.0) -> Share:
+    """A count with its interval; without trials that is all from 0 to 1.
+
+    Args:
+        hits: Number of trials in which it happened.
+        tests: Number of intervals that are to hold together with `LEVEL` (Bonferroni).
+        worth: Independent trials that each one is worth; 1 where they are independent.
+
+    Raises:
+        ValueError: More hits than trials, or fewer than none.
+    """
+    if not 0 <= hits <= trials:
+        raise ValueError(f"{hits} of {trials} is no share")
+    low, high = exact_interval(worth * hits, worth * trials, 0.5 * (1.0 - LEVEL) / tests)
+    return Share(hits=hits, trials=trials, low=low, high=high)
+
+
+def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, float]:
+    """Interval of a probability by quantiles of the beta distribution (Clopper and Pearson, 1934).
+
+    Args:
+        hits: Independent trials in which it happened; parts of one where a trial is worth less than one.
+        tail: Probability, at most, that it lies below the interval; the same for above.
+    """
+    low = float(betaincinv(hits, trials - hits + 1.0, tail)) if hits else 0.0
+    high = float(betaincinv(hits + 1.0, trials - hits, 1.0 - tail)) if hits < trials else 1.0
+    return low, high
+
+
+def at_least(hits: int, trials: int, probability: float) -> float:
+    """P(X >= hits) for X binomial: how likely so many are, if each has `probability` at most."""
+    if hits <= 0:
+        return 1.0
+    return float(betainc(hits, trials - hits + 1, probability))
+
+
+def two_sided_normal(z: float) -> float:
+    """P(|Z| >= |z|) for Z standard normal."""
+    return float(2.0 * ndtr(-abs(z)))
+
+
+def normal_reach(tests: int = 1) -> float:
+    """z with P(|Z| > z) = (1 - LEVEL) / tests."""
+    return float(-ndtri(0.5 * (1.0 - LEVEL) / tests))
+
+
+def variance_bounds(count: int, tests: int = 1) -> tuple[float, float]:
+    """What the mean of `count` squared standard normal numbers is within, by the χ² distribution."""
+    tail = 0.5 * (1.0 - LEVEL) / tests
+    low, high = (2.0 * float(gammaincinv(0.5 * count, p)) / count for p in (tail, 1.0 - tail))
+    return low, high
+
+
+def variance_p(squares: float, count: int) -> float:
+    """Two-sided p-value of a sum of `count` squared standard normal numbers."""
+    above = float(gammaincc(0.5 * count, 0.5 * squares))
+    return min(1.0, 2.0 * min(above, 1.0 - above))
+
+
+def autocorrelation(values: Floats, lags: int) -> Floats:
+    """Correlation of a sequence (n,) with itself 1 … `lags` places on (lags,); 0 where nothing varies."""
+    centred = values - values.mean() if len(values) else values
+    size = float(centred @ centred)
+    if size == 0.0:
+        return np.zeros(lags)
+    return np.array(
+        [float(centred[lag:] @ centred[:-lag]) / size if lag < len(values) else 0.0 for lag in range(1, lags + 1)]
+    )
+
+
+def ljung_box(correlation: Floats, count: int) -> tuple[float, float]:
+    """Q = n (n+2) Σ r_k² / (n-k) of Ljung and Box (1978) and its p-value; χ² with as many degrees of freedom as lags.
+
+    Args:
+        correlation: r_k, k = 1 … (lags,).
+        count: n, length of the sequence; longer than there are lags.
+    """
+    lags = np.arange(1, len(correlation) + 1)
+    q = float(count * (count + 2) * np.sum(correlation**2 / (count - lags)))
+    return q, float(chdtrc(len(correlation), q))
+
+
+def chi2_quantile(probability: float, degrees: int) -> float:
+    """Quantile of the χ² distribution."""
+    return 2.0 * float(gammaincinv(0.5 * degrees, probability))

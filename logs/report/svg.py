@@ -1,0 +1,230 @@
+"""Drawings as inline SVG whose colours follow the page: light, dark and on paper."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+
+from logs.recording.design_view import Floats
+
+# role -> (light, dark). Okabe and Ito's colours, which colour-blind people can tell apart; lifted for dark pages.
+PALETTE = {
+    "ink": ("#1f2933", "#e4e8ed"),
+    "muted": ("#5d6875", "#a3adb8"),
+    "grid": ("#dde2e7", "#353d47"),
+    "card": ("#fefefe", "#1c2128"),
+    "truth": ("#2d3640", "#d3dae2"),
+    "estimate": ("#0072b2", "#56b4e9"),
+    "sample": ("#d99400", "#f0b43c"),
+    "target": ("#008a65", "#2fc79a"),
+    "limit": ("#d55e00", "#ff8c42"),
+    "plan": ("#a2468a", "#e08fc8"),
+    "fallback": ("#cc79a7", "#cc79a8"),
+    "lost": ("#c44e00", "#ff9a5c"),
+}
+# Ages of a plan, fresh to old: middle lightness throughout, so that it reads on white and on black.
+RAMP = ((0x2A, 0x86, 0xD1), (0x8B, 0x74, 0xC9), (0xCF, 0x6A, 0x94), (0xE0, 0x7B, 0x1E))
+WIDTH_IN = 4.7
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.68, 0.14, 0.44, 0.3
+FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
+
+_CURVES = re.compile(r"[CcQqSsTtAaHhVvlm]|e")
+_COMMANDS = re.compile(r"([MLz])(?: (\S+) (\S+))?")
+# Spaces around letters, and before a minus.
+_NEEDLESS = re.compile(r" ?([mz]) ?| (?=-)")
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+_STYLE: dict[str, object] = {
+    "svg.fonttype": "none",
+    "text.parse_math": False,
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+    "figure.constrained_layout.w_pad": 0.08,
+    "figure.constrained_layout.h_pad": 0.06,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+_ROLES = {
+    "text.color": "ink",
+    "axes.labelcolor": "muted",
+    "axes.titlecolor": "ink",
+    "axes.edgecolor": "muted",
+    "xtick.color": "muted",
+    "ytick.color": "muted",
+    "grid.color": "grid",
+}
+
+
+def colour(role: str) -> str:
+    """Colour of a role while drawing; becomes a CSS variable in the SVG."""
+    return PALETTE[role][0]
+
+
+def ramp(index: int, count: int) -> str:
+    """Colour of plan index `index` of `count`."""
+    place = (len(RAMP) - 1) * index / max(1, count - 1)
+    left = min(int(place), len(RAMP) - 2)
+    part = place - left
+    mixed = (round(a + part * (b - a)) for a, b in zip(RAMP[left], RAMP[left + 1], strict=True))
+    return "#" + "".join(f"{value:02x}" for value in mixed)
+
+
+def css_variables(dark: bool) -> str:
+    """CSS declarations of the palette."""
+    return "".join(f"--{role}:{pair[dark]};" for role, pair in PALETTE.items())
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure for the page: inline SVG and what it shows, in words."""
+
+    key: str
+    svg: str
+    label: str
+
+
+@dataclass
+class Canvas:
+    """A figure being drawn; `svg` is filled in when its `with` block ends."""
+
+    figure: Figure
+    svg: str = field(default="", init=False)
+
+    def axes(self, title: str, x_label: str, y_label: str, left_in: float = _LEFT_IN) -> Axes:
+        """One titled and labelled set of axes that fills the figure, with room for labels of usual lengths.
+
+        Margins that are known need no second drawing to find them, which would double the time of a page.
+        """
+        self.figure.set_layout_engine(None)
+        width_in, height_in = self.figure.get_size_inches()
+        sides = {"left": left_in / width_in, "right": 1.0 - _RIGHT_IN / width_in}
+        top_in = _TOP_IN if title else _RIGHT_IN
+        axes = self.figure.subplots(
+            gridspec_kw={**sides, "bottom": _BOTTOM_IN / height_in, "top": 1.0 - top_in / height_in}
+        )
+        axes.set_title(title)
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        return axes
+
+
+@contextmanager
+def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[Canvas]:
+    """A styled figure; `key` keeps its ids apart from those of the page's other figures."""
+    with style.context([_STYLE, {name: colour(role) for name, role in _ROLES.items()}, {"svg.hashsalt": key}]):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        one = Canvas(figure)
+        yield one
+        out = io.StringIO()
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+        one.svg = _inline(out.getvalue(), key)
+
+
+def power_of_ten(value: float, _place: object = None) -> str:
+    """A tick of a logarithmic axis, as in "10⁻⁹": no markup, as figures have none."""
+    return "10" + str(round(np.log10(value))).translate(_RAISED)
+
+
+def dots(ax: Axes, x: Floats, y: Floats, role: str, size_pt: float, zorder: float = 2) -> None:
+    """Round dots: strokes without length."""
+    points = (x, y)
+    strokes(ax, points, points, colour(role), size_pt, zorder)
+
+
+def strokes(
+    ax: Axes, begin: tuple[Floats, Floats], end: tuple[Floats, Floats], paint: str, width_pt: float, zorder: float = 2
+) -> None:
+    """Separate strokes between points (x, y), as one path: a tenth of the bytes of as many lines or markers."""
+    if not len(begin[0]):
+        return
+    points = np.stack([np.column_stack(begin), np.column_stack(end)], axis=1).reshape(-1, 2)
+    path = Path(points, np.tile([Path.MOVETO, Path.LINETO], len(begin[0])))
+    path.should_simplify = False
+    ax.add_patch(PathPatch(path, fill=False, ec=paint, lw=width_pt, capstyle="round", zorder=zorder))
+
+
+def standalone(svg: str, label: str) -> str:
+    """An SVG file of its own from an inline one: colours, background and fonts come with it."""
+    look = (
+        f"<style>:root{{{css_variables(False)}}}"
+        f"@media (prefers-color-scheme:dark){{:root{{{css_variables(True)}}}}}"
+        f"text{{font-family:{FONT}!important}}</style>"
+        f'<title>{label}</title><rect width="100%" height="100%" rx="6" style="fill:var(--card)"/>'
+    )
+    opened = svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" role="img" ', 1)
+    head, _, tail = opened.partition(">")
+    return f"{head}>{look}{tail}"
+
+
+def _inline(text: str, key: str) -> str:
+    """Strip what HTML does not need, keep ids apart, shorten numbers, and let the page colour it."""
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
+    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text).replace("xlink:href=", "href=")
+    text = re.sub(r'(<svg [^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg [^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'\b(id=")', rf"\1{key}-", text)
+    text = re.sub(r'(href="#|url\(#)', rf"\1{key}-", text)
+    text = re.sub(r' d="([^"]*)"', lambda found: f' d="{compact(found.group(1))}"', text)
+    text = re.sub(r' (?:x|y|transform)="[^"]*"', lambda found: _shorten(found.group()), text)
+    text = re.sub(r"\s*\n\s*", "\n", text)
+    roles = {light: f"var(--{role},{light})" for role, (light, _) in PALETTE.items()}
+    return re.sub("|".join(roles), lambda found: roles[found.group()], text)
+
+
+def compact(path: str) -> str:
+    """Straight lines in tenths of a point, each from the end of the last: a third of the bytes. Curves keep theirs.
+
+    Args:
+        path: As Matplotlib writes it: commands M, L and z with absolute places.
+    """
+    if _CURVES.search(path):
+        return _shorten(path)
+    parts: list[str] = []
+    at = begun = (0, 0)
+    for command, x, y in _COMMANDS.findall(path):
+        if command == "z":
+            parts.append("z")
+            at = begun
+            continue
+        to = (round(10.0 * float(x)), round(10.0 * float(y)))
+        if command == "M":
+            parts.append("m")  # the first one counts from zero; lines that follow need no letter
+            begun = to
+        parts += [_tenths(to[0] - at[0]), _tenths(to[1] - at[1])]
+        at = to
+    return _NEEDLESS.sub(r"\1", " ".join(parts))
+
+
+def _tenths(value: int) -> str:
+    """A tenth of a whole number, as short as SVG allows."""
+    return f"{value / 10:.1f}".removesuffix(".0").replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}"
+
+
+def _shorten(attribute: str) -> str:
+    """Two decimals of a point are finer than any screen."""
+    return re.sub(r"-?\d+\.\d{3,}", lambda number: f"{float(number.group()):.2f}", attribute)

@@ -1,0 +1,210 @@
+"""The flight as lanes along the time: who flew, what the vehicle said, where news was lost, what went amiss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from logs.recording.design_view import Floats
+from logs.recording.flight import FlightData
+from logs.recording.summary import SLACK_TOLERANCE, input_outside, state_outside
+from logs.report.page import Mark
+from logs.report.plots import span
+from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, strokes
+from uavctl.records import ControlMode, Severity, SolveStatus
+
+WIDE_IN = 8.6
+MARKS = 400  # of one lane: more would touch each other
+_LANE_IN = 0.3
+_LEFT_IN = 0.95  # for the lanes' names
+_INK_PER_CHARACTER_IN = 0.072
+_MODES = {
+    ControlMode.WAIT: "grid",
+    ControlMode.TRACK: "estimate",
+    ControlMode.BRAKE: "fallback",
+    ControlMode.HOLD: "fallback",
+    ControlMode.LAND: "limit",
+    ControlMode.STOPPED: "grid",
+}
+_MEANINGS = {
+    ("positions", "lost"): Mark("tick", "lost", "step without news"),
+    ("positions", "fallback"): Mark("tick", "fallback", "position refused"),
+    ("plans", "sample"): Mark("tick", "sample", "a constraint gave way"),
+    ("plans", "limit"): Mark("tick", "limit", "no optimum"),
+    ("limits", "limit"): Mark("tick", "limit", "outside a limit"),
+    ("events", "muted"): Mark("tick", "muted", "event"),
+    ("events", "sample"): Mark("tick", "sample", "warning"),
+    ("events", "limit"): Mark("tick", "limit", "error"),
+    ("orders", "target"): Mark("tick", "target", "order of the operator"),
+}
+_HANDS = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
+
+
+@dataclass(frozen=True)
+class Span:
+    """A bar of a lane, with its text where there is room."""
+
+    begun_s: float
+    ended_s: float
+    role: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A row: bars, and marks of a colour."""
+
+    name: str
+    spans: tuple[Span, ...] = ()
+    marks: tuple[tuple[str, Floats], ...] = ()  # role, times [s]
+
+
+def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...]]:
+    """The lanes, for a wide page and for a narrow one, and what their marks mean."""
+    rows = list(lanes(flight))
+    label = "Timeline of the flight: " + ", ".join(lane.name for lane in rows)
+    drawings = []
+    for key, width_in in (("timeline-wide", WIDE_IN), ("timeline-narrow", WIDTH_IN)):
+        with canvas(key, 0.55 + _LANE_IN * len(rows), width_in) as one:
+            ax = one.axes("", "time [s]", "", _LEFT_IN)
+            span(ax, flight)
+            for row, lane in enumerate(rows):
+                _draw_lane(ax, lane, row, _character_s(float(np.ptp(ax.get_xlim())), width_in))
+            ax.set_ylim(len(rows) - 0.5, -0.5)
+            ax.set_yticks(range(len(rows)), [lane.name for lane in rows])
+            ax.tick_params(axis="y", length=0)
+            ax.grid(visible=False, axis="y")
+        drawings.append(Drawing(key, one.svg, label))
+    marked = {(lane.name, role) for lane in rows for role, times in lane.marks if len(times)}
+    meanings = tuple(mark for key, mark in _MEANINGS.items() if key in marked)
+    return drawings[0], drawings[1], (*_untold(rows, flight), *meanings)
+
+
+def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
+    """What bars mean that are too short for their text on the narrow page, by colour."""
+    shown_s = max(flight.duration_s, flight.design.dt_s)
+    character_s = _character_s(shown_s, WIDTH_IN)
+    texts: dict[str, dict[str, None]] = {}
+    for one in (one for lane in rows for one in lane.spans):
+        if not _fits(one, character_s):
+            texts.setdefault(one.role, {})[one.text] = None
+    for role, told in texts.items():
+        yield Mark("band", role, " · ".join(told))
+
+
+def lanes(flight: FlightData) -> Iterator[Lane]:
+    """The rows that this flight has something for."""
+    yield Lane("controller", tuple(_modes(flight)))
+    found = (
+        Lane("hand-over", tuple(_hand_over(flight))),
+        Lane("vehicle", tuple(_vehicle(flight))),
+        Lane("positions", marks=tuple(_positions(flight))),
+        Lane("plans", marks=tuple(_plans(flight))),
+        Lane("limits", marks=(("limit", _outside(flight)),)),
+        Lane("events", marks=tuple(_events(flight))),
+        Lane("orders", marks=(("target", _orders(flight)),)),
+    )
+    for lane in found:
+        if lane.spans or any(len(times) for _, times in lane.marks):
+            yield lane
+
+
+def _modes(flight: FlightData) -> Iterator[Span]:
+    changes = [next(group) for _, group in groupby(flight.decisions, key=lambda decision: decision.mode)]
+    begins = flight.seconds([decision.at_ns for decision in changes]).tolist()
+    for decision, (begun_s, ended_s) in zip(changes, pairwise([*begins, flight.duration_s]), strict=True):
+        yield Span(begun_s, ended_s, _MODES[decision.mode], decision.mode.value)
+
+
+def _hand_over(flight: FlightData) -> Iterator[Span]:
+    """States of the hand-over, out of its events' texts: "before -> after (mode, armed)"."""
+    told = [event for event in flight.events if event.code == "hand-over" and " -> " in event.text]
+    states = [event.text.split(" -> ", 1)[1].split(" (", 1)[0] for event in told]
+    begins = flight.seconds([event.at_ns for event in told]).tolist()
+    if told and begins[0] > 0.0:
+        states.insert(0, told[0].text.split(" -> ", 1)[0])
+        begins.insert(0, 0.0)
+    for state, (begun_s, ended_s) in zip(states, pairwise([*begins, flight.duration_s]), strict=True):
+        yield Span(begun_s, ended_s, _HANDS.get(state, "grid"), state)
+
+
+def _vehicle(flight: FlightData) -> Iterator[Span]:
+    """What the vehicle's heartbeats said."""
+    told = [(one.at_ns, f"{one.mode}{'' if one.armed else ', disarmed'}", one) for one in flight.vehicles]
+    changes = [next(group) for _, group in groupby(told, key=lambda one: one[1])]
+    begins = flight.seconds([at_ns for at_ns, _, _ in changes]).tolist()
+    for (_, text, status), (begun_s, ended_s) in zip(changes, pairwise([*begins, flight.duration_s]), strict=True):
+        role = "grid" if not status.armed else "estimate" if status.external else "sample"
+        yield Span(max(0.0, begun_s), ended_s, role, text)
+
+
+def _positions(flight: FlightData) -> Iterator[tuple[str, Floats]]:
+    """Steps without news; positions that were refused."""
+    silent = [d.at_ns for d in flight.flown if d.boundary and d.age_steps]
+    yield "lost", flight.seconds(silent)
+    yield "fallback", flight.seconds([d.at_ns for d in flight.decisions if d.rejected])
+
+
+def _plans(flight: FlightData) -> Iterator[tuple[str, Floats]]:
+    """Plans in which a constraint gave way; solves without an optimum."""
+    gave = [
+        plan.base_ns for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE
+    ]
+    yield "sample", flight.seconds(gave)
+    failed = [d.at_ns for d in flight.decisions if d.solve not in (None, SolveStatus.OPTIMAL)]
+    yield "limit", flight.seconds(failed)
+
+
+def _outside(flight: FlightData) -> Floats:
+    return flight.steps.t_s[state_outside(flight) | input_outside(flight)]
+
+
+def _events(flight: FlightData) -> Iterator[tuple[str, Floats]]:
+    roles = {Severity.INFO: "muted", Severity.WARNING: "sample", Severity.ERROR: "limit"}
+    for severity, role in roles.items():
+        yield role, flight.seconds([event.at_ns for event in flight.events if event.severity is severity])
+
+
+def _orders(flight: FlightData) -> Floats:
+    given = [one.at_ns for one in flight.step_inputs if one.commands]
+    return flight.seconds(given if flight.stopped_ns is None else [*given, flight.stopped_ns])
+
+
+def _character_s(shown_s: float, width_in: float) -> float:
+    """Seconds that a character of a bar's text takes."""
+    return _INK_PER_CHARACTER_IN * shown_s / (width_in - 1.1)
+
+
+def _fits(one: Span, character_s: float) -> bool:
+    return (len(one.text) + 1) * character_s < one.ended_s - one.begun_s
+
+
+def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
+    for one in lane.spans:
+        ax.broken_barh(
+            [(one.begun_s, one.ended_s - one.begun_s)],
+            (row - 0.32, 0.64),
+            color=colour(one.role),
+            alpha=_alpha(one),
+            lw=0,
+        )
+        if _fits(one, character_s):
+            ax.text(0.5 * (one.begun_s + one.ended_s), row, one.text, ha="center", va="center", fontsize=8.5)
+    for role, times_s in lane.marks:
+        shown = _apart(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
+        low, high = np.full(len(shown), row - 0.28), np.full(len(shown), row + 0.28)
+        strokes(ax, (shown, low), (shown, high), colour(role), 1.2)
+
+
+def _alpha(one: Span) -> float:
+    return 0.9 if one.role == "grid" else 0.3
+
+
+def _apart(times_s: Floats, shown_s: float) -> Floats:
+    """Times, of those too near to be told apart the first only."""
+    _, first = np.unique(np.floor(times_s / shown_s * MARKS), return_index=True)
+    return times_s[first]

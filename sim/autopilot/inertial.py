@@ -1,0 +1,234 @@
+"""Inertial sensors, and the attitude that an autopilot estimates from them, with the errors of both.
+
+A bias of the accelerometer across gravity cannot be told from a tilt, so the estimate tilts by it: at hover the
+specific force that is told, turned by the attitude that is told, is nearly right although both err. Dead reckoning
+goes
+wrong by what remains: a small tilt that wanders within seconds, biases that the estimate knows and the message
+keeps,
+and noise. All figures and their sources are in docs/vehicle.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.vehicle.interface import Quaternion, Vehicle, in_body
+from sim.vehicle.rigid_body import GRAVITY_MPS2, turned
+from uavctl.records import Vec3
+
+DRIFT_S, WANDER_S, HEADING_S = 60.0, 4.0, 30.0  # time constants
+STEP_NS = 20_000_000  # between two changes of the attitude that the vehicle's own loops believe
+DRAWS = 1000  # normal numbers drawn at once
+
+
+@dataclass(frozen=True)
+class InertialErrors:
+    """Standard deviations of the errors of inertial and attitude data, each axis."""
+
+    tilting_mps2: float  # constant bias of the accelerometer along front and right, by which the estimate tilts
+    drift_mps2: float  # drift of that bias, by which it tilts too
+    bias_mps2: float  # constant bias along front and right that the estimate knows and the message keeps
+    bias_down_mps2: float  # constant bias along down; no tilt hides it
+    tilt_rad: float  # constant tilt of the attitude beside that of the bias
+    wander_rad: float  # wandering tilt, in flight
+    heading_rad: float  # wandering heading, in flight
+    noise_mps2: float  # white noise of a specific force
+    vibration_mps2: float  # white noise that flying adds to it
+    gyro_bias_rps: float  # constant bias of a body rate
+    gyro_noise_rps: float  # white noise of a body rate
+    gyro_vibration_rps: float  # white noise that flying adds to it
+
+    def scaled(self, factor: float) -> InertialErrors:
+        """Multiply all of them by a factor."""
+        return InertialErrors(*(factor * size for size in astuple(self)))
+
+
+# PX4 takes the biases that its estimate knows out of HIGHRES_IMU; ArduPilot leaves them in its messages.
+ERRORS = {
+    "px4": InertialErrors(
+        tilting_mps2=0.03,
+        drift_mps2=0.03,
+        bias_mps2=0.0,
+        bias_down_mps2=0.004,
+        tilt_rad=math.radians(0.035),
+        wander_rad=math.radians(0.07),
+        heading_rad=math.radians(0.3),
+        noise_mps2=0.07,
+        vibration_mps2=0.07,
+        gyro_bias_rps=0.001,
+        gyro_noise_rps=0.0075,
+        gyro_vibration_rps=0.01,
+    ),
+    "ardupilot": InertialErrors(
+        tilting_mps2=0.03,
+        drift_mps2=0.03,
+        bias_mps2=0.02,
+        bias_down_mps2=0.03,
+        tilt_rad=math.radians(0.09),
+        wander_rad=math.radians(0.05),
+        heading_rad=math.radians(0.3),
+        noise_mps2=0.01,
+        vibration_mps2=0.07,
+        gyro_bias_rps=0.001,
+        gyro_noise_rps=0.0005,
+        gyro_vibration_rps=0.01,
+    ),
+}
+
+
+def normals(seed: np.random.SeedSequence) -> Iterator[float]:
+    """Draw standard normal numbers without end."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from rng.standard_normal(DRAWS).tolist()
+
+
+class GaussMarkov:
+    """First-order Gauss-Markov process, moved on exactly by any time.
+
+    Attributes:
+        value: its present value.
+    """
+
+    def __init__(self, time_s: float) -> None:
+        self._time_s = time_s
+        self.value = 0.0
+
+    def move(self, elapsed_s: float, std: float, normal: float) -> None:
+        """Move on towards this standard deviation; after infinite time the value is drawn from it."""
+        keep = math.exp(-elapsed_s / self._time_s)
+        self.value = keep * self.value + std * math.sqrt(1.0 - keep * keep) * normal
+
+
+class Imu:
+    """One inertial measurement unit: its biases, and the noise of what it measures."""
+
+    def __init__(self, errors: InertialErrors, seed: np.random.SeedSequence) -> None:
+        e, draw = errors, normals(seed)
+        self._errors, self._draw = errors, draw
+        self._tilting = (e.tilting_mps2 * next(draw), e.tilting_mps2 * next(draw))
+        self._bias = (e.bias_mps2 * next(draw), e.bias_mps2 * next(draw), e.bias_down_mps2 * next(draw))
+        self._gyro_bias = (e.gyro_bias_rps * next(draw), e.gyro_bias_rps * next(draw), e.gyro_bias_rps * next(draw))
+        self._drift = GaussMarkov(DRIFT_S), GaussMarkov(DRIFT_S)
+
+    @property
+    def tilting_mps2(self) -> tuple[float, float]:
+        """Bias along front and right by which an estimate tilts."""
+        (front, right), (one, other) = self._tilting, self._drift
+        return front + one.value, right + other.value
+
+    def move(self, elapsed_s: float) -> None:
+        """Let the bias drift on."""
+        for drift in self._drift:
+            drift.move(elapsed_s, self._errors.drift_mps2, next(self._draw))
+
+    def force(self, true_mps2: Vec3, *, flies: bool) -> Vec3:
+        """Measure a specific force."""
+        e, draw, (tf, tr), (bf, br, bd) = self._errors, self._draw, self.tilting_mps2, self._bias
+        noise = math.hypot(e.noise_mps2, e.vibration_mps2) if flies else e.noise_mps2
+        front, right, down = true_mps2
+        return (
+            front + tf + bf + noise * next(draw),
+            right + tr + br + noise * next(draw),
+            down + bd + noise * next(draw),
+        )
+
+    def rates(self, true_rps: Vec3, *, flies: bool) -> Vec3:
+        """Measure body rates."""
+        e, draw, (bp, bq, br) = self._errors, self._draw, self._gyro_bias
+        noise = math.hypot(e.gyro_noise_rps, e.gyro_vibration_rps) if flies else e.gyro_noise_rps
+        p, q, r = true_rps
+        return p + bp + noise * next(draw), q + bq + noise * next(draw), r + br + noise * next(draw)
+
+
+class InertialMeasurement(NamedTuple):
+    """Measurement of one unit."""
+
+    at_ns: int  # when it was made
+    force_mps2: Vec3  # specific force along front, right, down: (0, 0, -g) at rest and level
+    rates_rps: Vec3  # body rates about them
+
+
+class InertialSensors:
+    """Two inertial units of a vehicle, and the attitude that its estimate makes of the first.
+
+    Until the first measurement the attitude is the true one, so who uses no inertial data is not disturbed by their
+    errors. With `flown` the errors are there from the start, and the vehicle's own loops take the wrong attitude for
+    true.
+
+    Args:
+        flown: whether the vehicle flies by the attitude that it believes.
+
+    Attributes:
+        next_ns: when what the loops believe changes next, None if they know the truth.
+    """
+
+    def __init__(self, errors: InertialErrors, craft: Vehicle, seed: np.random.SeedSequence, *, flown: bool) -> None:
+        first, second, own = seed.spawn(3)
+        self._errors, self._craft = errors, craft
+        self._units = Imu(errors, first), Imu(errors, second)
+        self._draw = normals(own)
+        self._tilt = (errors.tilt_rad * next(self._draw), errors.tilt_rad * next(self._draw))
+        self._wander = GaussMarkov(WANDER_S), GaussMarkov(WANDER_S)
+        self._heading = GaussMarkov(HEADING_S)
+        self._moved_ns: int | None = None
+        self._errs = flown
+        self.next_ns = craft.now_ns if flown else None
+
+    def measure(self, unit: int) -> InertialMeasurement:
+        """Measure with the first (0) or the second unit (1)."""
+        self._errs = True
+        self._move()
+        craft, imu = self._craft, self._units[unit]
+        north, east, down = craft.acceleration_mps2
+        force = in_body(craft.attitude, (north, east, down - GRAVITY_MPS2))
+        flies = not craft.landed
+        return InertialMeasurement(
+            craft.measured_ns, imu.force(force, flies=flies), imu.rates(craft.rates_rps, flies=flies)
+        )
+
+    def attitude(self) -> Quaternion:
+        """Estimate the attitude: what turns body axes FRD into NED."""
+        return turned(self._craft.attitude, self._error_rad()) if self._errs else self._craft.attitude
+
+    def rates(self) -> Vec3:
+        """Measure the body rates that go with the attitude."""
+        craft = self._craft
+        return self._units[0].rates(craft.rates_rps, flies=not craft.landed) if self._errs else craft.rates_rps
+
+    def run(self, at_ns: int) -> None:
+        """Mislead the loops that fly, when that is due."""
+        if self.next_ns is not None and self.next_ns <= at_ns:
+            self.next_ns = at_ns + STEP_NS
+            self._craft.mislead_attitude(self._error_rad())
+
+    def _error_rad(self) -> Vec3:
+        """Tell what the estimated attitude is turned by against the true one, about body axes."""
+        self._move()
+        front, right = self._units[0].tilting_mps2
+        (roll, pitch), (one, other) = self._tilt, self._wander
+        # With this tilt a unit at rest that measures (front, right, -g) would measure nothing but gravity.
+        return (
+            roll + one.value - right / GRAVITY_MPS2,
+            pitch + other.value + front / GRAVITY_MPS2,
+            self._heading.value,
+        )
+
+    def _move(self) -> None:
+        """Move everything slow on to the present."""
+        now_ns = self._craft.now_ns
+        if now_ns == self._moved_ns:
+            return
+        elapsed_s = math.inf if self._moved_ns is None else (now_ns - self._moved_ns) * 1e-9
+        self._moved_ns = now_ns
+        for unit in self._units:
+            unit.move(elapsed_s)
+        e, flies = self._errors, not self._craft.landed
+        for wander in self._wander:
+            wander.move(elapsed_s, e.wander_rad if flies else 0.0, next(self._draw))
+        self._heading.move(elapsed_s, e.heading_rad if flies else 0.0, next(self._draw))

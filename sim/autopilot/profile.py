@@ -1,0 +1,363 @@
+"""Parameters of the simulated autopilots: the ones that change what they do, and some that only tell.
+
+The rest of the real ones' thousand parameters are not there: a vehicle that took a parameter and did not heed it
+would
+tell a client something untrue. For the same reason a value that is not simulated is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, IntEnum, auto
+from typing import Literal
+
+from sim.vehicle.loops import LAND_MPS, REFERENCE_ACCEL_MPS2, TUNINGS
+
+
+class ParameterType(IntEnum):
+    """MAV_PARAM_TYPE."""
+
+    INT8 = 2
+    INT16 = 4
+    UINT32 = 5
+    INT32 = 6
+    REAL32 = 9
+
+
+LIMITS = {ParameterType.INT8: 2**7, ParameterType.INT16: 2**15, ParameterType.INT32: 2**31}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter."""
+
+    value: float  # at the start
+    kind: ParameterType  # its type
+    allowed: tuple[float, ...] = ()  # the values that are simulated; empty is all
+
+
+def _int(value: int, *allowed: float, kind: ParameterType = ParameterType.INT32) -> Parameter:
+    return Parameter(value, kind, allowed)
+
+
+def _byte(value: int, *allowed: float) -> Parameter:
+    return _int(value, *allowed, kind=ParameterType.INT8)
+
+
+def _real(value: float, *allowed: float) -> Parameter:
+    return Parameter(value, ParameterType.REAL32, allowed)
+
+
+def _told(value: float, kind: ParameterType = ParameterType.REAL32) -> Parameter:
+    """One that tells what the vehicle is, and cannot be changed."""
+    return Parameter(value, kind, (value,))
+
+
+def _degrees(autopilot: str) -> float:
+    return round(math.degrees(TUNINGS[autopilot].tilt_limit_rad))
+
+
+# Values as in the recorded flights; COM_OBL_RC_ACT too, since with the default 0 a lost stream goes unnoticed.
+PX4_PARAMETERS = {
+    "BAT_CRIT_THR": _real(0.07),
+    "BAT_LOW_THR": _real(0.15),
+    "COM_DISARM_PRFLT": _real(10.0),
+    "COM_DL_LOSS_T": _int(10),
+    "COM_LOW_BAT_ACT": _int(0, 0, 2),  # warn, land when critical
+    "COM_OBL_RC_ACT": _int(5, 0, 1, 2, 4, 5),  # 0-2 leave it to the stick, and without one do nothing; land, hold
+    "COM_OF_LOSS_T": _real(1.0),
+    "COM_RC_IN_MODE": _told(4, ParameterType.INT32),  # no stick
+    "EKF2_BARO_CTRL": _int(1, 0, 1),
+    "EKF2_EV_CTRL": _int(0),
+    "EKF2_EV_DELAY": _real(0.0),
+    "EKF2_GPS_CTRL": _int(7),
+    "EKF2_HGT_REF": _int(1, 0, 1, 3),
+    "EKF2_MAG_TYPE": _int(0, 0, 5),
+    "EKF2_NOAID_TOUT": _int(5_000_000),
+    "MAV_SYS_ID": _told(1, ParameterType.INT32),
+    "MIS_TAKEOFF_ALT": _real(2.5),
+    "MPC_ACC_HOR": _told(REFERENCE_ACCEL_MPS2),
+    "MPC_LAND_SPEED": _told(TUNINGS["px4"].land_mps),
+    "MPC_TILTMAX_AIR": _told(_degrees("px4")),
+    "NAV_DLL_ACT": _int(0, 0, 1, 3),  # nothing, hold, land
+    "SYS_HAS_GPS": _int(1, 0, 1),
+    "SYS_HAS_MAG": _int(1, 0, 1),
+}
+ARDUPILOT_PARAMETERS = {
+    "ANGLE_MAX": _told(100 * _degrees("ardupilot"), ParameterType.INT16),
+    "ARMING_CHECK": _told(1, ParameterType.INT32),
+    "BATT_FS_LOW_ACT": _byte(0, 0, 1),  # nothing, land
+    "BATT_LOW_TIMER": _byte(10),
+    "BATT_LOW_VOLT": _real(3.4),
+    "COMPASS_USE": _byte(1, 0, 1),
+    "COMPASS_USE2": _byte(1, 0, 1),
+    "COMPASS_USE3": _byte(1, 0, 1),
+    "DISARM_DELAY": _byte(10),
+    "EK3_SRC1_POSXY": _byte(3, 0, 3, 6),  # None, GPS, external
+    "EK3_SRC1_POSZ": _byte(1, 0, 1, 3, 6),  # None, barometer, GPS, external
+    "EK3_SRC1_VELXY": _byte(3, 0, 3, 6),
+    "EK3_SRC1_VELZ": _byte(3, 0, 3, 6),
+    "EK3_SRC1_YAW": _byte(1, 0, 1, 6),  # None, compass, external
+    "FS_EKF_ACTION": _byte(1, 0, 1),  # nothing, land
+    "FS_EKF_THRESH": _told(0.8),
+    "FS_GCS_ENABLE": _byte(0, 0, 5),  # nothing, land
+    "FS_GCS_TIMEOUT": _real(5.0),
+    "GPS1_TYPE": _byte(1, 0, 1),
+    "GUID_OPTIONS": _told(0, ParameterType.INT32),
+    "GUID_TIMEOUT": _real(3.0),
+    "LAND_SPEED": _told(100 * LAND_MPS, ParameterType.INT16),
+    "PSC_JERK_XY": _told(TUNINGS["ardupilot"].jerk_mps3),
+    "PSC_JERK_Z": _told(TUNINGS["ardupilot"].jerk_mps3),
+    "SYSID_MYGCS": _int(255, kind=ParameterType.INT16),
+    "SYSID_THISMAV": _told(1, ParameterType.INT16),
+    "VISO_DELAY_MS": _int(10, kind=ParameterType.INT16),
+    "VISO_TYPE": _byte(0, 0, 1),
+    "WPNAV_ACCEL": _told(100 * REFERENCE_ACCEL_MPS2),
+    "WP_YAW_BEHAVIOR": _byte(2, 0, 1, 2, 3),  # 0 holds the heading, else the nose follows travel
+}
+TABLES: dict[str, Mapping[str, Parameter]] = {"px4": PX4_PARAMETERS, "ardupilot": ARDUPILOT_PARAMETERS}
+WITH_STICK = 0  # COM_RC_IN_MODE
+OWN_ID = {"px4": "MAV_SYS_ID", "ardupilot": "SYSID_THISMAV"}
+
+
+class Parameters:
+    """The values of one vehicle, in order of name as they are numbered on the wire.
+
+    Args:
+        system_id: MAVLink system id of the vehicle.
+
+    Attributes:
+        names: in order; a parameter's index is its place.
+    """
+
+    def __init__(self, autopilot: Literal["px4", "ardupilot"], system_id: int = 1, *, radio: bool = False) -> None:
+        name = OWN_ID[autopilot]
+        table = TABLES[autopilot]
+        self._table = {**table, name: _told(system_id, table[name].kind)}
+        if autopilot == "px4" and radio:
+            self._table["COM_RC_IN_MODE"] = _told(WITH_STICK, ParameterType.INT32)
+        self._bytewise = autopilot == "px4"
+        self._values = {name: _stored(one.value, one.kind) for name, one in self._table.items()}
+        self.names = tuple(sorted(self._table))
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def kind(self, name: str) -> ParameterType:
+        """Type of a parameter."""
+        return self._table[name].kind
+
+    def allowed(self, name: str) -> tuple[float, ...]:
+        """The values of a parameter that are simulated; empty is all."""
+        return self._table[name].allowed
+
+    def takes(self, name: str, value: float) -> bool:
+        """Whether a parameter can be changed to a value; not if it is none, or is not simulated."""
+        one = self._table[name]
+        if not math.isfinite(value) or abs(value) > 1e9:
+            return False
+        return not one.allowed or _stored(value, one.kind) in {_stored(allowed, one.kind) for allowed in one.allowed}
+
+    def set(self, name: str, value: float) -> bool:
+        """Change a parameter; False if it stays as it is, since it does not take the value."""
+        takes = self.takes(name, value)
+        if takes:
+            self._values[name] = _stored(value, self._table[name].kind)
+        return takes
+
+    def encoded(self, name: str) -> float:
+        """A value as it travels in PARAM_VALUE: PX4 puts the bytes of an integer into the float, ArduPilot casts."""
+        value = self._values[name]
+        if self._bytewise and self.kind(name) is not ParameterType.REAL32:
+            return float(struct.unpack("<f", struct.pack("<i", int(value)))[0])
+        return value
+
+    def decoded(self, name: str, wire: float) -> float:
+        """The inverse of `encoded` for what PARAM_SET carries."""
+        if self._bytewise and self.kind(name) is not ParameterType.REAL32:
+            return float(struct.unpack("<i", struct.pack("<f", wire))[0])
+        return wire
+
+    @property
+    def digest(self) -> float:
+        """PX4's `_HASH_CHECK`: CRC-32 of all names and values in order, its bytes as a float."""
+        crc = 0
+        for name in self.names:
+            form = "<f" if self.kind(name) is ParameterType.REAL32 else "<i"
+            value = self._values[name] if form == "<f" else int(self._values[name])
+            crc = zlib.crc32(name.encode() + struct.pack(form, value), crc)
+        return float(struct.unpack("<f", struct.pack("<I", crc))[0])
+
+
+def _stored(value: float, kind: ParameterType) -> float:
+    """A value as the autopilot keeps it: a float, or the nearest integer within the type."""
+    if kind is ParameterType.REAL32:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    return float(min(max(math.floor(value + 0.5), -LIMITS[kind]), LIMITS[kind] - 1))
+
+
+# How a PX4 and an ArduCopter differ, as tables: modes, frames, answers, habits.
+#
+# Mode numbers are the `custom_mode` of each autopilot's HEARTBEAT; base modes are those of recorded flights.
+
+
+# MAVLink common: MAV_RESULT
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
+
+
+class Role(Enum):
+    """What a mode means here."""
+
+    EXTERNAL = auto()  # takes our setpoints
+    HOLD = auto()  # brakes and waits
+    TAKEOFF = auto()
+    LAND = auto()
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A flight mode; `base` is its base_mode while disarmed."""
+
+    name: str
+    custom: int
+    base: int
+    role: Role
+    needs_position: bool = True
+
+
+@dataclass(frozen=True)
+class SimulatedProfile:
+    """One kind of autopilot."""
+
+    name: Literal["px4", "ardupilot"]
+    autopilot: int  # MAV_AUTOPILOT
+    modes: tuple[Mode, ...]
+    ground: str  # mode after boot
+    frames: frozenset[int]  # MAV_FRAMEs in which setpoints are taken
+    needs_stream: bool  # external mode is refused without setpoints
+    timeout: str  # parameter with the silence [s] after which setpoints have stopped
+    preflight_timeout: str  # parameter with the time [s] after which it disarms itself if it does not take off
+    refused_arming: int  # MAV_RESULT
+    refused_disarming: int  # MAV_RESULT
+    unknown_mode: int  # MAV_RESULT for a mode that it has not
+    set_mode_ack: int  # command number that answers SET_MODE
+    armed_text: str
+    disarmed_text: str
+    preflight_text: str  # when it disarms itself before take-off
+    landed_text: str  # empty: it says nothing
+    takeoff_text: str  # when it notices that it takes off; empty: it says nothing
+    touch_text: str  # its simulator's, on the floor's first touch; empty: it says nothing
+    lifts_s: float  # from arming to the thrust that lifts: rotors spin up, thrust ramps
+    ramps_s: float  # the same from the order, armed for long
+    settles_s: float  # from standing on the floor to knowing it
+    disarms_s: float  # from knowing it to disarming
+    resumes_mode: bool  # a landing or a failsafe that ended with disarming leaves the mode of before
+    good_flags: int  # ESTIMATOR_STATUS_FLAGS of a good estimate, as recorded in flight
+    vtol_state: int  # of EXTENDED_SYS_STATE
+    version: int  # flight_sw_version of AUTOPILOT_VERSION
+    origin_deg_m: tuple[float, float, float]  # latitude, longitude, altitude of its simulated field
+    radio: bool  # whether its simulator has a stick by itself, as SYS_STATUS of the recorded flights tells
+    greeting: tuple[bytes, ...]  # text on a TCP link, before its first packet and between that and the second
+
+    def mode(self, name: str) -> Mode:
+        """The mode of this name."""
+        return next(mode for mode in self.modes if mode.name == name)
+
+    def by_role(self, role: Role) -> Mode:
+        """The first mode of a role."""
+        return next(mode for mode in self.modes if mode.role is role)
+
+    def by_number(self, custom: int) -> Mode | None:
+        """The mode with this custom_mode, None if there is none."""
+        return next((mode for mode in self.modes if mode.custom == custom), None)
+
+
+def px4_custom(main: int, sub: int) -> int:
+    """PX4's custom_mode: main mode in bits 16-23, sub mode in bits 24-31."""
+    return main << 16 | sub << 24
+
+
+PX4 = SimulatedProfile(
+    name="px4",
+    autopilot=12,
+    modes=(
+        Mode("OFFBOARD", px4_custom(6, 0), 17, Role.EXTERNAL),
+        Mode("AUTO.LOITER", px4_custom(4, 3), 29, Role.HOLD),
+        Mode("AUTO.TAKEOFF", px4_custom(4, 2), 29, Role.TAKEOFF),
+        Mode("AUTO.LAND", px4_custom(4, 6), 29, Role.LAND, needs_position=False),
+        Mode("POSCTL", px4_custom(3, 0), 81, Role.HOLD),
+    ),
+    ground="AUTO.LOITER",
+    frames=frozenset({1, 8}),
+    needs_stream=True,
+    timeout="COM_OF_LOSS_T",
+    preflight_timeout="COM_DISARM_PRFLT",
+    refused_arming=TEMPORARILY_REJECTED,
+    refused_disarming=DENIED,
+    unknown_mode=DENIED,
+    set_mode_ack=176,
+    armed_text="Armed by external command",
+    disarmed_text="Disarmed by landing",
+    preflight_text="Disarmed by auto preflight disarming",
+    landed_text="Landing detected",
+    takeoff_text="Takeoff detected",
+    touch_text="",
+    lifts_s=3.8,
+    ramps_s=3.0,
+    settles_s=1.9,
+    disarms_s=2.0,
+    resumes_mode=True,
+    good_flags=0x37F,
+    vtol_state=0,
+    version=0x01080000,
+    origin_deg_m=(47.397742, 8.545594, 488.0),
+    radio=False,
+    greeting=(),
+)
+
+ARDUPILOT = SimulatedProfile(
+    name="ardupilot",
+    autopilot=3,
+    modes=(
+        Mode("GUIDED", 4, 89, Role.EXTERNAL),
+        Mode("LOITER", 5, 89, Role.HOLD),
+        Mode("LAND", 9, 89, Role.LAND, needs_position=False),
+        Mode("BRAKE", 17, 89, Role.HOLD),
+        Mode("STABILIZE", 0, 81, Role.HOLD, needs_position=False),
+    ),
+    ground="STABILIZE",
+    frames=frozenset({1, 7, 8, 9}),
+    needs_stream=False,
+    timeout="GUID_TIMEOUT",
+    preflight_timeout="DISARM_DELAY",
+    refused_arming=FAILED,
+    refused_disarming=FAILED,
+    unknown_mode=FAILED,
+    set_mode_ack=11,
+    armed_text="Arming motors",
+    disarmed_text="Disarming motors",
+    preflight_text="Disarming motors",
+    landed_text="",
+    takeoff_text="",
+    touch_text="SIM Hit ground at 0.500000 m/s",
+    lifts_s=3.4,
+    ramps_s=0.8,
+    settles_s=0.0,
+    disarms_s=1.65,
+    resumes_mode=False,
+    good_flags=0x33F,
+    vtol_state=3,
+    version=0x040602FF,
+    origin_deg_m=(-35.363262, 149.165237, 584.0),
+    radio=True,
+    greeting=(b"\n\nInit ArduCopter V4.6.2 (simulated)\n\nFree RAM: 131072\n", b"parameters loaded\nready to fly\n"),
+)
+
+PERSONALITIES = {"px4": PX4, "ardupilot": ARDUPILOT}

@@ -1,0 +1,306 @@
+"""Everything beyond the wire in lockstep."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.autopilot.autopilot import Autopilot
+from sim.cameras import Cameras
+from sim.channel import Channel, earliest, within
+from sim.faults import Faults, active, with_spans
+from sim.vehicle.linear import LinearVehicle, Script, ScriptedChannel, linear_model
+from sim.vehicle.quadrotor import STEP_S, Quadrotor
+from sim.wind import Wind
+from uavctl.config.types import Config
+from uavctl.records import Flyer, Outgoing, Truth, Vec3
+
+# A simulated vehicle at one instant, for whoever watches.
+
+
+@dataclass(frozen=True)
+class VehicleSnapshot:
+    """What can be seen of one vehicle; positions and velocities are the true ones, local NED."""
+
+    system_id: int  # MAVLink system id
+    time_s: float  # since the start
+    mode: str  # the autopilot's own name of it, or CRASHED
+    armed: bool  # whether it is armed
+    phase: str  # where it is: ground, air, climb, descent
+    position_m: Vec3  # position
+    velocity_mps: Vec3  # velocity
+    battery: float  # charge left, 0 to 1
+    # (system, component) id of whom the last setpoint came from, None before the first
+    steered_by: tuple[int, int] | None
+    setpoint_age_s: float | None  # time since that setpoint, None before the first
+    sent: int  # positions that the cameras sent
+    lost: int  # those of them that the link lost
+    faults: tuple[str, ...]  # what is amiss, as kinds of faults
+    text: str  # the last STATUSTEXT
+
+
+# Everything on the other side of the wire, under one clock that the caller moves.
+
+
+VEHICLE, MOCAP = "vehicle", "mocap"
+Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
+
+
+class Peers:
+    """Vehicle, autopilot, cameras and the radio channel that carries positions.
+
+    The vehicle's link is a wire: no loss (but for `link.uplink_blackout`), no delay. Positions go through the channel.
+    With `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel.
+
+    `on_truth` gets one `Truth` for every boundary start_ns + k Δt: the state x(k), and the input that acts
+    from there on. It is therefore called when time moves *past* the boundary: what arrives at the
+    boundary's own instant is already in it, what arrives later (on real sockets, a fraction of a
+    millisecond) is not.
+
+    With a `script`, plant, start, disturbances and the channel are its, not those of the configuration: what flies
+    is the linear plant.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        start_ns: int,
+        *,
+        airborne: bool = True,
+        shared_link: bool = False,
+        on_truth: Callable[[Truth], None] | None = None,
+        script: Script | None = None,
+    ) -> None:
+        config = self._config = with_spans(config)
+        for_vehicle, for_cameras, for_channel, for_inertial = np.random.SeedSequence(config.sim.seed).spawn(4)
+        self.vehicle: LinearVehicle | Quadrotor
+        if config.sim.plant == "quadrotor" and script is None:
+            self.vehicle = quadrotor(config, for_vehicle, start_ns)
+        else:
+            self.vehicle = LinearVehicle(config, for_vehicle, start_ns, script)
+        self.autopilot = Autopilot(config, self.vehicle, start_ns, for_inertial, airborne=airborne)
+        self.channel: Channel | ScriptedChannel
+        if script is None:
+            self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
+        else:
+            self.channel = ScriptedChannel(script.delays_ns)
+        self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+        self._faults = Faults(config, self.vehicle, self.autopilot, self._cameras, start_ns)
+        self._airborne = airborne
+        self._start_ns = start_ns
+        self._mocap_link = VEHICLE if shared_link else MOCAP
+        self._on_truth = on_truth
+        self._truth_ns = start_ns  # boundary of the next truth
+        self._wire: deque[Due] = deque()  # in order of time
+
+    @property
+    def now_ns(self) -> int:
+        """How far time has come [ns]."""
+        return self.vehicle.now_ns
+
+    @property
+    def next_ns(self) -> int:
+        """Time of the next event [ns]: something to send, a sample, or the vehicle's own doing."""
+        times = [self._own_ns, self._truth_ns + 1, self.channel.next_ns]
+        if self._wire:
+            times.append(self._wire[0][0])
+        return min(at_ns for at_ns in times if at_ns is not None)
+
+    @property
+    def _own_ns(self) -> int:
+        """When cameras, autopilot or a fault do something next [ns]."""
+        return self._earliest_ns(self.autopilot.next_ns, self._faults.next_ns)
+
+    def _earliest_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
+        found_ns = earliest((autopilot_ns, fault_ns))
+        return self._cameras.next_ns if found_ns is None else min(self._cameras.next_ns, found_ns)
+
+    def advance(self, to_ns: int) -> list[Due]:
+        """Move time on; returns the datagrams due up to and including `to_ns`, in order of time."""
+        self._run(to_ns)
+        due = [*self._wire, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
+        self._wire.clear()
+        due.sort(key=lambda one: one[0])  # stable: the vehicle first
+        return due
+
+    def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Iterable[Outgoing]]) -> None:
+        """Move time on and have every datagram heard in order of time; its answers are taken where time then is.
+
+        Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
+        in another way.
+        """
+        while True:
+            at_ns = max(min(to_ns, self._own_ns), self.now_ns)
+            for arrival_ns, link, data in self.advance(at_ns):
+                for answer in hear(link, data, arrival_ns):
+                    self.receive(answer.link, answer.data, at_ns)
+            if at_ns >= to_ns:
+                return
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> None:
+        """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
+        self._run(at_ns)
+        if link == VEHICLE and not within(self._config.link.uplink_blackout, at_ns - self._start_ns):
+            self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
+
+    def truth(self) -> Truth:
+        """The true state now, and the input acting from now on."""
+        return Truth(
+            at_ns=self.now_ns,
+            position_m=self.vehicle.position_m,
+            velocity_mps=self.vehicle.velocity_mps,
+            state=tuple(self.vehicle.state.tolist()),
+            input=tuple(self.vehicle.input.tolist()),
+            sent=self.channel.counters.sent,
+            lost=self.channel.counters.lost,
+            mode=self.autopilot.mode_name,
+            faults=self._amiss,
+        )
+
+    @property
+    def _amiss(self) -> tuple[str, ...]:
+        """What is amiss now, as kinds of faults; a random occlusion is one too."""
+        found = active(self._config, self.now_ns - self._start_ns)
+        return (*found, "occluded") if self._cameras.hidden and "occluded" not in found else found
+
+    def look(self) -> VehicleSnapshot:
+        """What can be seen of the vehicle now."""
+        pilot, counters = self.autopilot.pilot, self.channel.counters
+        setpoint_ns = pilot.setpoint_ns
+        return VehicleSnapshot(
+            system_id=self._config.sim.system_id,
+            time_s=(self.now_ns - self._start_ns) * 1e-9,
+            mode=self.autopilot.mode_name,
+            armed=pilot.armed,
+            phase=pilot.phase.name.lower(),
+            position_m=self.vehicle.position_m,
+            velocity_mps=self.vehicle.velocity_mps,
+            battery=self.autopilot.craft.battery.remaining,
+            steered_by=self.autopilot.steered_by,
+            setpoint_age_s=None if setpoint_ns is None else (self.now_ns - setpoint_ns) * 1e-9,
+            sent=counters.sent,
+            lost=counters.lost,
+            faults=self._amiss,
+            text=self.autopilot.text,
+        )
+
+    def flush(self, to_ns: int | None = None) -> None:
+        """Tell the truth of a boundary that time has reached but not passed; for the end of a run.
+
+        With `to_ns`, of that one: the vehicle alone moves on to it, and nothing more is sent.
+        """
+        if to_ns is not None:
+            self._move(to_ns)
+        if self._truth_ns == self.now_ns:
+            self._tell()
+
+    def _run(self, to_ns: int) -> None:
+        while True:
+            autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
+            at_ns = max(min(self._earliest_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
+            self._move(at_ns)
+            busy = False
+            if fault_ns is not None and fault_ns <= at_ns:
+                self._faults.run(at_ns)
+                busy = True
+            if autopilot_ns is not None and autopilot_ns <= at_ns:
+                self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
+                busy = True
+            if self._cameras.next_ns <= at_ns:
+                craft = self.vehicle
+                sample = self._cameras.capture(craft.position_m, craft.velocity_mps, craft.attitude)
+                if sample is None:
+                    self.channel.pass_over(at_ns)
+                else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
+                    self.channel.push(*sample, certain=self._airborne and not self.channel.counters.sent)
+                busy = True
+            if not busy:
+                break
+        self._move(to_ns)
+
+    def _move(self, to_ns: int) -> None:
+        while self._truth_ns < to_ns:
+            self.vehicle.advance(self._truth_ns)
+            self._tell()
+        self.vehicle.advance(to_ns)
+
+    def _tell(self) -> None:
+        self._truth_ns += self.vehicle.model.dt_ns
+        if self._on_truth is not None:
+            self._on_truth(self.truth())
+
+
+def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
+    """The quadrotor of a configuration, in its wind; the seed is that of the gusts."""
+    sim = config.sim
+    return Quadrotor(
+        linear_model(config.plant),
+        sim.autopilot,
+        Wind(sim.wind.velocity_mps, sim.wind.gust_wind_mps, sim.wind.height_m, STEP_S, seed),
+        start_ns,
+        position_m=sim.start_position_m,
+        velocity_mps=sim.start_velocity_mps,
+        charge=sim.quadrotor.charge,
+    )
+
+
+# The simulated peers and a controller in lockstep, in virtual time: no socket, no clock.
+
+
+class World:
+    """A flight of `flyer` against the simulated peers; bit-identical for a seed.
+
+    In each tick of the grid start_ns + n tick_s the flyer first gets every datagram that has arrived by
+    then, then decides, and what it sends reaches the peers at the same instant. So a sample taken at a boundary
+    and not delayed is known to that boundary's decision. What it answers a datagram with reaches the vehicle when
+    that one was sent, or with the peers' next doing.
+
+    Args:
+        config: the whole configuration; `sim`, `link`, `plant`, `frame` and the tick are used.
+        on_truth: gets the `Truth` of every Δt boundary, see `Peers`.
+        on_progress: gets the seconds flown so far, after every Δt.
+        start_ns: time of tick 0.
+        airborne: whether the vehicle begins in the air, armed and in its external mode; else on the floor, disarmed.
+        script: plant, start, disturbances and losses of a flight that is flown again; the `Truth` at its end is told.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        flyer: Flyer,
+        on_truth: Callable[[Truth], None] | None = None,
+        on_progress: Callable[[float], None] | None = None,
+        *,
+        start_ns: int = 0,
+        airborne: bool = True,
+        script: Script | None = None,
+    ) -> None:
+        self._flyer = flyer
+        self._on_progress = on_progress
+        self._start_ns = start_ns
+        self._tick_ns = round(config.daemon.tick_s * 1e9)
+        self._ticks_per_step = round(config.plant.dt_s / config.daemon.tick_s)
+        shared = config.daemon.vehicle == config.daemon.mocap
+        self._again = script is not None
+        self._ticks = 0
+        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth, script=script)
+
+    def run(self, duration_s: float, over: Callable[[], bool] = lambda: False) -> None:
+        """Fly on, all the ticks that begin within `duration_s` from the start, or until it is over."""
+        for tick in range(self._ticks, round(duration_s * 1e9) // self._tick_ns):
+            if over():
+                break
+            self._tick(tick)
+            self._ticks = tick + 1
+            if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
+                self._on_progress((tick + 1) * self._tick_ns * 1e-9)
+        self.peers.flush(self._start_ns + round(duration_s * 1e9) if self._again else None)
+
+    def _tick(self, tick: int) -> None:
+        at_ns = self._start_ns + tick * self._tick_ns
+        self.peers.converse(at_ns, self._flyer.receive)
+        for outgoing in self._flyer.tick(tick, at_ns):
+            self.peers.receive(outgoing.link, outgoing.data, at_ns)

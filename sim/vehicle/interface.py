@@ -1,0 +1,314 @@
+"""What the simulated autopilot asks of whatever flies, and the linear plant made to do it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Protocol
+
+from sim.vehicle.linear import LinearVehicle
+from sim.vehicle.loops import BRAKE_MPS2, approach, brake, climb, descend
+from uavctl.records import Vec3
+
+Quaternion = tuple[float, float, float, float]  # w, x, y, z: turns body axes into NED
+
+STEER_NS = 20_000_000  # period of the linear plant's own braking, climbing and landing
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+class Supply(Protocol):
+    """A battery as telemetry sees it."""
+
+    @property
+    def voltage_v(self) -> float:
+        """At the terminals."""
+        ...
+
+    @property
+    def current_a(self) -> float:
+        """Of the load."""
+        ...
+
+    @property
+    def remaining(self) -> float:
+        """Charge left, 0 to 1."""
+        ...
+
+
+class Vehicle(Protocol):
+    """A vehicle with the loops that fly it; all vectors are local NED."""
+
+    grounded: bool  # stands on the floor with its rotors off
+
+    @property
+    def now_ns(self) -> int:
+        """How far its time has come."""
+        ...
+
+    @property
+    def has_down(self) -> bool:
+        """Whether it can climb and descend."""
+        ...
+
+    @property
+    def position_m(self) -> Vec3:
+        """True position."""
+        ...
+
+    @property
+    def velocity_mps(self) -> Vec3:
+        """True velocity."""
+        ...
+
+    @property
+    def attitude(self) -> Quaternion:
+        """Attitude: turns body axes FRD into NED."""
+        ...
+
+    @property
+    def rates_rps(self) -> Vec3:
+        """Body rates about front, right, down."""
+        ...
+
+    @property
+    def acceleration_mps2(self) -> Vec3:
+        """True acceleration at `measured_ns`; zero on the floor."""
+        ...
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of attitude, rates and acceleration: now, or the last step of its physics."""
+        ...
+
+    @property
+    def landed(self) -> bool:
+        """Whether it stands on the floor."""
+        ...
+
+    @property
+    def battery(self) -> Supply:
+        """Its battery."""
+        ...
+
+    def accelerate(self, accel_mps2: Vec3) -> None:
+        """Hold this acceleration setpoint from now on."""
+
+    def brake(self) -> None:
+        """Stop, and stay where that ends."""
+
+    def fly(self, velocity_mps: Vec3) -> None:
+        """Fly this velocity."""
+
+    def go_to(self, position_m: Vec3) -> None:
+        """Fly to this position and stay."""
+
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position, which moves with this velocity and acceleration."""
+
+    def take_off(self, height_m: float) -> None:
+        """Climb to this height above the floor, over the present place."""
+
+    def land(self) -> None:
+        """Sink at the landing speed."""
+
+    def face(self, yaw_rad: float) -> None:
+        """Turn the nose to this heading, clockwise from north."""
+
+    def rest(self) -> None:
+        """Stand on the floor, rotors off, until `grounded` is cleared."""
+
+    def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
+        """What its own loops take for position and velocity is wrong by so much from now on."""
+
+    def mislead_attitude(self, error_rad: Vec3) -> None:
+        """Turn what its own loops take for its attitude by so much about body axes, from now on."""
+
+
+@dataclass(frozen=True)
+class FullBattery:
+    """A battery that never empties."""
+
+    voltage_v: float = 4.2
+    current_a: float = 0.0
+    remaining: float = 1.0
+
+
+class _Goal(Enum):
+    """What the linear plant does by itself."""
+
+    NOTHING = auto()  # an acceleration setpoint acts
+    VELOCITY = auto()
+    POSITION = auto()
+    CLIMB = auto()
+    LAND = auto()
+
+
+class SteeredPlant:
+    """The linear plant with simple laws (`steering.py`) in place of loops; always level, its nose north.
+
+    Its laws are evaluated at `next_ns`, every 20 ms, and when something new is asked.
+    """
+
+    attitude: Quaternion = LEVEL
+    rates_rps: Vec3 = ZERO
+    battery: Supply = FullBattery()
+
+    def __init__(self, plant: LinearVehicle) -> None:
+        self._plant = plant
+        self._goal = _Goal.NOTHING
+        self._wanted: Vec3 = ZERO
+        self._ahead: Vec3 = ZERO  # velocity of a position that moves
+        self._errors: tuple[Vec3, Vec3] = (ZERO, ZERO)
+        self._steer_ns = plant.now_ns
+
+    @property
+    def next_ns(self) -> int | None:
+        """When its laws are evaluated next [ns]; None while an acceleration setpoint acts or on the floor."""
+        return None if self._goal is _Goal.NOTHING or self.grounded else self._steer_ns
+
+    @property
+    def now_ns(self) -> int:
+        """How far its time has come."""
+        return self._plant.now_ns
+
+    @property
+    def has_down(self) -> bool:
+        """Whether the plant can climb and descend."""
+        return self._plant.has_down
+
+    @property
+    def position_m(self) -> Vec3:
+        """True position."""
+        return self._plant.position_m
+
+    @property
+    def velocity_mps(self) -> Vec3:
+        """True velocity."""
+        return self._plant.velocity_mps
+
+    @property
+    def acceleration_mps2(self) -> Vec3:
+        """True acceleration; zero on the floor."""
+        return self._plant.acceleration_mps2
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of the acceleration: now."""
+        return self._plant.now_ns
+
+    @property
+    def landed(self) -> bool:
+        """Whether it has reached the floor."""
+        return self.grounded or (self.has_down and self.position_m[2] >= 0.0)
+
+    @property
+    def grounded(self) -> bool:
+        """Whether it stands on the floor."""
+        return self._plant.grounded
+
+    @grounded.setter
+    def grounded(self, grounded: bool) -> None:
+        self._plant.grounded = grounded
+
+    def accelerate(self, accel_mps2: Vec3) -> None:
+        """Hold this acceleration setpoint from now on."""
+        self._goal = _Goal.NOTHING
+        self._plant.accelerate(accel_mps2)
+
+    def brake(self) -> None:
+        """Stop."""
+        self._ask(_Goal.VELOCITY, ZERO)
+
+    def fly(self, velocity_mps: Vec3) -> None:
+        """Fly this velocity."""
+        self._ask(_Goal.VELOCITY, velocity_mps)
+
+    def go_to(self, position_m: Vec3) -> None:
+        """Fly to this position."""
+        self._ask(_Goal.POSITION, position_m)
+
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position, which moves with this velocity; its acceleration is not used."""
+        del accel_mps2
+        self._ask(_Goal.POSITION, position_m, velocity_mps)
+
+    def take_off(self, height_m: float) -> None:
+        """Climb to this height above the floor."""
+        self._ask(_Goal.CLIMB, (0.0, 0.0, -height_m))
+
+    def land(self) -> None:
+        """Sink at the landing speed."""
+        self._ask(_Goal.LAND, ZERO)
+
+    def face(self, yaw_rad: float) -> None:
+        """Nothing: the nose stays north."""
+
+    def rest(self) -> None:
+        """Stand on the floor until `grounded` is cleared."""
+        self._goal = _Goal.NOTHING
+        self._plant.rest()
+
+    def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
+        """What its laws take for position and velocity is wrong by so much from now on."""
+        self._errors = (position_error_m, velocity_error_mps)
+
+    def mislead_attitude(self, error_rad: Vec3) -> None:
+        """Do nothing: its laws know no attitude."""
+
+    def steer(self) -> None:
+        """Evaluate the law of what is asked, and hold its acceleration."""
+        self._steer_ns = self.now_ns + STEER_NS
+        where, speed = self._plant.position_m, self._plant.velocity_mps
+        off_m, off_mps = self._errors
+        place = (where[0] + off_m[0], where[1] + off_m[1], where[2] + off_m[2])
+        motion = (speed[0] + off_mps[0], speed[1] + off_mps[1], speed[2] + off_mps[2])
+        self._plant.accelerate(self._law(place, motion))
+
+    def _ask(self, goal: _Goal, wanted: Vec3, ahead: Vec3 = ZERO) -> None:
+        self._goal, self._wanted, self._ahead = goal, wanted, ahead
+        if not self.grounded:
+            self.steer()
+
+    def _law(self, place: Vec3, motion: Vec3) -> Vec3:
+        wanted = self._wanted
+        if self._goal is _Goal.POSITION:
+            near, ahead = approach(place, self._wanted), self._ahead
+            wanted = (near[0] + ahead[0], near[1] + ahead[1], near[2] + ahead[2])
+        elif self._goal in (_Goal.CLIMB, _Goal.LAND):
+            wanted = ZERO
+        north, east, down = brake(tuple_minus(motion, wanted), BRAKE_MPS2)
+        if self._goal is _Goal.CLIMB and self.has_down:
+            down = climb(place[2], motion[2], self._wanted[2])
+        elif self._goal is _Goal.LAND and self.has_down:
+            down = descend(motion[2])
+        return north, east, down
+
+
+def tuple_minus(a: Vec3, b: Vec3) -> Vec3:
+    """Difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def heading_rad(attitude: Quaternion) -> float:
+    """Heading of an attitude, clockwise from north."""
+    w, x, y, z = attitude
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
+    """A vector in body axes, in NED."""
+    w, x, y, z = attitude
+    bx, by, bz = body
+    return (
+        (1.0 - 2.0 * (y * y + z * z)) * bx + 2.0 * (x * y - w * z) * by + 2.0 * (x * z + w * y) * bz,
+        2.0 * (x * y + w * z) * bx + (1.0 - 2.0 * (x * x + z * z)) * by + 2.0 * (y * z - w * x) * bz,
+        2.0 * (x * z - w * y) * bx + 2.0 * (y * z + w * x) * by + (1.0 - 2.0 * (x * x + y * y)) * bz,
+    )
+
+
+def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:
+    """A vector in NED, in body axes."""
+    w, x, y, z = attitude
+    return rotated((w, -x, -y, -z), ned)

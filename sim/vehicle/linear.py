@@ -1,0 +1,338 @@
+"""The simulated vehicle's motion: the linear plant, advanced exactly in continuous time.
+
+Built from the configuration by the simulator's own code, not by the controller's plant, so that
+a mistake in one of them shows as a disagreement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm, logm
+
+from sim.channel import UnderWay
+from uavctl.config.types import Config, PlantConfig
+from uavctl.errors import DesignError
+from uavctl.records import Vec3
+
+# A flight with everything given that is drawn otherwise: for flying one run of a campaign again.
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Script:
+    """What the simulated vehicle and the radio channel do, in place of the configuration's plant, link and draws."""
+
+    plant: PlantConfig  # the plant that flies; the controller may believe in another one
+    start: Array  # its state at the start (n_x,)
+    disturbances: Array  # w of each step (T, n_w); zero after the last one
+    # Delay of each position sent [ns], None for one that is lost; those after the last one are lost
+    delays_ns: tuple[int | None, ...]
+
+
+class ScriptedChannel(UnderWay):
+    """One direction of a radio link that loses and delays the packets that it is told to.
+
+    Args:
+        delays_ns: Of each packet [ns], None for one that is lost; those after the last one are lost.
+    """
+
+    def __init__(self, delays_ns: tuple[int | None, ...]) -> None:
+        super().__init__()
+        self._delays_ns = delays_ns
+        self._number = 0  # of the next packet
+
+    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
+        """Send a packet at `at_ns`; a `certain` one is not lost, and not late if it was to be lost."""
+        number = self._number
+        self._number += 1
+        self.counters.sent += 1
+        delay_ns = self._delays_ns[number] if number < len(self._delays_ns) else None
+        if delay_ns is None and not certain:
+            self.counters.lost += 1
+            return
+        arrival_ns = at_ns + (delay_ns or 0)
+        self._let_through(arrival_ns, arrival_ns, data)
+
+    def pass_over(self, at_ns: int) -> None:
+        """Nothing is sent where a packet was due: the next one is told what goes for the packet after."""
+        del at_ns
+        self._number += 1
+
+
+NED_AXES = ("north", "east", "down")
+# A setpoint beyond ten g is no acceleration that a multicopter can try; it is limited there, and
+# the numbers stay finite whatever a client sends.
+MAX_ACCEL_MPS2 = 100.0
+# Closeness of expm(logm(M)) to M that proves the continuous-time model, relative to |M|.
+LOGARITHM_TOLERANCE = 1e-9
+# Sub-steps kept at hand; a lockstep run needs fewer than ten, a run on sockets any number.
+CACHED_TRANSITIONS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """x(k+1) = A x + B u + E w, w ~ N(0, W), with the generator of its continuous-time flow."""
+
+    a: Array  # A (n_x, n_x)
+    b: Array  # B (n_x, n_u)
+    e: Array  # E (n_x, n_w)
+    w_root: Array  # symmetric square root of W (n_w, n_w)
+    flow: Array  # G (n, n), n = n_x + n_u + n_w, with expm(G Δt) = [[A, B, E], [0, I]] [1/s]
+    dt_ns: int  # δt [ns]
+    axes: tuple[int, ...]  # index in NED of each plant axis
+    position_index: tuple[int, ...]  # state index of each axis' position
+    velocity_index: tuple[int, ...]  # state index of each axis' velocity
+    accel_per_input: Array  # (n_u,) acceleration setpoint per unit of input
+
+    def transition(self, duration_ns: int) -> tuple[Array, Array, Array]:
+        """A, B, E of a step of `duration_ns` with u and w held; those of the plant for Δt itself."""
+        if duration_ns == self.dt_ns:
+            return self.a, self.b, self.e
+        return _split(expm(self.flow * (duration_ns * 1e-9)), *self.b.shape)
+
+
+def _split(m: Array, n_x: int, n_u: int) -> tuple[Array, Array, Array]:
+    return m[:n_x, :n_x], m[:n_x, n_x : n_x + n_u], m[:n_x, n_x + n_u :]
+
+
+def linear_model(plant: PlantConfig) -> LinearModel:
+    """Build the model of either kind from its configuration.
+
+    Raises:
+        DesignError: the matrices have no real logarithm, so there is no motion between the steps.
+    """
+    if plant.model == "matrices":
+        a, b, e = (np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e))
+        w = np.array(plant.w, dtype=np.float64)
+        flow = _generator(a, b, e, plant.dt_s)
+        position, velocity, gain = plant.position_index, plant.velocity_index, plant.accel_per_input
+    else:
+        n = len(plant.axes)
+        each = plant.states_per_axis
+        if plant.model == "drag-lag":
+            flow, deviations = _drag_lag_flow(plant), np.array(plant.wind_std_mps2)
+        else:
+            flow = _velocity_reference_flow(plant)
+            drift = np.array(plant.force_drift_mps2_rts) / np.sqrt(plant.dt_s)
+            deviations = np.column_stack([plant.wind_std_mps2, plant.input_std_mps2, drift]).ravel()
+        a, b, e = _split(expm(flow * plant.dt_s), each * n, n)
+        w = np.diag(np.square(deviations))
+        position, velocity, gain = tuple(range(0, each * n, each)), tuple(range(1, each * n, each)), (1.0,) * n
+    eigenvalues, vectors = np.linalg.eigh(w)
+    return LinearModel(
+        a=a,
+        b=b,
+        e=e,
+        w_root=(vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T,
+        flow=flow,
+        dt_ns=round(plant.dt_s * 1e9),
+        axes=tuple(NED_AXES.index(axis) for axis in plant.axes),
+        position_index=position,
+        velocity_index=velocity,
+        accel_per_input=np.array(gain, dtype=np.float64),
+    )
+
+
+def _drag_lag_flow(plant: PlantConfig) -> Array:
+    """Continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a, each axis."""
+    n = len(plant.axes)
+    axis = [
+        np.array([[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]])
+        for c, lag in zip(plant.drag_1ps, plant.lag_s, strict=True)
+    ]
+    flow = np.zeros((5 * n, 5 * n))
+    flow[: 3 * n, : 3 * n] = block_diag(*axis)
+    for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s, strict=True)):
+        flow[3 * i + 2, 3 * n + i] = gain / lag
+        flow[3 * i + 1, 4 * n + i] = 1.0
+    return flow
+
+
+def _velocity_reference_flow(plant: PlantConfig) -> Array:
+    """Continuous-time generator of the vehicle's own loops on a reference that the input accelerates, each axis.
+
+    In the coordinates of the loops: reference P, V with P' = V, V' = u; the acceleration b that they make; their
+    integral j; the force f. The states are linear in these.
+    """
+    n = len(plant.axes)
+    states = 6 * n
+    flow = np.zeros((10 * n, 10 * n))
+    for axis in range(n):
+        kp, kv, ki = plant.position_1ps[axis], plant.velocity_1ps[axis], plant.integral_1ps2[axis]
+        c, lag = plant.drag_1ps[axis], plant.lag_s[axis]
+        loops = np.zeros((10, 10))  # p, v, b, P, V, j, f, u, w, n
+        loops[0, 1] = 1.0
+        loops[1, [1, 2, 6, 8]] = [-c, 1.0, 1.0, 1.0]
+        loops[2, [0, 1, 2, 3, 4, 5, 7]] = np.array([-kv * kp, -kv, -1.0, kv * kp, kv, 1.0, 1.0]) / lag
+        loops[3, 4] = 1.0
+        loops[4, 7] = 1.0
+        loops[5, [0, 1, 3, 4]] = [-ki * kp, -ki, ki * kp, ki]
+        loops[6, 9] = 1.0
+        seen = np.zeros((9, 10))  # p, v, b + f, P - p, V - v, j + f, u, w, n
+        seen[[0, 1], [0, 1]] = 1.0
+        seen[2, [2, 6]] = 1.0
+        seen[3, [3, 0]] = [1.0, -1.0]
+        seen[4, [4, 1]] = [1.0, -1.0]
+        seen[5, [5, 6]] = 1.0
+        seen[[6, 7, 8], [7, 8, 9]] = 1.0
+        meant = np.zeros((10, 9))  # one of the loops' states that are seen so: that without a force
+        meant[[0, 1, 2, 5], [0, 1, 2, 5]] = 1.0
+        meant[3, [0, 3]] = meant[4, [1, 4]] = 1.0
+        meant[[7, 8, 9], [6, 7, 8]] = 1.0
+        one = seen @ loops @ meant
+        disturbed = 7 * n + 3 * axis
+        places = [*range(6 * axis, 6 * axis + 6), states + axis, disturbed, disturbed + 2]
+        flow[np.ix_(places, places)] = one
+        flow[:, disturbed + 1] = flow[:, states + axis]
+    return flow
+
+
+def _generator(a: Array, b: Array, e: Array, dt_s: float) -> Array:
+    """Matrix logarithm of [[A, B, E], [0, I]] over Δt."""
+    n_x, held = a.shape[0], b.shape[1] + e.shape[1]
+    m = np.block([[a, b, e], [np.zeros((held, n_x)), np.eye(held)]])
+    if np.linalg.matrix_rank(a) == n_x:
+        logarithm = np.asarray(logm(m))
+        real = np.ascontiguousarray(logarithm.real, dtype=np.float64)
+        if np.abs(expm(real) - m).max() <= LOGARITHM_TOLERANCE * np.abs(m).max():
+            return real / dt_s
+    raise DesignError(
+        "plant.a",
+        "has no real matrix logarithm, so the simulated vehicle has no motion within a step",
+        "use a plant whose A comes from a continuous-time model (no eigenvalue at or below 0)",
+    )
+
+
+class LinearVehicle:
+    """State of the plant at one moment, moved forward by `advance`.
+
+    w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
+    changed. Axes that the plant has not stay at their start position. With a `script`, plant, start and w are its.
+
+    Attributes:
+        attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
+    """
+
+    attitude = (1.0, 0.0, 0.0, 0.0)
+
+    def __init__(
+        self, config: Config, seed: np.random.SeedSequence, start_ns: int, script: Script | None = None
+    ) -> None:
+        self.model = linear_model(config.plant if script is None else script.plant)
+        self._speeding = self.model.flow[list(self.model.velocity_index)]  # rows of v'
+        self._rng = np.random.default_rng(seed)
+        self._given = None if script is None else iter(script.disturbances)
+        self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
+        self._offset_m = config.sim.start_position_m
+        x = np.zeros(self.model.a.shape[0])
+        for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
+            x[p] = config.sim.start_position_m[axis]
+            x[v] = config.sim.start_velocity_mps[axis]
+        if script is not None:
+            x = script.start.copy()
+        self._anchor_x: Array = x  # state at the last change of u or w
+        self._anchor_ns = start_ns
+        self._x: Array | None = x  # state now, once asked for
+        self._u: Array = np.zeros(self.model.b.shape[1])
+        self._w: Array = self._draw()
+        self._next_boundary_ns = start_ns + self.model.dt_ns
+        self.now_ns = start_ns
+        self.grounded = False
+
+    def _draw(self) -> Array:
+        if self._given is not None:
+            return next(self._given, np.zeros(self.model.e.shape[1]))
+        return self.model.w_root @ self._rng.standard_normal(self.model.w_root.shape[0])
+
+    @property
+    def has_down(self) -> bool:
+        """Whether the plant can climb and descend."""
+        return NED_AXES.index("down") in self.model.axes
+
+    @property
+    def state(self) -> Array:
+        """State x (n_x,) now."""
+        if self._x is None:
+            a, b, e = self._transition(self.now_ns - self._anchor_ns)
+            self._x = a @ self._anchor_x + b @ self._u + e @ self._w
+        return self._x
+
+    @property
+    def input(self) -> Array:
+        """Input u (n_u,) that acts now, in the plant's units."""
+        return self._u
+
+    @property
+    def position_m(self) -> Vec3:
+        """Position in local NED [m]."""
+        return self._vec3(self.model.position_index, self._offset_m)
+
+    @property
+    def velocity_mps(self) -> Vec3:
+        """Velocity in local NED [m/s]; zero along axes that the plant has not."""
+        return self._vec3(self.model.velocity_index, (0.0, 0.0, 0.0))
+
+    @property
+    def acceleration_mps2(self) -> Vec3:
+        """Acceleration in local NED [m/s²]; zero along axes that the plant has not, and on the floor."""
+        values = [0.0, 0.0, 0.0]
+        if not self.grounded:
+            changes = self._speeding @ np.concatenate((self.state, self._u, self._w))
+            for axis, value in zip(self.model.axes, changes.tolist(), strict=True):
+                values[axis] = value
+        return values[0], values[1], values[2]
+
+    def _vec3(self, index: tuple[int, ...], default: Vec3) -> Vec3:
+        values = list(default)
+        state = self.state
+        for axis, i in zip(self.model.axes, index, strict=True):
+            values[axis] = state.item(i)
+        return values[0], values[1], values[2]
+
+    def advance(self, to_ns: int) -> None:
+        """Move on to `to_ns`, through every boundary up to and including it."""
+        if to_ns < self.now_ns:
+            raise ValueError(f"time cannot go back from {self.now_ns} to {to_ns} ns")
+        while self._next_boundary_ns <= to_ns:
+            self._move(self._next_boundary_ns)
+            self._re_anchor()
+            self._w = self._draw()
+            self._next_boundary_ns += self.model.dt_ns
+        self._move(to_ns)
+
+    def _move(self, to_ns: int) -> None:
+        if to_ns == self.now_ns:
+            return
+        self.now_ns = to_ns
+        if self.grounded:
+            self._anchor_ns = to_ns
+        else:
+            self._x = None
+
+    def _re_anchor(self) -> None:
+        self._anchor_x = self.state
+        self._anchor_ns = self.now_ns
+
+    def accelerate(self, accel_mps2: Vec3) -> None:
+        """Hold this acceleration setpoint from now on; axes that the plant has not ignore it."""
+        wanted = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
+        u = np.array(wanted) / self.model.accel_per_input
+        if not np.array_equal(u, self._u):
+            self._re_anchor()
+            self._u = u
+
+    def rest(self) -> None:
+        """Stand on the floor (z = 0): at rest, with no input, until `grounded` is cleared."""
+        x = np.zeros_like(self.state)
+        for axis, p in zip(self.model.axes, self.model.position_index, strict=True):
+            x[p] = 0.0 if NED_AXES[axis] == "down" else self.state[p]
+        self._x = self._anchor_x = x
+        self._anchor_ns = self.now_ns
+        self._u = np.zeros_like(self._u)
+        self.grounded = True

@@ -1,0 +1,472 @@
+"""Outer loops of the cascade: what is asked of the vehicle, the reference that it follows, the acceleration it wants.
+
+A reference (position, velocity, acceleration) moves within limits towards what is asked; a proportional position
+loop
+and a proportional-integral velocity loop hold the vehicle on it. What distinguishes the autopilots is what an
+acceleration setpoint does: ArduPilot moves the reference with it, so zero keeps the velocity and rejects wind; PX4
+flies it open loop, so wind, drag and the error of its hover thrust show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Literal, NamedTuple
+
+from sim.vehicle.rigid_body import GRAVITY_MPS2, Airframe, BodyState, Quaternion
+from uavctl.records import Vec3
+
+# Inner loops of the cascade: from a wanted acceleration to thrust and attitude, to body rates, to torque.
+
+
+# Gains of the rate loop for a Crazyflie. With the derivative gain D the motors' lag of 65 ms acts like 65/(1 + D) ms.
+RATE_GAIN_1PS = 110.0
+RATE_DERIVATIVE = 3.0
+RATE_INTEGRAL_1PS2 = 200.0
+YAW_RATE_GAIN_1PS = 6.0
+YAW_INTEGRAL_1PS2 = 6.0
+DERIVATIVE_LAG_S = 0.004
+MAX_RATE_RPS = math.radians(220.0)
+MAX_YAW_RATE_RPS = math.radians(90.0)
+LEAST_UP_MPS2 = 1.0  # thrust asked for is never less than this much upward: the lean stays defined
+
+
+@dataclass(frozen=True)
+class Lean:
+    """A wanted thrust per mass and the attitude that points it."""
+
+    force_mps2: Vec3  # specific force wanted of the rotors, NED
+    attitude: Quaternion  # that points the rotors along it with the wanted heading
+    limited: bool  # whether the largest tilt kept the horizontal part below the wanted one
+    dive_limited: bool  # whether a dive was wanted in which no thrust would be left to lean
+
+
+def lean(accel_mps2: Vec3, yaw_rad: float, tilt_limit_rad: float) -> Lean:
+    """The lean that gives an acceleration in still air; height comes before way where the tilt is limited."""
+    north, east = accel_mps2[0], accel_mps2[1]
+    wanted_up = GRAVITY_MPS2 - accel_mps2[2]
+    up = max(wanted_up, LEAST_UP_MPS2)
+    level = math.sqrt(north * north + east * east)
+    most = up * math.tan(tilt_limit_rad)
+    limited = level > most
+    if limited:
+        north, east = north * most / level, east * most / level
+    norm = math.sqrt(north * north + east * east + up * up)
+    # Body-down is against the force; half-angle formula of the shortest turn from down to there, then the heading.
+    bx, by, bz = -north / norm, -east / norm, up / norm
+    w = math.sqrt(0.5 * (1.0 + bz))
+    x, y = -0.5 * by / w, 0.5 * bx / w
+    c, s = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
+    attitude = (w * c, x * c + y * s, y * c - x * s, w * s)
+    return Lean((north, east, -up), attitude, limited, up != wanted_up)
+
+
+class AttitudeLoop:
+    """Attitude error to rates, proportional; rates to torque with proportional, integral and derivative parts.
+
+    Args:
+        airframe: its inertia turns angular accelerations into torques.
+        attitude_gain_1ps: rate per angle of roll and pitch; yaw has a quarter of it.
+    """
+
+    def __init__(self, airframe: Airframe, attitude_gain_1ps: float, step_s: float) -> None:
+        self._inertia = airframe.inertia_kgm2
+        self._gain = attitude_gain_1ps
+        self._step_s = step_s
+        self._smooth = 1.0 - math.exp(-step_s / DERIVATIVE_LAG_S)
+        self.reset((0.0, 0.0, 0.0))
+
+    def reset(self, rates_rps: Vec3) -> None:
+        """Forget the past; the body turns at these rates."""
+        self._last = rates_rps
+        self._slope: Vec3 = (0.0, 0.0, 0.0)
+        self._integral: Vec3 = (0.0, 0.0, 0.0)
+
+    def torque(self, motion: BodyState, attitude: Quaternion, *, integrate: bool) -> Vec3:
+        """Torque [N m] that turns the body towards an attitude; `integrate` is false at the rotors' limits."""
+        w, x, y, z = motion.attitude
+        a, b, c, d = attitude
+        ew, ex = w * a + x * b + y * c + z * d, w * b - x * a - y * d + z * c
+        ey, ez = w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a
+        # As the autopilots do it: the shortest turn that points the thrust first, whatever the heading still lacks.
+        upright = math.sqrt(ew * ew + ez * ez)
+        if upright > 0.0:
+            ex, ey = (ew * ex - ey * ez) / upright, (ew * ey + ex * ez) / upright
+        p, q = 2.0 * self._gain * ex, 2.0 * self._gain * ey
+        r = math.copysign(0.5, ew) * self._gain * ez
+        size = math.sqrt(p * p + q * q)
+        if size > MAX_RATE_RPS:
+            p, q = p * MAX_RATE_RPS / size, q * MAX_RATE_RPS / size
+        r = min(max(r, -MAX_YAW_RATE_RPS), MAX_YAW_RATE_RPS)
+        return self._rate_loop(motion.rates_rps, (p, q, r), integrate)
+
+    def _rate_loop(self, rates: Vec3, wanted: Vec3, integrate: bool) -> Vec3:
+        (lp, lq, lr), (sp, sq, sr), (ip, iq, ir) = self._last, self._slope, self._integral
+        p, q, r = rates
+        smooth = self._smooth
+        per_step = 1.0 / self._step_s
+        sp += smooth * ((p - lp) * per_step - sp)
+        sq += smooth * ((q - lq) * per_step - sq)
+        sr += smooth * ((r - lr) * per_step - sr)
+        ep, eq, er = wanted[0] - p, wanted[1] - q, wanted[2] - r
+        if integrate:
+            tilting, turning = RATE_INTEGRAL_1PS2 * self._step_s, YAW_INTEGRAL_1PS2 * self._step_s
+            ip, iq, ir = ip + tilting * ep, iq + tilting * eq, ir + turning * er
+        self._last, self._slope, self._integral = rates, (sp, sq, sr), (ip, iq, ir)
+        jx, jy, jz = self._inertia
+        return (
+            jx * (RATE_GAIN_1PS * ep + ip - RATE_DERIVATIVE * sp),
+            jy * (RATE_GAIN_1PS * eq + iq - RATE_DERIVATIVE * sq),
+            jz * (YAW_RATE_GAIN_1PS * er + ir),
+        )
+
+
+# Simple laws by which the simulated vehicle moves itself, on its true state; gains in 1/s.
+
+
+BRAKE_MPS2 = 2.5  # as recorded of ArduCopter after its setpoint timeout
+BRAKE_GAIN = 2.0
+LAND_MPS = 0.5  # LAND_SPEED of the recorded ArduCopter
+CLIMB_MPS = 1.0
+CLIMB_GAIN = 0.8
+CRUISE_MPS = 5.0
+
+
+def brake(velocity_mps: Vec3, limit_mps2: float) -> Vec3:
+    """Acceleration against the velocity: proportional to it, its norm at most the limit."""
+    speed = math.hypot(*velocity_mps)
+    gain = min(BRAKE_GAIN, limit_mps2 / speed) if speed > 0.0 else 0.0
+    north, east, down = velocity_mps
+    return -gain * north, -gain * east, -gain * down
+
+
+def descend(down_mps: float) -> float:
+    """Downward acceleration that settles at the landing speed."""
+    return BRAKE_GAIN * (LAND_MPS - down_mps)
+
+
+def climb(down_m: float, down_mps: float, to_m: float) -> float:
+    """Downward acceleration towards the height `to_m` (NED down), at the climbing speed at most."""
+    wanted = min(max(CLIMB_GAIN * (to_m - down_m), -CLIMB_MPS), CLIMB_MPS)
+    return BRAKE_GAIN * (wanted - down_mps)
+
+
+def approach(place_m: Vec3, to_m: Vec3) -> Vec3:
+    """Velocity towards a position: proportional to the way, at most the cruising and the climbing speed."""
+    north, east, down = (CLIMB_GAIN * (to - at) for at, to in zip(place_m, to_m, strict=True))
+    level = math.hypot(north, east)
+    slow = CRUISE_MPS / level if level > CRUISE_MPS else 1.0
+    return slow * north, slow * east, min(max(down, -CLIMB_MPS), CLIMB_MPS)
+
+
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+# Reference: within these limits a velocity is reached with a gain such that the jerk limit is met by itself.
+REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
+REFERENCE_GAIN_1PS = 2.0
+REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
+CRAWL_BELOW_M = 1.0  # PX4's MPC_LAND_ALT3
+CARRIED_S = 3.0  # ArduPilot moves a position on with its velocity for so long (GUID_TIMEOUT), then it stays
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How an autopilot flies."""
+
+    open_loop: bool  # whether an acceleration setpoint is flown as it comes
+    dead_time_s: float  # from taking an acceleration setpoint, or one of a position that moves, to acting on it
+    tilt_limit_rad: float  # largest lean
+    jerk_mps3: float  # limit of the change of an acceleration setpoint; infinite is none
+    attitude_gain_1ps: float  # of the attitude loop
+    position_1ps: float  # gain of the position loop, horizontal
+    position_down_1ps: float  # the same, vertical
+    velocity_1ps: float  # gain of the velocity loop, horizontal
+    velocity_down_1ps: float  # the same, vertical
+    integral_1ps2: float  # integral gain of the velocity loop, horizontal
+    integral_down_1ps2: float  # the same, vertical
+    hover_error: float  # relative error of the thrust that the autopilot takes for hovering
+    # of a loop that holds the vertical acceleration by the thrust; 0 is none, and the thrust that is reckoned for an
+    # acceleration is given at once
+    thrust_gain: float = 0.0
+    thrust_integral_1ps: float = 0.0  # integral gain of that loop
+    land_mps: float = LAND_MPS  # with which it sinks to land
+    crawl_mps: float = LAND_MPS  # the same near the floor
+    climb_mps: float = CLIMB_MPS  # with which it takes off, at most
+    # speed of a take-off per metre that is left; more than half a metre a second overshoots
+    climb_1ps: float = REFERENCE_POSITION_1PS
+
+
+# ArduPilot gives throttle for the error of the vertical acceleration alone: PSC_ACCZ_P 0.5 and PSC_ACCZ_I 1, a
+# thousandth of it for 1 cm/s2, on a vehicle that hovers at a throttle of 0.39 (MOT_THST_HOVER as recorded).
+THROTTLE_MPS2 = GRAVITY_MPS2 / 0.39
+# Outer gains are the autopilots' defaults (PSC_POSXY_P, PSC_VELXY_P and so on; MPC_XY_P, MPC_XY_VEL_P_ACC and so on);
+# dead time, attitude gain and hover error are fitted to the recorded flights, see docs/vehicle.md.
+TUNINGS = {
+    "ardupilot": Tuning(
+        open_loop=False,
+        dead_time_s=0.0,
+        tilt_limit_rad=math.radians(30.0),
+        jerk_mps3=5.0,
+        attitude_gain_1ps=7.0,
+        position_1ps=1.0,
+        position_down_1ps=1.0,
+        velocity_1ps=2.0,
+        velocity_down_1ps=5.0,
+        integral_1ps2=1.0,
+        integral_down_1ps2=0.0,
+        hover_error=0.0,
+        thrust_gain=0.05 * THROTTLE_MPS2,
+        thrust_integral_1ps=0.1 * THROTTLE_MPS2,
+        climb_mps=1.7,  # as recorded, to 1.2, 2 and 5 m; overshoots by a tenth of a metre
+        climb_1ps=1.0,
+    ),
+    "px4": Tuning(
+        open_loop=True,
+        dead_time_s=0.08,
+        tilt_limit_rad=math.radians(45.0),
+        jerk_mps3=math.inf,
+        attitude_gain_1ps=5.0,
+        position_1ps=0.95,
+        position_down_1ps=1.0,
+        velocity_1ps=1.8,
+        velocity_down_1ps=4.0,
+        integral_1ps2=0.4,
+        integral_down_1ps2=2.0,
+        hover_error=0.0153,
+        land_mps=0.7,  # MPC_LAND_SPEED and MPC_LAND_CRWL, as recorded
+        crawl_mps=0.3,
+        climb_mps=1.1,  # as recorded, to 1.2 and 5 m
+        climb_1ps=0.53,
+    ),
+}
+
+
+class LoopDemand(Enum):
+    """What is asked of the vehicle."""
+
+    ACCELERATION = auto()
+    VELOCITY = auto()
+    POSITION = auto()
+    MOTION = auto()
+    CLIMB = auto()
+    LANDING = auto()
+
+
+class _Asked(NamedTuple):
+    """A setpoint that waits out the dead time; a motion has a position, a velocity and an acceleration."""
+
+    due: int  # step in which it acts
+    demand: LoopDemand
+    wanted: Vec3
+    velocity: Vec3 = ZERO
+    accel: Vec3 = ZERO
+
+
+class Cascade:
+    """From what is asked to a lean, once per step.
+
+    Attributes:
+        yaw_rad: heading to hold.
+    """
+
+    def __init__(self, autopilot: Literal["px4", "ardupilot"], step_s: float) -> None:
+        self.tuning = TUNINGS[autopilot]
+        self.yaw_rad = 0.0
+        self._step_s = step_s
+        self._dead_steps = round(self.tuning.dead_time_s / step_s)
+        self._steps = 0
+        self._coming: deque[_Asked] = deque()  # taken, and not acting yet
+        self._carried_steps = 0  # for which a position has moved on by itself
+        self._demand = LoopDemand.ACCELERATION
+        self._wanted: Vec3 = ZERO
+        self._position: Vec3 = ZERO
+        self._velocity: Vec3 = ZERO
+        self._accel: Vec3 = ZERO
+        self._integral: Vec3 = ZERO
+        self._thrust_mps2 = 0.0  # integral of the loop on the vertical acceleration
+
+    def begin(self, motion: BodyState) -> None:
+        """Begin anew from this motion, with zero acceleration."""
+        self._coming.clear()
+        self._demand, self._wanted = LoopDemand.ACCELERATION, ZERO
+        self._accel = self._integral = ZERO
+        self._thrust_mps2 = 0.0
+        self._carry(motion)
+
+    def accelerate(self, accel_mps2: Vec3) -> None:
+        """Fly this acceleration (NED), after the autopilot's dead time."""
+        self._take(_Asked(self._steps + self._dead_steps, LoopDemand.ACCELERATION, accel_mps2))
+
+    def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
+        """Be at this position (NED), which moves with this velocity and acceleration, after the dead time.
+
+        PX4 takes each for what it is, until the next comes; ArduPilot moves it on in between.
+        """
+        due = self._steps + self._dead_steps
+        self._take(_Asked(due, LoopDemand.MOTION, position_m, velocity_mps, accel_mps2))
+
+    def _take(self, asked: _Asked) -> None:
+        if self._coming and self._coming[-1].due == asked.due:
+            self._coming.pop()
+        self._coming.append(asked)
+
+    def fly(self, velocity_mps: Vec3) -> None:
+        """Fly this velocity (NED); zero stops, and stays where that ends."""
+        self._coming.clear()
+        self._demand, self._wanted = LoopDemand.VELOCITY, velocity_mps
+
+    def go_to(self, position_m: Vec3) -> None:
+        """Fly to this position (NED) and stay."""
+        self._coming.clear()
+        self._demand, self._wanted = LoopDemand.POSITION, position_m
+
+    def take_off(self, height_m: float) -> None:
+        """Climb to this height above the origin, over the present place."""
+        self._coming.clear()
+        self._demand, self._wanted = LoopDemand.CLIMB, (self._position[0], self._position[1], -height_m)
+
+    def land(self) -> None:
+        """Sink at the landing speed, over the present place."""
+        self._coming.clear()
+        self._demand, self._wanted = LoopDemand.LANDING, (0.0, 0.0, self.tuning.land_mps)
+
+    def listen(self) -> None:
+        """Begin a step: what has waited out the dead time is asked from now on."""
+        if self._coming and self._coming[0].due <= self._steps:
+            _, self._demand, self._wanted, velocity, accel = self._coming.popleft()
+            if self._demand is LoopDemand.MOTION:
+                self._position, self._velocity, self._accel = self._wanted, velocity, accel
+                self._carried_steps = 0
+        self._steps += 1
+
+    @property
+    def climbs(self) -> bool:
+        """Whether what is asked leads up from the floor."""
+        return self._wanted[2] < 0.0
+
+    def stand(self, motion: BodyState) -> None:
+        """A step on the floor: the reference stays with the vehicle, and nothing is left of the flight before."""
+        self._accel = self._integral = ZERO
+        self._thrust_mps2 = 0.0
+        self._carry(motion)
+
+    def step(self, motion: BodyState, *, thrust_limited: bool, fall_mps2: float = 0.0) -> Lean:
+        """A step in the air: the lean to take now.
+
+        Args:
+            motion: of the vehicle, as its loops see it.
+            thrust_limited: whether the rotors could not give the thrust of the last step.
+            fall_mps2: downward acceleration in the last step, as accelerometers feel it.
+        """
+        if self._demand is LoopDemand.ACCELERATION:
+            self._follow_acceleration()
+            if self.tuning.open_loop:
+                self._carry(motion)
+                north, east, down = self._accel
+                return self._lean((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
+        elif self._demand is LoopDemand.VELOCITY:
+            self._follow_velocity(self._wanted)
+        elif self._demand is LoopDemand.LANDING:
+            near = -motion.position_m[2] < CRAWL_BELOW_M
+            self._follow_velocity((0.0, 0.0, self.tuning.crawl_mps if near else self.tuning.land_mps))
+        elif self._demand is LoopDemand.POSITION:
+            self._follow_position(REFERENCE_POSITION_1PS, CLIMB_MPS)
+        elif self._demand is LoopDemand.CLIMB:
+            self._follow_position(self.tuning.climb_1ps, self.tuning.climb_mps)
+        else:
+            self._carry_on()
+            return self._track(motion, thrust_limited, fall_mps2)
+        self._move_reference()
+        return self._track(motion, thrust_limited, fall_mps2)
+
+    def _lean(self, accel: Vec3) -> Lean:
+        return lean(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
+
+    # The reference
+
+    def _carry(self, motion: BodyState) -> None:
+        self._position, self._velocity = motion.position_m, motion.velocity_mps
+
+    def _follow_acceleration(self) -> None:
+        """Change the reference acceleration within the jerk limit; no more than the tilt limit can give."""
+        north, east, down = self._wanted
+        most = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
+        level = math.sqrt(north * north + east * east)
+        if level > most:
+            north, east = north * most / level, east * most / level
+        change = self.tuning.jerk_mps3 * self._step_s
+        dn, de, dd = north - self._accel[0], east - self._accel[1], down - self._accel[2]
+        level = math.sqrt(dn * dn + de * de)
+        if level > change:
+            north, east = self._accel[0] + dn * change / level, self._accel[1] + de * change / level
+        self._accel = (north, east, self._accel[2] + min(max(dd, -change), change))
+
+    def _follow_velocity(self, wanted: Vec3) -> None:
+        vn, ve, vd = self._velocity
+        north, east = REFERENCE_GAIN_1PS * (wanted[0] - vn), REFERENCE_GAIN_1PS * (wanted[1] - ve)
+        down = REFERENCE_GAIN_1PS * (wanted[2] - vd)
+        level = math.sqrt(north * north + east * east)
+        if level > REFERENCE_ACCEL_MPS2:
+            north, east = north * REFERENCE_ACCEL_MPS2 / level, east * REFERENCE_ACCEL_MPS2 / level
+        self._accel = (north, east, min(max(down, -REFERENCE_ACCEL_MPS2), REFERENCE_ACCEL_MPS2))
+
+    def _follow_position(self, down_1ps: float, climb_mps: float) -> None:
+        dn, de = self._wanted[0] - self._position[0], self._wanted[1] - self._position[1]
+        dd = self._wanted[2] - self._position[2]
+        far = math.sqrt(dn * dn + de * de)
+        speed = _approach(far, CRUISE_MPS, REFERENCE_POSITION_1PS) / far if far > 0.0 else 0.0
+        down = math.copysign(_approach(abs(dd), climb_mps, down_1ps), dd)
+        self._follow_velocity((speed * dn, speed * de, down))
+
+    def _carry_on(self) -> None:
+        """Move a position on with its velocity, where the autopilot does so."""
+        if self.tuning.open_loop:
+            return
+        if self._carried_steps * self._step_s >= CARRIED_S:
+            self._velocity = self._accel = ZERO
+        self._move_reference()
+        self._carried_steps += 1
+
+    def _move_reference(self) -> None:
+        h = self._step_s
+        (pn, pe, pd), (vn, ve, vd), (an, ae, ad) = self._position, self._velocity, self._accel
+        self._position = (pn + h * (vn + 0.5 * h * an), pe + h * (ve + 0.5 * h * ae), pd + h * (vd + 0.5 * h * ad))
+        self._velocity = (vn + h * an, ve + h * ae, vd + h * ad)
+
+    # The loops on it
+
+    def _track(self, motion: BodyState, thrust_limited: bool, fall_mps2: float) -> Lean:
+        """Hold the vehicle on the reference, which must not run away from a vehicle that cannot follow."""
+        t = self.tuning
+        (pn, pe, pd), (vn, ve, vd) = motion.position_m, motion.velocity_mps
+        en = self._velocity[0] - vn + t.position_1ps * (self._position[0] - pn)
+        ee = self._velocity[1] - ve + t.position_1ps * (self._position[1] - pe)
+        ed = self._velocity[2] - vd + t.position_down_1ps * (self._position[2] - pd)
+        (an, ae, ad), (jn, je, jd) = self._accel, self._integral
+        down = ad + t.velocity_down_1ps * ed + jd - t.hover_error * GRAVITY_MPS2
+        lack = down - fall_mps2
+        if t.thrust_gain > 0.0:  # a loop on the acceleration gives the thrust for it
+            down = t.thrust_gain * lack + self._thrust_mps2
+        result = self._lean((an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down))
+        if result.limited:
+            self._position, self._velocity = (pn, pe, self._position[2]), (vn, ve, self._velocity[2])
+        else:
+            gain = t.integral_1ps2 * self._step_s
+            jn, je = jn + gain * en, je + gain * ee
+        if thrust_limited or result.dive_limited:
+            self._position, self._velocity = (*self._position[:2], pd), (*self._velocity[:2], vd)
+        else:
+            jd += t.integral_down_1ps2 * self._step_s * ed
+            self._thrust_mps2 += t.thrust_integral_1ps * self._step_s * lack
+        self._integral = (jn, je, jd)
+        return result
+
+
+def _approach(distance_m: float, limit_mps: float, gain_1ps: float) -> float:
+    """Speed at a distance from which a stop takes half of the limit: proportional when near, a parabola when far."""
+    near = REFERENCE_ACCEL_MPS2 / (2.0 * gain_1ps**2)
+    if distance_m <= near:
+        return min(gain_1ps * distance_m, limit_mps)
+    braking = math.sqrt(REFERENCE_ACCEL_MPS2 * (distance_m - 0.5 * near))
+    return min(braking, limit_mps)

@@ -1,1 +1,0 @@
-"""Campaigns: many runs of many controllers on the same noise and the same losses."""

@@ -1,0 +1,341 @@
+"""Uavctl bench."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter, validators
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from uavctl.build.controller import build_conditioned, build_design, build_spec
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, located, messages
+from uavctl.config.types import Config
+from uavctl.errors import DesignError, UsageError
+from uavctl.lab.bench.decisions import DecisionBench, time_decisions, time_flight
+from uavctl.lab.bench.loop import LoopBench, LoopRun, TimeQuantiles, run_loop_bench
+from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, bench_svg, run_bench
+from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+
+# `uavctl bench --loop`: the control loop on real UDP beside an empty one.
+
+
+def bench_loop(common: Common, seconds: float, runs: int) -> int:
+    """Measure and show."""
+    options = ["--config", common.config]
+    for override in common.overrides:
+        options += ["--set", override]
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("")
+
+        def told(what: str, done: int, total: int) -> None:
+            progress.update(task, description=what, completed=done, total=total, refresh=True)
+
+        result = run_loop_bench(common.load().config, options, seconds, runs, told)
+    common.show(result, lambda: loop_picture(result))
+    return 0
+
+
+def loop_picture(result: LoopBench) -> RenderableType:
+    """The figures as a table."""
+    table = Table(title="Control loop on real UDP, recording", title_justify="left")
+    for heading in ("", "median", "p99", "p99.9", "largest"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
+        table.add_row(f"[bold]{name}")
+        for label, spread in _spreads(run):
+            table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in _values(spread)))
+    head = (
+        f"Median of {result.runs} runs of {result.seconds:g} s each, a position in every tick of {result.tick_s:g} s."
+    )
+    denied = () if result.permitted else ("Not all of --realtime was permitted; `uavctl fly --realtime` says what.",)
+    return Group(
+        head, "", table, _rest("without --realtime", result.plain), _rest("with --realtime", result.realtime), *denied
+    )
+
+
+def _spreads(run: LoopRun) -> tuple[tuple[str, TimeQuantiles], ...]:
+    return (
+        ("position in -> setpoint out", run.in_to_out_us),
+        ("tick late by", run.lateness_us),
+        ("tick of an empty loop late by", run.empty_lateness_us),
+        ("in the control core", run.step_us),
+    )
+
+
+def _values(spread: TimeQuantiles) -> tuple[float, float, float, float]:
+    return spread.p50, spread.p99, spread.p999, spread.max
+
+
+def _rest(name: str, run: LoopRun) -> str:
+    return (
+        f"{name}: {run.positions:.0f} positions, {run.unanswered:.0f} without a setpoint in their tick, "
+        f"{run.missed_ticks:.0f} ticks missed; {run.recorded:.0f} records, {run.dropped:.0f} dropped; "
+        f"{run.memory_mib:.0f} MiB, grown by {run.memory_growth_kib:.0f} KiB."
+    )
+
+
+# `uavctl bench`: how long a decision takes, beside the problem as printed.
+
+
+_REFRESH_S = 0.2
+
+
+def bench(
+    *,
+    states: Annotated[
+        int,
+        Parameter(
+            help="number of states; the slow methods answer the first of them",
+            validator=validators.Number(gte=1, lte=100_000),
+        ),
+    ] = DEFAULT_SIZES.states,
+    seed: Annotated[int, Parameter(help="seed of states and policies", validator=SEED)] = 0,
+    plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
+    loop: Annotated[
+        bool, Parameter(negative=(), help="measure the whole control loop on real UDP instead, beside an empty one")
+    ] = False,
+    seconds: Annotated[float, Parameter(help="with --loop: length of a run [s]", validator=SPAN_S)] = 60.0,
+    runs: Annotated[
+        int,
+        Parameter(
+            help="with --loop: runs without --realtime, and as many with it",
+            validator=validators.Number(gte=1, lte=1000),
+        ),
+    ] = 5,
+    common: Common = DEFAULTS,
+) -> int:
+    """Measure the speed of a decision on this machine; of hahn-stursberg beside the problem as printed, in one run."""
+    if loop:
+        return bench_loop(common, seconds, runs)
+    loaded = common.load()
+    if loaded.config.conditioned:
+        if plot is not None:
+            raise UsageError("--plot draws the methods of smpc.scheme `hahn-stursberg`; leave it out")
+        with located(loaded):
+            solver = build_conditioned(loaded.config).solver
+        with _progress() as advance:
+            advance("a flight's own decisions", 0, None)
+            flight = time_flight(loaded.config, lambda done, total: advance("a flight's own decisions", done, total))
+            decided = time_decisions(solver, states, seed, lambda done: advance("decisions", done, states))
+        decided = msgspec.structs.replace(decided, flight=flight)
+        common.show(decided, lambda: _decisions(decided, loaded.config.name))
+        return 0
+    if plot is not None:
+        _check_plot(plot)
+    with located(loaded):
+        design = build_design(loaded.config)
+        loss = build_spec(loaded.config).link.outage(1)
+        with _progress() as advance:
+            sizes = replace(DEFAULT_SIZES, states=states)
+            result = run_bench(design, loss, seed, advance, sizes, _conditioned_solver(loaded.config))
+    if plot is not None:
+        plot.write_text(bench_svg(result, loaded.config.name), encoding="utf-8")
+    common.show(result, lambda: bench_picture(result, loaded.config.name))
+    return 0
+
+
+def _conditioned_solver(config: Config) -> ConditionedSolver | None:
+    """The solver of scheme `age-conditioned`; None where silence outlasts the horizon too often for it."""
+    try:
+        return build_conditioned(config).solver
+    except DesignError:
+        return None
+
+
+def _decisions(found: DecisionBench, name: str) -> str:
+    """The figures of scheme `age-conditioned` in words."""
+    us, iterations, flight = found.us, found.iterations, found.flight
+    flown = (
+        ""
+        if flight is None
+        else (
+            f"\n{flight.questions} of its own flight: median {_us(flight.us.p50)}, p99 {_us(flight.us.p99)}, at most "
+            f"{_us(flight.us.max)}, the first one {_us(flight.first_us)}; iterations {flight.iterations.p50:.0f}, p99 "
+            f"{flight.iterations.p99:.0f}, at most {flight.iterations.max:.0f}. {flight.left_alone:.1%} need no "
+            f"program, {flight.gave_way:.1%} give way."
+        )
+    )
+    return (
+        f"{name}, risk conditioned on the age: one decision for all axes, {found.states} states and targets anywhere "
+        f"within the limits.\nMedian {_us(us.p50)}, p99 {_us(us.p99)}, at most {_us(us.max)}; iterations "
+        f"{iterations.p50:.0f}, p99 {iterations.p99:.0f}, at most {iterations.max:.0f}.\n"
+        f"{found.left_alone:.1%} need no program, {found.gave_way:.1%} give way, {found.without} got no plan.{flown}"
+    )
+
+
+def _check_plot(plot: Path) -> None:
+    """Refuse a file that cannot be written, before minutes of measuring.
+
+    Raises:
+        UsageError: There is no such folder, or the name is that of something else.
+    """
+    try:
+        there, taken = plot.parent.is_dir(), plot.exists() and not plot.is_file()
+    except OSError as error:
+        raise UsageError(f"--plot: {error.strerror}; give another name") from error
+    if not there:
+        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
+    if taken:
+        raise UsageError(f"--plot: {plot} is not a file; give another name")
+
+
+@contextmanager
+def _progress() -> Iterator[Advance]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # A thread that draws the bar would disturb what is measured.
+    with Progress(*columns, console=messages(), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("design", total=None)
+        drawn = 0.0
+
+        def advance(what: str, done: int, total: int | None) -> None:
+            nonlocal drawn
+            now = time.monotonic()
+            if done and done != total and now - drawn < _REFRESH_S:
+                return
+            drawn = now
+            progress.update(task, description=what, completed=done, total=total, refresh=True)
+
+        yield advance
+
+
+def bench_picture(result: BenchResult, name: str) -> RenderableType:
+    """The figures as tables."""
+    axes = "1 independent axis" if result.components == 1 else f"{result.components} independent axes"
+    head = (
+        f"{name}: {axes}; {result.states} states, half uniform over the feasible {result.feasible_share:.0%} of the "
+        "box, half along closed loops"
+    )
+    methods = (_methods(result), _conditioned(result.conditioned), _axis(result))
+    answers = (*methods, _certificates(result), _gaps(result))
+    return Group(head, "", *answers, _growth(result), _resources(result))
+
+
+def _methods(result: BenchResult) -> Table:
+    table = Table(title="One decision for all axes", title_justify="left")
+    for heading in ("", "states", "median", "library is faster by", "what came of it"):
+        table.add_column(
+            heading, justify="right" if heading in ("states", "median", "library is faster by") else "left"
+        )
+    joint = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"
+    same = "" if result.cost_difference is None else f"cost of the exact one to {result.cost_difference:.1e}"
+    library = result.library_us
+    rows = (
+        (
+            "as printed, jointly, CVXPY",
+            result.printed_states,
+            _ms(result.printed_ms),
+            result.ratio_printed_library,
+            joint,
+        ),
+        (
+            "as printed, axis by axis, CVXPY",
+            result.cvxpy_states,
+            _ms(result.cvxpy_ms),
+            result.ratio_cvxpy_library,
+            same,
+        ),
+        ("exact", result.exact_states, _ms(result.exact_ms), result.ratio_exact_library, ""),
+    )
+    for label, states, took, ratio, ending in rows:
+        table.add_row(label, str(states), took, f"{ratio:.0f} ×", ending)
+    table.add_row(
+        "policy library",
+        str(result.states),
+        _us(library.p50),
+        "",
+        f"p99 {_us(library.p99)}, at most {_us(library.max)}",
+    )
+    return table
+
+
+def _conditioned(ours: ConditionedTimes | None) -> str:
+    if ours is None:
+        return ""
+    return (
+        f"Risk conditioned on the age, a scheme of its own: {_us(ours.us.p50)}, p99 {_us(ours.us.p99)}, at most "
+        f"{_us(ours.us.max)} and {ours.iterations.max:.0f} iterations; {ours.left_alone:.0%} of the states need no "
+        f"program. The printed problem, axis by axis, takes {ours.ratio_cvxpy:.0f} × as long.\n"
+    )
+
+
+def _axis(result: BenchResult) -> str:
+    return (
+        f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}. "
+        f"The frozen policy's QP: DAQP {_us(result.qp_us.daqp)}, Clarabel {_us(result.qp_us.clarabel)}.\n"
+    )
+
+
+def _certificates(result: BenchResult) -> Table:
+    table = Table(title="The library's answers", title_justify="left")
+    for heading in ("method", "share", "median"):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    shares = result.shares
+    for method, share, took in (
+        ("frozen policy", shares.frozen, result.frozen_us),
+        ("mixture", shares.mixture, result.mixture_us),
+        ("exact program", shares.exact, result.fallback_us),
+    ):
+        table.add_row(method, f"{share:.1%}", _us(took))
+    return table
+
+
+def _gaps(result: BenchResult) -> str:
+    gap = result.gap
+    return (
+        f"Certified gap: median {gap.p50:.1e}, p99 {gap.p99:.1e}, at most {gap.max:.1e}; "
+        f"exact optima outside the certified bounds by at most {result.certificate_excess:.0e}.\n"
+    )
+
+
+def _growth(result: BenchResult) -> Table:
+    table = Table(title="Growth", title_justify="left")
+    for heading in ("", "frozen", "mixture"):
+        table.add_column(heading, justify="right" if heading else "left")
+    longer, more = result.growth_h, result.growth_axes
+    for steps, frozen, mixture in zip(longer.horizon, longer.frozen_us, longer.mixture_us, strict=True):
+        table.add_row(f"one axis, H = {steps}", _us(frozen), _us(mixture))
+    table.add_row(
+        "exponent of H (the longest three)",
+        _number(longer.frozen_exponent),
+        f"{_number(longer.mixture_exponent)} ({_number(longer.mixture_exponent_last)})",
+        end_section=True,
+    )
+    for count, frozen, mixture in zip(more.axes, more.frozen_us, more.mixture_us, strict=True):
+        table.add_row("1 axis" if count == 1 else f"{count} axes", _us(frozen), _us(mixture))
+    table.add_row("exponent of their number", _number(more.frozen_exponent), _number(more.mixture_exponent))
+    return table
+
+
+def _resources(result: BenchResult) -> str:
+    memory = result.memory_mb
+    return (
+        f"Library made in {result.library_s:.1f} s ({_sum(result.library_policies)} policies, "
+        f"{result.library_bytes / 1e3:.0f} kB), ready in {result.ready_s:.2f} s. "
+        f"Peak memory: {memory.before:.0f} MB before, {memory.library:.0f} with it, {memory.after:.0f} at the end."
+    )
+
+
+def _sum(policies: Sequence[int]) -> str:
+    return " + ".join(map(str, policies))
+
+
+def _ms(milliseconds: float) -> str:
+    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
+
+
+def _us(microseconds: float | None) -> str:
+    return "-" if microseconds is None else f"{microseconds:.0f} µs"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

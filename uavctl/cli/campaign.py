@@ -1,0 +1,381 @@
+"""Uavctl campaign."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter, validators
+from rich.console import Group, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from logs.recording.reader import records
+from logs.recording.summary import FlightSummary, count, render
+from uavctl.build.controller import design_of
+from uavctl.cli import INTERRUPTED
+from uavctl.cli.common import WORKERS, Common, messages
+from uavctl.cli.flying import Engagement, new_recording, stop_on_signals
+from uavctl.cli.loopback import lockstep
+from uavctl.cli.prepare import prepare, ready_library
+from uavctl.errors import UsageError
+from uavctl.lab.campaign.page import write_report, write_trial_report
+from uavctl.lab.campaign.pool import Workers, cluster, fly_tasks, processes
+from uavctl.lab.campaign.rerun import Agreement, Reflight, again, agreement, reflight
+from uavctl.lab.campaign.results import SMPC, CellSummary, read_cells, summarise
+from uavctl.lab.campaign.spec import MOST_RUNS, read_campaign
+from uavctl.lab.campaign.store import SCHEMA, Store
+from uavctl.lab.campaign.tasks import Columns, Work, cells_of, document, tasks_of
+from uavctl.lab.campaign.trials import SCHEMA as TRIALS
+from uavctl.lab.campaign.trials import (
+    TrialSummary,
+    is_trial,
+    places_of,
+    read_trial,
+    summarise_trial,
+    told_trial,
+    trial_document,
+    trial_tasks,
+)
+from uavctl.lab.trial import COUNTS, MEANING, SHOWN
+from uavctl.records import Truth
+
+# One run of a campaign flown again in virtual time, recorded and reported like any flight.
+
+
+class Reflown(msgspec.Struct, frozen=True, kw_only=True):
+    """A run of a campaign as a flight."""
+
+    summary: FlightSummary
+    agreement: Agreement
+
+
+def refly_of(folder: Path, which: str, out: Path | None) -> Reflown:
+    """Fly a run of a campaign again; the recording and its page go to `out`.
+
+    Args:
+        out: Folder; a new one below `flights/` if it is not given.
+
+    Raises:
+        UsageError: There is no such run, or it is a baseline's.
+        UavctlError: The campaign cannot be read, or this version would make another design of it.
+    """
+    cell, run = _numbers(which)
+    if told_trial(folder) is not None:
+        raise UsageError(
+            f"{folder} holds flights of the quadrotor; fly one again by `uavctl loopback` with its configuration, "
+            "sim.plant = quadrotor and sim.seed as in runs.parquet"
+        )
+    _check_kind(folder, cell)
+    found = again(folder, cell, run, ready_library)
+    return fly_again(reflight(found, f"{found.campaign}, cell {cell}, run {run}"), out)
+
+
+def fly_again(flight: Reflight, out: Path | None) -> Reflown:
+    """Fly a run, record it and compare it with what the campaign flew."""
+    config = flight.config
+    as_flown = Engagement(config, take_off_m=None, goto=False)
+    with new_recording(out, "refly", config.log.free_bytes) as path:
+        summary = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
+        return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
+
+
+def refly_picture(reflown: Reflown) -> RenderableType:
+    """The flight's summary, and how well it agrees."""
+    one = reflown.agreement
+    text = (
+        f"Beside the campaign, over {count(one.steps, 'step')} of plans: states within {one.largest_state:.1e}, "
+        f"inputs within {one.largest_input:.1e}; {'agrees' if one.agrees else 'differs'} (to {one.tolerance:g})"
+    )
+    return Group(render(reflown.summary), Text(f"{text}{': ' if one.reason else ''}{one.reason}"))
+
+
+def _numbers(which: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+):(\d+)", which)
+    if found is None:
+        raise UsageError(f"--refly {which}: names no run; give CELL:RUN, as in 0:17")
+    return int(found[1]), int(found[2])
+
+
+def _check_kind(folder: Path, index: int) -> None:
+    cells = [cell for cell in read_cells(folder) if cell.index == index]
+    if cells and cells[0].kind != SMPC:
+        raise UsageError(
+            f"cell {index} is flown by {cells[0].controller} ({cells[0].kind}), a baseline without a flight "
+            "controller; runs of an SMPC can be flown again"
+        )
+
+
+# A campaign of flights of the quadrotor, as tables for the terminal.
+
+
+_TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
+
+
+class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a campaign of flights came to."""
+
+    name: str
+    runs_file: str
+    report: str
+    wall_s: float
+    cells: list[TrialSummary]
+
+
+def trial_picture(result: TrialResult) -> RenderableType:
+    """A table for each scenario."""
+    # What is the same in all cells needs no column, and of what only tells of ours the page has more.
+    lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
+    tables: list[RenderableType] = []
+    for scenario, every in SHOWN.items():
+        shown = [one for one in every if one not in COUNTS]
+        cells = [cell for cell in result.cells if cell.place.scenario == scenario]
+        if not cells:
+            continue
+        table = Table(title=f"Campaign {escape(result.name)}: {scenario}", title_justify="left")
+        for heading in (*lists, "controller"):
+            table.add_column(heading.replace("rate_hz", "Hz"))
+        for one in shown:
+            table.add_column(one.heading, justify="right")
+        for cell in cells:
+            names = [_text(getattr(cell.place, name)) for name in (*lists, "controller")]
+            told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
+            table.add_row(*map(escape, names), *told)
+        tables.append(table)
+    refusals = dict.fromkeys(
+        f"{cell.place.controller}, {cell.place.link}: {cell.place.refused}"
+        for cell in result.cells
+        if cell.place.refused
+    )
+    remarks = [f"Refused: {escape(text)}" for text in refusals]
+    failed = sum(cell.failed for cell in result.cells)
+    if failed:
+        remarks.append(f"{failed} flights failed; runs.parquet says why")
+    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
+    return Group(*tables, *remarks, MEANING, files)
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# `uavctl campaign`: many flights of many controllers on the same noise and the same losses.
+
+
+try:
+    import pyarrow  # everything below needs it
+except ImportError as missing:
+    raise UsageError("campaigns are kept by pyarrow, which is not there; install uavctl[campaign]") from missing
+
+
+_NAMES = ("controller", "link", "disturbance", "plant")
+
+
+class CampaignResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a campaign came to."""
+
+    name: str
+    runs_file: str
+    report: str
+    wall_s: float
+    cells: list[CellSummary]
+
+
+def campaign(
+    spec: Annotated[Path, Parameter(help="TOML file of the campaign; with --refly its folder", show_default=False)],
+    *,
+    runs: Annotated[
+        int | None,
+        Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1, lte=MOST_RUNS)),
+    ] = None,
+    workers: Annotated[
+        int | None, Parameter(help="processes that fly; else one for each processor", validator=WORKERS)
+    ] = None,
+    dask: Annotated[str | None, Parameter(help="fly on the workers of the Dask scheduler at this address")] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the results; else a new one below flights/")] = None,
+    resume: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
+    ] = False,
+    refly: Annotated[
+        str | None, Parameter(metavar="CELL:RUN", help="fly one run of a campaign once more, into a recording in --out")
+    ] = None,
+    json: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
+    ] = False,
+) -> int:
+    """Fly a grid of controllers, links, disturbances and plants, each on the same noise and the same losses.
+
+    With `world = "quadrotor"` in its file it is flights of the true vehicle, beside its own position loop.
+
+    The results do not depend on the number of workers, nor on where they are. Every finished task is kept at once: a
+    campaign that was interrupted or killed goes on with --resume.
+    """
+    if refly is not None and (resume or (runs, workers, dask) != (None, None, None)):
+        raise UsageError("--refly flies one run by itself; it goes with --out and --json only")
+    if dask is not None and workers is not None:
+        raise UsageError("--workers are this machine's, --dask has its own; give one of them")
+    if resume and out is None:
+        raise UsageError("--resume: give the campaign's folder with --out")
+    if refly is not None:
+        flight = refly_of(spec, refly, out)
+        Common(json=json).show(flight, lambda: refly_picture(flight))
+        return 0 if flight.summary.steps else 1
+    given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
+    begun = time.perf_counter()
+    store = Store(out or _new_folder(given.name), given.schema)
+    store.check(resume)  # the designs may take minutes
+    try:
+        described, tasks = given.prepare()
+        with store.opened(described, given.text, resume):
+            if not store.complete() and not _fly(store, tasks, _crew(dask, workers)):
+                raise KeyboardInterrupt
+            runs_file = store.finish(tasks)
+            _tell("writing the page")
+            report = given.write(store.folder)
+    except KeyboardInterrupt:
+        _tell(_interrupted(store, spec, runs))
+        return INTERRUPTED
+    shared = {"name": given.name, "runs_file": str(runs_file), "report": str(report)}
+    return given.conclude(store.folder, shared, time.perf_counter() - begun, json)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A campaign of either world."""
+
+    name: str  # its name
+    text: str  # of its file
+    schema: pyarrow.Schema  # of its table of runs
+    # Makes what `campaign.json` holds, and all tasks
+    prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
+    write: Callable[[Path], Path]  # writes the page into a folder
+    conclude: Callable[[Path, dict[str, str], float, bool], int]  # shows what came of a folder; gives the exit code
+
+
+def _of_runs(spec: Path, runs: int | None) -> _Given:
+    """A campaign in the linear world."""
+    read, text = read_campaign(spec, runs)
+
+    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+        cells = cells_of(read, ready_library)
+        return document(read, cells), list(tasks_of(cells))
+
+    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
+        result = CampaignResult(**shared, wall_s=wall_s, cells=summarise(folder))
+        Common(json=json).show(result, lambda: _picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
+
+    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, conclude)
+
+
+def _of_trials(path: Path, runs: int | None) -> _Given:
+    """A campaign in the world of the quadrotor."""
+    spec, text = read_trial(path, runs)
+
+    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+        places = places_of(spec, ready_library)
+        return trial_document(spec, places), list(trial_tasks(spec, places))
+
+    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
+        _, cells = summarise_trial(folder)
+        result = TrialResult(**shared, wall_s=wall_s, cells=cells)
+        Common(json=json).show(result, lambda: trial_picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in cells) else 1
+
+    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, conclude)
+
+
+def _new_folder(name: str) -> Path:
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
+    return Path("flights") / f"{stamp}-{name.replace(' ', '-')}"
+
+
+def _crew(dask: str | None, workers: int | None) -> AbstractContextManager[Workers]:
+    return processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
+
+
+def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:
+    """Fly the tasks that are not there; False if it was interrupted."""
+    kept = store.kept(tasks)
+    left = [task for task in tasks if task.name not in kept]
+    if not left:
+        return True
+    with stop_on_signals() as stopped, crew as flying, _progress(tasks, kept) as advance:
+
+        def keep(task: Work, columns: Columns) -> None:
+            store.keep(task, columns)
+            advance(task)
+
+        fly_tasks(left, flying, keep, stopped)
+    return len(store.kept(tasks)) == len(tasks)
+
+
+@contextmanager
+def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    left = (TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, *left, console=messages(), transient=True) as progress:
+        there = sum(task.runs for task in tasks if task.name in kept)
+        bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=there)
+        yield lambda task: progress.update(bar, advance=task.runs)
+
+
+def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
+    """What is there after an interruption, and how to go on."""
+    if not store.begun():
+        return "interrupted before the first run; policy libraries that were finished are kept"
+    number = () if runs is None else ("--runs", str(runs))
+    again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])
+    return f"interrupted; the runs that were finished are kept. To go on:\n{again}"
+
+
+def _tell(text: str) -> None:
+    messages().print(escape(text), soft_wrap=True)
+
+
+def _picture(result: CampaignResult) -> RenderableType:
+    # What is the same in all cells needs no column.
+    lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
+    table = Table(title=f"Campaign {result.name}", title_justify="left")
+    for heading in (*lists, "runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest"):
+        table.add_column(heading, justify="left" if heading in lists else "right")
+    for cell in result.cells:
+        names = [escape(getattr(cell, name)) for name in lists]
+        if cell.refused:
+            table.add_row(*names, "refused")
+            continue
+        figures = (
+            _percent(cell.violation_rate, cell.violation_ci),
+            _percent(cell.run_violation_rate, cell.run_violation_ci),
+            _cost(cell.cost, cell.cost_ci),
+        )
+        table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
+    refusals = dict.fromkeys(f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused)
+    told = [f"Refused: {escape(text)}" for text in refusals]
+    note = (
+        "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
+    )
+    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
+    return Group(table, *told, note, files)
+
+
+def _percent(rate: float | None, interval: tuple[float, float] | None) -> str:
+    if rate is None or interval is None:
+        return "-"
+    low, high = (f"{100 * side:.3g}" for side in interval)
+    return f"{100 * rate:.3g} ({low}–{high})"
+
+
+def _cost(mean: float | None, interval: tuple[float, float] | None) -> str:
+    return "-" if mean is None or interval is None else f"{mean:.6g} ± {(interval[1] - interval[0]) / 2:.2g}"

@@ -1,0 +1,237 @@
+"""Uavctl check, and the check before arming."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.markup import escape
+from rich.table import Table
+
+from uavctl.check.findings import Item, ItemState, item, judged, refusals
+from uavctl.check.preflight import Preflight
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, messages
+from uavctl.cli.flying import stop_on_signals
+from uavctl.clock import Ticker, monotonic_ns
+from uavctl.config import Config
+from uavctl.config.connections import warnings
+from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
+from uavctl.io.base import Connection
+from uavctl.io.signed_connection import connected
+from uavctl.io.transport import wait
+from uavctl.loop import make_links
+from uavctl.records import Checked, Sink
+
+# A check on real connections, bounded in time: what `uavctl check` runs, and `uavctl fly --arm` before it arms.
+
+
+MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
+
+
+def run_preflight(
+    config: Config,
+    connections: Mapping[str, Connection],
+    seconds: float,
+    *,
+    move: bool = False,
+    take_off_m: float | None = None,
+    prompt: Callable[[str], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
+    now: Callable[[], int] = monotonic_ns,
+) -> tuple[Item, ...]:
+    """Listen, ask, and tell what was found. Arms nothing, changes no mode and no parameter.
+
+    Args:
+        seconds: how long to listen [s].
+        move: go on until a person has moved the body as asked, for `MOVE_LIMIT_S` at most.
+        take_off_m: height of the climb that is planned [m]; None if none is.
+        prompt: told every new thing that is asked of that person; empty to wait.
+        stop: asked once a tick; ends the listening.
+        wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
+        now: the clock [ns].
+    """
+    ticker = Ticker(round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9), now)
+    due = ticker.next()
+    begun_ns, asked = due.at_ns, ""
+    flight = Preflight(config, make_links, begun_ns, move=move, take_off_m=take_off_m)
+    while True:
+        while True:
+            for name in wait_for(connections, due.at_ns):
+                _receive(flight, name, connections[name])
+            if now() >= due.at_ns:
+                break
+        for message in flight.tick(due.tick, due.at_ns):
+            connections[message.link].send(message.data)
+        if prompt is not None and flight.prompt != asked:
+            asked = flight.prompt
+            prompt(asked)
+        moving = flight.guide is not None and not flight.guide.over
+        closed = all(connection.closed for connection in connections.values())
+        heard_s = (due.at_ns - begun_ns) * 1e-9
+        limit_s = seconds + (MOVE_LIMIT_S if moving else 0.0)
+        if closed or stop() or (heard_s >= limit_s and (heard_s >= limit_s + config.check.wait_s or not flight.waits)):
+            return flight.items(due.at_ns)
+        due = ticker.next()
+
+
+def _receive(flight: Preflight, name: str, connection: Connection) -> None:
+    for index, (data, received_ns) in enumerate(connection.receive()):
+        answers = flight.receive(name, data, received_ns)
+        if flight.heard_vehicle:  # cameras or a ground station may share the port
+            connection.answer(index)
+        elif flight.heard_source:
+            connection.trust(index)
+        for answer in answers:
+            connection.send(answer.data)
+
+
+# What `uavctl fly --arm` looks at before the vehicle is asked for anything.
+
+
+def checked_before_arming(
+    config: Config, connections: Mapping[str, Connection], stop: Callable[[], bool], take_off_m: float
+) -> tuple[Item, ...]:
+    """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m`; tells what is not good.
+
+    Returns:
+        All items; none of them forbids arming.
+
+    Raises:
+        NotReadyError: an item forbids arming.
+    """
+    messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
+    items = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop)
+    against = refusals(items, config.check)
+    if against:
+        lines = (f"{one.name}: {one.value} (wanted: {one.want}); {one.hint}" for one in against)
+        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *lines)))
+    for one in _worth_telling(items):
+        messages().print(f"[yellow]check:[/] {escape(f'{one.name}: {one.value}; {one.hint}')}", soft_wrap=True)
+    return items
+
+
+def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
+    """Put what was found into the recording."""
+    for one in items:
+        found = Checked(at_ns=at_ns, name=one.name, state=str(one.state), value=one.value, want=one.want, hint=one.hint)
+        sink.put("/uavctl/check", at_ns, found)
+
+
+def _worth_telling(items: Iterable[Item]) -> list[Item]:
+    return [one for one in items if one.state is not ItemState.GOOD]
+
+
+# `uavctl check`: what can be known before take-off. It never arms, and changes neither mode nor parameter.
+
+
+_STYLES = {
+    ItemState.GOOD: "green",
+    ItemState.NOTE: "yellow",
+    ItemState.UNDETERMINED: "yellow",
+    ItemState.BAD: "bold red",
+}
+
+
+_PERMISSIONS = "see to cable, port, permissions (serial ports: group dialout), or another program that has it"
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """What a check found."""
+
+    ok: bool  # nothing speaks against arming
+    items: tuple[Item, ...]  # one for each thing that was looked at
+
+
+def check(
+    *,
+    common: Common = DEFAULTS,
+    vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
+    mocap: Annotated[
+        str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
+    ] = None,
+    seconds: Annotated[
+        float | None, Parameter(help="how long to listen [s]; else check.seconds", validator=SPAN_S)
+    ] = None,
+    move: Annotated[
+        bool, Parameter(negative=(), help="ask for movements of the body by hand, which show every axis")
+    ] = False,
+    out: Annotated[Path, Parameter(help="folder that recordings will be written to")] = Path("flights"),
+) -> int:
+    """Look at rates, ages, frames, clocks, the vehicle's parameters and the disk; arms nothing.
+
+    Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
+    """
+    given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap, "check.seconds": seconds}
+    overrides = [
+        f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}"
+        for key, value in given.items()
+        if value is not None
+    ]
+    config = common.with_overrides(overrides).load().config
+    items = [*disk_items(out, config.log.free_bytes)]
+    items.append(_strangers(warnings(config.security, config.daemon)))
+    try:
+        with connected(config) as connections, stop_on_signals() as stopped:
+            seconds_s = config.check.seconds
+            items += run_preflight(config, connections, seconds_s, move=move, prompt=_prompt, stop=stopped)
+    except (ConnectionSpecError, KeyFileError) as error:
+        if isinstance(error, ConnectionSpecError) and not isinstance(error.__cause__, OSError):
+            raise  # a URL that is none: usage
+        items.append(item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS))
+    report = Report(ok=not refusals(items, config.check), items=tuple(items))
+    common.show(report, lambda: _table(report))
+    return 0 if report.ok else 1
+
+
+def disk_items(folder: Path, free_bytes: int) -> list[Item]:
+    """Items of the folder that recordings go to; nothing is made."""
+    there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
+    writable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    free = shutil.disk_usage(there).free
+    return [
+        judged(
+            "recordings folder",
+            good=writable,
+            value=f"{folder}: {'writable' if writable else f'{there} is not writable'}",
+            want="a folder to write to",
+            hint="choose another folder (--out), or change its owner",
+        ),
+        judged(
+            "disk room",
+            good=free >= free_bytes,
+            value=f"{free / 1e9:.2f} GB free",
+            want=f"at least {free_bytes / 1e9:.2f} GB (log.free_bytes)",
+            hint="make room, choose another folder (--out), or lower log.free_bytes",
+        ),
+    ]
+
+
+def _strangers(texts: tuple[str, ...]) -> Item:
+    state = ItemState.NOTE if texts else ItemState.GOOD
+    value, hint = "; ".join(texts) or "none can speak", "see security.allow and security.key_file (docs/security.md)"
+    return item("strangers", state, value, "known peers, and signed frames", hint)
+
+
+def _prompt(text: str) -> None:
+    messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
+
+
+def _table(report: Report) -> Table:
+    words = "ready" if report.ok else "not ready: see what is red"
+    table = Table(title=f"check: {words}", title_justify="left", show_lines=False)
+    for heading in ("", "what", "found", "wanted", "what to do"):
+        table.add_column(heading, overflow="fold")
+    for one in report.items:
+        style = _STYLES[one.state]
+        table.add_row(f"[{style}]{one.state}[/]", *(_plain(text) for text in (one.name, one.value, one.want, one.hint)))
+    return table
+
+
+def _plain(text: str) -> str:
+    return text.replace("[", r"\[")

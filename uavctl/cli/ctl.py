@@ -1,0 +1,215 @@
+"""`uavctl ctl`: orders and questions to a daemon that is flying."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import App, Parameter
+from rich.table import Table
+
+from uavctl.cli.common import Common, messages
+from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, control_folder
+from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
+from uavctl.errors import NotReachedError, UsageError
+from uavctl.records import Vec3
+
+ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
+_BLOCK = 65_536
+
+ctl_app = App(name="ctl", help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Which:
+    """Options of every order."""
+
+    vehicle: Annotated[
+        str | None, Parameter(help="which daemon, if several run: its name, or a part of it that no other one has")
+    ] = None
+    control: Annotated[
+        Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or the user's own")
+    ] = None
+    json: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
+    ] = False
+
+
+ANY = Which()
+
+
+@ctl_app.command
+def goto(place: Annotated[str, Parameter(allow_leading_hyphen=True)], /, *, which: Which = ANY) -> int:
+    """Fly to a place and stay there: north,east,down in local NED [m], as in `ctl goto 2,1,-2`."""
+    return _order(ControlRequest(ask="goto", position_m=_place(place)), which)
+
+
+@ctl_app.command
+def hold(*, which: Which = ANY) -> int:
+    """Stay where the vehicle comes to rest."""
+    return _order(ControlRequest(ask="hold"), which)
+
+
+@ctl_app.command
+def resume(*, which: Which = ANY) -> int:
+    """Go on with the configured mission where it was left."""
+    return _order(ControlRequest(ask="resume"), which)
+
+
+@ctl_app.command
+def land(*, which: Which = ANY) -> int:
+    """Brake and hand over to the vehicle's own landing."""
+    return _order(ControlRequest(ask="land"), which)
+
+
+@ctl_app.command
+def engage(*, which: Which = ANY) -> int:
+    """Ask for the external mode again, after the pilot or the vehicle has left it."""
+    return _order(ControlRequest(ask="engage"), which)
+
+
+@ctl_app.command
+def status(*, which: Which = ANY) -> int:
+    """Say how the flight is doing. Exit code 1: no daemon answers."""
+    reply = _ask(ControlRequest(ask="status"), which)
+    if reply.status is None:
+        raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
+    found = reply.status
+    Common(json=which.json).show(found, lambda: _table(found))
+    return 0
+
+
+def _place(text: str) -> Vec3:
+    try:
+        north, east, down = map(float, text.split(","))
+    except ValueError:
+        raise UsageError(f"goto {text}: write three numbers, north,east,down [m], as in 2,1,-2") from None
+    request = ControlRequest(ask="goto", position_m=(north, east, down))
+    if request.problem() is not None:
+        raise UsageError(f"goto {text}: {request.problem()}")
+    return north, east, down
+
+
+def _order(request: ControlRequest, which: Which) -> int:
+    reply = _ask(request, which)
+    if which.json:
+        Common(json=True).show({"ok": reply.ok, "text": reply.text}, str)
+    else:
+        verdict = "accepted" if reply.ok else "refused"
+        messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, markup=False, highlight=False)
+    return 0 if reply.ok else 1
+
+
+def _ask(request: ControlRequest, which: Which) -> Reply:
+    """The answer of the daemon that is meant.
+
+    Raises:
+        NotReachedError: none, or more than one, or no answer.
+    """
+    with _reach(control_folder(which.control), which.vehicle) as connection:
+        try:
+            connection.sendall(msgspec.json.encode(request) + b"\n")
+            line = b""
+            while not line.endswith(b"\n"):
+                data = connection.recv(_BLOCK)
+                if not data:
+                    raise NotReachedError("the daemon hung up: it is ending, or runs as another user")
+                line += data
+            return msgspec.json.decode(line, type=Reply)
+        except OSError as error:
+            raise NotReachedError(
+                f"no answer within {ANSWER_LIMIT_S:g} s ({error}); the daemon is not ready yet (its design, the check "
+                "before arming), or the control loop may hang: see to the vehicle"
+            ) from error
+        except msgspec.MsgspecError as error:
+            raise NotReachedError(f"the answer is not understood ({error}); is the daemon of this version?") from error
+
+
+def _reach(folder: Path, wanted: str | None) -> socket.socket:
+    """A connection to the daemon that is meant."""
+    found = {path.name.removesuffix(SUFFIX): path for path in _sockets(folder)}
+    names = [name for name in found if wanted is None or wanted in name]
+    if wanted in found:
+        names = [wanted]
+    alive: dict[str, socket.socket] = {}
+    for name in names:
+        connection = _connect(found[name])
+        if connection is not None:
+            alive[name] = connection
+    if len(alive) == 1:
+        return alive.popitem()[1]
+    for connection in alive.values():
+        connection.close()
+    if alive:
+        raise NotReachedError(f"several daemons run: {', '.join(sorted(alive))}; choose one with --vehicle NAME")
+    whose = "no daemon" if wanted is None else f"no daemon named like {wanted!r}"
+    raise NotReachedError(
+        f"{whose} answers in {folder}; start one with `uavctl fly`, or name its folder with --control "
+        "(a service's is in its unit)"
+    )
+
+
+def _sockets(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == SUFFIX)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise NotReachedError(
+            f"{folder}: {error.strerror}; orders are for the user that the daemon runs as, and for root"
+        ) from error
+
+
+def _connect(path: Path) -> socket.socket | None:
+    """A connection; None if nobody listens there any more."""
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.settimeout(ANSWER_LIMIT_S)
+    try:
+        connection.connect(str(path))
+    except OSError:
+        connection.close()
+        return None
+    return connection
+
+
+def _table(health: Health) -> Table:
+    table = Table(title=f"{health.name} (process {health.pid}), {health.url}", title_justify="left", show_header=False)
+    vehicle, recorder = health.vehicle, health.recorder
+    rows = {
+        "mode": "waiting" if health.mode is None else f"{health.mode.value}: {health.reason}",
+        "who flies": health.who_flies or "-",
+        **({"ending": health.ending} if health.ending else {}),
+        **({} if health.relay is None else {"relay": _relay(health.relay)}),
+        "age": "-" if health.age_s is None else f"{health.age_s:.2f} s ({health.age_steps} steps)",
+        "position": _point(health.position_m),
+        "target": _point(health.target_m),
+        "vehicle": "not heard" if vehicle is None else f"{vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'}",
+        "battery": "-" if vehicle is None or vehicle.battery_v is None else f"{vehicle.battery_v:.1f} V",
+        "loss": "-" if health.loss is None else f"{health.loss:.0%}",
+        "lateness": f"{health.lateness_us / 1e3:.2f} ms, {health.missed_ticks} ticks missed",
+        "recording": recorder.path if recorder.ok and not recorder.reason else f"{recorder.path}, {_trouble(recorder)}",
+    }
+    for name, text in rows.items():
+        table.add_row(name, text)
+    return table
+
+
+def _relay(relay: RelayHealth) -> str:
+    """How the vehicle gets its positions; control may have ended before."""
+    if relay.last_s is None:
+        return "no position has been passed on yet"
+    alone = "; control has ended, positions go on" if relay.alone else ""
+    return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{alone}"
+
+
+def _trouble(recorder: RecorderHealth) -> str:
+    """What a person has to know of the recording."""
+    return f"{'' if recorder.ok else 'in trouble, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
+
+
+def _point(point: dict[str, float] | None) -> str:
+    return "-" if point is None else ", ".join(f"{axis} {value:.2f} m" for axis, value in point.items())

@@ -1,0 +1,299 @@
+"""Uavctl design."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from cyclopts import Parameter, validators
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from uavctl.build.controller import build_conditioned, build_design, build_spec, start_state
+from uavctl.build.library import StoredLibrary
+from uavctl.build.mission import build_names
+from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.prepare import ready_library
+from uavctl.errors import UsageError
+from uavctl.lab.compare_designs import (
+    RISK_OPTIONS,
+    Costs,
+    GainComparison,
+    GainReport,
+    RiskComparison,
+    compare_gains,
+    compare_risk,
+)
+from uavctl.smpc.conditioned.planner import ConditionedDesign, conditioned_record
+from uavctl.smpc.hahn_stursberg.design import Design, design_record
+from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
+
+# `uavctl design --synthesize` and `--compare-risk`: designs beside one another.
+
+
+SEED = 0
+
+
+def gains_report(common: Common, states: int) -> int:
+    """Synthesise the terminal gain and compare; 1 if no complete design can be made with it."""
+    loaded = common.load()
+    begin = time.perf_counter()
+    with located(loaded):
+        spec = build_spec(loaded.config)
+        with _progress(2 + 4 * states) as advance:
+            found = compare_gains(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
+    document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
+    common.show(document, lambda: _gains_picture(found, loaded.config.name))
+    return 0 if found.after.refused is None else 1
+
+
+def risk_report(common: Common, states: int) -> int:
+    """Compare the risk allocations."""
+    loaded = common.load()
+    begin = time.perf_counter()
+    with located(loaded):
+        spec = build_spec(loaded.config)
+        with _progress(1 + 2 * len(RISK_OPTIONS) * states) as advance:
+            found = compare_risk(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
+    document = {**msgspec.to_builtins(found), "wall_s": time.perf_counter() - begin}
+    common.show(document, lambda: _risk_picture(found, loaded.config.name))
+    return 0
+
+
+@contextmanager
+def _progress(steps: int) -> Iterator[Callable[[str], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        task = progress.add_task("designs", total=steps)
+
+        def advance(what: str) -> None:
+            progress.update(task, advance=1, description=what)
+
+        yield advance
+
+
+def _gains_picture(found: GainComparison, name: str) -> RenderableType:
+    table = Table(title=f"Terminal gain of {name}", title_justify="left")
+    for heading in ("", "configured", "synthesised"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for label, figure in _GAIN_ROWS:
+        table.add_row(label, figure(found.before), figure(found.after))
+    refusals = [
+        Text(f"No complete design with the {which} gain: {report.refused}")
+        for which, report in (("configured", found.before), ("synthesised", found.after))
+        if report.refused is not None
+    ]
+    return Group(table, *refusals, _basis(found), "To take the synthesised gain over:", "", Text(found.toml))
+
+
+def _risk_picture(found: RiskComparison, name: str) -> RenderableType:
+    table = Table(title=f"Risk allocation, {name}", title_justify="left")
+    for heading in (
+        "allocation", "κ_x last stage", "κ_u", "terminal back-off x", "back-off u", "cost at start", "mean cost",
+        "of the box",
+    ):  # fmt: skip
+        table.add_column(heading, justify="left" if heading == "allocation" else "right")
+    refusals = []
+    for each in found.allocations:
+        if each.costs is None or each.kappa_x_terminal is None or each.kappa_u_terminal is None:
+            refusals.append(Text(f"No design with {each.allocation}: {each.refused}"))
+            continue
+        table.add_row(
+            each.allocation,
+            f"{each.kappa_x_terminal:.3f}",
+            f"{each.kappa_u_terminal:.3f}",
+            _several(each.terminal_backoff_x),
+            _several(each.terminal_backoff_u),
+            _cost(each.costs.start),
+            _cost(each.costs.mean),
+            f"{each.costs.feasible:.1%}",
+        )
+    return Group(table, *refusals, _basis(found))
+
+
+def _basis(found: GainComparison | RiskComparison) -> str:
+    return (
+        "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
+        "way of nearer equilibria, or gives way where the limits are soft.\n"
+        f"Means over {found.compared} states on the way to the target, feasible for every design; shares of "
+        f"{found.states} states uniform in the box of the limits."
+    )
+
+
+def _several(values: list[float]) -> str:
+    """Different values, in their order; the two sides of a box have the same."""
+    return " ".join(dict.fromkeys(f"{value:.3g}" for value in values))
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _cost(value: float | None) -> str:
+    return "infeasible" if value is None else f"{value:.2f}"
+
+
+def _cost_row(pick: Callable[[Costs], str]) -> Callable[[GainReport], str]:
+    return lambda report: "-" if report.costs is None else pick(report.costs)
+
+
+_GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
+    ("stationary cost of a step", lambda report: _figure(report.stationary_cost)),
+    ("spectral radius (4.2: below 1)", lambda report: _figure(report.spectral_radius)),
+    ("state room taken (4.3: at most 1)", lambda report: _figure(report.filled_x)),
+    ("input room taken (4.4: at most 1)", lambda report: _figure(report.filled_u)),
+    ("margin s* of the terminal condition", lambda report: _figure(report.margin)),
+    ("optimal cost from the simulator's start", _cost_row(lambda costs: _cost(costs.start))),
+    ("mean optimal cost", _cost_row(lambda costs: _cost(costs.mean))),
+    ("share of the box feasible", _cost_row(lambda costs: f"{costs.feasible:.1%}")),
+)
+
+
+# `uavctl design`: make a design, and show what it rests on.
+
+
+_RARE = 1e-9  # ages that are all older than this share of the time are told together
+
+
+def design(
+    *,
+    synthesize: Annotated[
+        bool,
+        Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
+    ] = False,
+    compare_risk: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="make the design under each risk allocation, and compare")
+    ] = False,
+    states: Annotated[
+        int, Parameter(help="seeded states in either comparison", validator=validators.Number(gte=1, lte=10_000))
+    ] = 60,
+    common: Common = DEFAULTS,
+) -> int:
+    """Make a design and its policy library: schedule, terminal ingredients, Assumption 4 with figures."""
+    if synthesize and compare_risk:
+        raise UsageError("--synthesize and --compare-risk are two questions; ask one at a time")
+    if synthesize:
+        return gains_report(common, states)
+    if compare_risk:
+        return risk_report(common, states)
+    loaded = common.load()
+    start = time.perf_counter()
+    if loaded.config.conditioned:
+        with located(loaded):
+            conditioned = build_conditioned(loaded.config)
+        common.show(
+            conditioned_document(conditioned, time.perf_counter() - start),
+            lambda: conditioned_picture(conditioned, loaded.config.name),
+        )
+        return 0
+    with located(loaded):
+        made = build_design(loaded.config)
+        stored = ready_library(loaded.config, made)
+    document = design_document(made, stored, time.perf_counter() - start)
+    common.show(document, lambda: design_picture(made, stored, loaded.config.name))
+    return 0
+
+
+def conditioned_document(made: ConditionedDesign, wall_s: float) -> dict[str, object]:
+    """The figures of scheme `age-conditioned`, for --json."""
+    return {**conditioned_record(made), "wall_s": wall_s}
+
+
+def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
+    """Ages and their risk, and where a plan may rest, as tables."""
+    ages = Table(title=f"Risk by the age of information, design {made.design_id} of {name}", title_justify="left")
+    for heading in ("age [steps]", "probability", "may be outside", "far from limits"):
+        ages.add_column(heading, justify="right")
+    risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
+    left = 1.0 - np.cumsum(risk.weights)
+    told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
+    for age in range(told):
+        both = (f"{spread.budgets[age]:.2%}" for spread in (risk, transit))
+        ages.add_row(str(age + 1), f"{risk.weights[age]:.3g}", *both)
+    if told < problem.horizon:
+        rest = f"{risk.weights[told:].sum():.3g}"
+        both = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
+        ages.add_row(f"{told + 1} to {problem.horizon}", rest, *both)
+    ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
+    names = build_names(made)
+    limits = Table(title="Where a plan may rest", title_justify="left")
+    for heading in ("limit", "at", "rests up to", "unit"):
+        limits.add_column(heading, justify="left" if heading in ("limit", "unit") else "right")
+    # A row of one entry limits -x from below where the entry is negative.
+    sizes = problem.state_set.c.sum(axis=1)
+    for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True):
+        limits.add_row(row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
+    return Group(ages, limits)
+
+
+def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
+    """The figures of a design and its policy library, for --json; without a library these are 0 and null."""
+    return {
+        **design_record(made),
+        "library_size": 0 if stored is None else sum(stored.sizes),
+        "gap_max": None if stored is None else stored.check.worst_gap,
+        "library": None if stored is None else library_document(stored),
+        "wall_s": wall_s,
+    }
+
+
+def library_document(stored: StoredLibrary) -> dict[str, object]:
+    """The figures of a policy library, for --json."""
+    return {
+        "library_id": stored.library_id,
+        "bytes": len(stored.data),
+        "file": None if stored.path is None else str(stored.path),
+        "cached": stored.cached,
+        "made_s": stored.made_s,
+        "components": [{"name": name, "policies": size} for name, size in zip(stored.names, stored.sizes, strict=True)],
+        "check": msgspec.to_builtins(stored.check),
+    }
+
+
+def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
+    """Assumption 4, the schedule and the policy library, as tables."""
+    checks = Table(title=f"Assumption 4, design {made.design_id} of {name}", title_justify="left")
+    for heading in ("item", "holds", "value", "limit", "of what"):
+        checks.add_column(heading)
+    for check in made.assumptions:
+        holds = "[green]yes[/]" if check.ok else "[red]no[/]"
+        checks.add_row(check.item, holds, f"{check.value:.4g}", f"{check.limit:.4g}", check.text)
+    schedule = Table()
+    for heading in ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"):
+        schedule.add_column(heading, justify="right")
+    rows = zip(made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True)
+    for t, (delay, alpha, gamma_x, gamma_u) in enumerate(rows):
+        schedule.add_row(str(t), str(delay), f"{alpha:.5f}", f"{gamma_x:.5f}", f"{gamma_u:.5f}")
+    terminal = (
+        f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
+        f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
+    )
+    return Group(
+        checks,
+        terminal,
+        "Schedule: stage t counts on information that is d_t steps old.",
+        schedule,
+        *_library_picture(stored),
+    )
+
+
+def _library_picture(stored: StoredLibrary | None) -> list[RenderableType]:
+    if stored is None:
+        return []
+    table = Table(title=f"Policy library {stored.library_id}", title_justify="left")
+    for heading in ("", "policies"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, size in zip(stored.names, stored.sizes, strict=True):
+        table.add_row(name, str(size))
+    check = stored.check
+    shares = ", ".join(f"{count / check.states:.0%} {name}" for name, count in check.methods.items())
+    answers = f"Answers from {check.states} states, most of them anywhere in the limits: {shares}; worst gap "
+    where = "kept nowhere" if stored.path is None else f"{'from' if stored.cached else 'kept in'} {stored.path}"
+    facts = f"{len(stored.data):,} bytes, made in {stored.made_s:.1f} s, {where}."
+    return [table, Text(f"{answers}{check.worst_gap:.1e}."), Text(facts)]

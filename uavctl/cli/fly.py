@@ -1,0 +1,289 @@
+"""Uavctl fly."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.markup import escape
+
+from logs.recording.recorder import Recorder, RecorderStatus
+from logs.recording.summary import FlightSummary, render
+from logs.recording.topics import ENDED
+from uavctl.build.controller import design_of
+from uavctl.cli.check import checked_before_arming, record_items
+from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
+from uavctl.cli.flying import (
+    Engagement,
+    Live,
+    LivePort,
+    check_places,
+    checked_take_off,
+    conclude,
+    ending_noted,
+    final,
+    goto_overrides,
+    live_line,
+    live_view_port,
+    new_recording,
+    onlookers,
+    put_header,
+    stand_by,
+    stop_limit_s,
+    stop_on_signals,
+    tell_ending,
+)
+from uavctl.cli.prepare import prepare
+from uavctl.clock import Due, Ticker, monotonic_ns
+from uavctl.config import Config, LoadedConfig
+from uavctl.config.connections import warnings
+from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
+from uavctl.daemon.daemon import fly as run_daemon
+from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
+from uavctl.daemon.lock import sole_daemon
+from uavctl.daemon.realtime import collected_between_ticks, realtime
+from uavctl.io.signed_connection import connected
+from uavctl.loop import ControlLoop
+
+# What stands beside the control loop of `uavctl fly`: orders, health lines, the service manager, real time.
+
+
+AfterTick = Callable[[Due, int], None]
+_UNREAD_LINES = 10  # health lines that wait for a slow terminal or log
+
+
+@contextmanager
+def operation(
+    loop: ControlLoop, config: Config, path: Path, status: Callable[[], RecorderStatus], listener: socket.socket
+) -> Iterator[Sequence[AfterTick]]:
+    """What the daemon calls after each tick; closed at the end.
+
+    Raises:
+        UsageError: the service manager's variables cannot be understood.
+    """
+    notifier = Notifier()
+    with _health_lines() as show:
+
+        def tell(line: str) -> None:
+            notifier.status(line)
+            show(line)
+
+        def recorder() -> RecorderHealth:
+            return recorder_health(status(), path)
+
+        identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
+        watch = HealthWatch(loop, config, identity, recorder, tell)
+        server = ControlServer(listener, config, loop, watch.look)
+        try:
+            # The sign of life comes last: it stands for all that a tick has to do.
+            yield watch.after_tick, server.after_tick, notifier.after_tick
+        finally:
+            notifier.status(f"ended: {loop.ending.sentence}")
+            server.close()
+            notifier.close()
+
+
+@contextmanager
+def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
+    """Real-time scheduling and memory if wanted, with what was not permitted told; what to call after each tick."""
+    with ExitStack() as stack:
+        for outcome in stack.enter_context(realtime()) if wanted else ():
+            style = "" if outcome.ok else "[bold yellow]warning:[/] "
+            messages().print(f"{style}--realtime: {outcome.part}: {outcome.text}", soft_wrap=True)
+        yield (stack.enter_context(collected_between_ticks()).after_tick,)
+
+
+@contextmanager
+def _health_lines() -> Iterator[Callable[[str], None]]:
+    """Write lines to standard error from a thread of its own, where no terminal shows the live line instead."""
+    lines: deque[str] = deque(maxlen=_UNREAD_LINES)
+    if sys.stderr.isatty():
+        yield lines.append
+        return
+    news, done = threading.Event(), threading.Event()
+
+    def write() -> None:
+        while not done.is_set():
+            news.wait()
+            news.clear()
+            while lines:
+                sys.stderr.write(lines.popleft() + "\n")
+                sys.stderr.flush()
+
+    def show(line: str) -> None:
+        lines.append(line)
+        news.set()
+
+    thread = threading.Thread(target=write, name="health", daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        done.set()
+        news.set()
+        thread.join(1.0)  # a reader that hangs does not keep the daemon
+
+
+def recorder_health(status: RecorderStatus, path: Path) -> RecorderHealth:
+    """How a recording is doing, for those who look at the flight."""
+    reason = status.warning if status.ok else status.reason or status.refusal
+    return RecorderHealth(
+        ok=status.ok,
+        dropped=status.dropped + status.refused + status.gone,
+        reason=reason,
+        path=str(path),
+        unwritten_s=status.unwritten_s,
+    )
+
+
+# `uavctl fly`: the flight daemon on a real link. Without `--arm` it never asks for a mode but landing.
+
+
+def fly(
+    *,
+    common: Common = DEFAULTS,
+    vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
+    mocap: Annotated[
+        str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
+    ] = None,
+    duration: Annotated[
+        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=SPAN_S)
+    ] = None,
+    arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
+    takeoff: Annotated[
+        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
+    ] = None,
+    goto: Annotated[
+        str | None,
+        Parameter(help="x,y,z in local NED [m]: fly there once in charge and stay", allow_leading_hyphen=True),
+    ] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+    control: Annotated[
+        Path | None, Parameter(help="folder of the socket for `uavctl ctl`; else $UAVCTL_CONTROL or the user's own")
+    ] = None,
+    realtime: Annotated[bool, Parameter(negative=(), help="SCHED_FIFO and locked memory, as far as permitted")] = False,
+    live: Live = False,
+    live_port: LivePort = None,
+) -> int:
+    """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C hands it back.
+
+    With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there; the end,
+    by Ctrl-C or --duration, is its landing.
+
+    Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
+    switches. When the pilot leaves the mode, streaming stops at once and does not come back.
+    """
+    given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap}
+    take_off_m = checked_take_off(arm, takeoff)
+    view_port = live_view_port(live=live, port=live_port)
+    overrides = [*(f'{key}="{value}"' for key, value in given.items() if value is not None), *goto_overrides(goto)]
+    summary = fly_daemon(
+        common.with_overrides(overrides).load(),
+        take_off_m=take_off_m,
+        goto=goto is not None,
+        duration_s=duration,
+        out=out,
+        control=control,
+        as_realtime_process=realtime,
+        view_port=view_port,
+    )
+    common.show(summary, lambda: render(summary))
+    return summary.ending.exit_code
+
+
+def fly_daemon(
+    loaded: LoadedConfig,
+    *,
+    take_off_m: float | None = None,
+    goto: bool = False,
+    duration_s: float | None = None,
+    out: Path | None = None,
+    control: Path | None = None,
+    as_realtime_process: bool = False,
+    view_port: int | None = None,
+) -> FlightSummary:
+    """Fly a vehicle until the end, record it, and say on the console how it ended.
+
+    Args:
+        loaded: the configuration, with where it is from.
+        take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
+        goto: whether the mission is the place of `--goto`.
+        duration_s: hand over after this time [s]; None flies on.
+        out: folder of the recording; None makes a new one below `flights/`.
+        control: folder of the socket for orders; None is the user's own.
+        as_realtime_process: SCHED_FIFO and locked memory, as far as permitted.
+        view_port: TCP port of a live view; None is none.
+
+    Raises:
+        UavctlError: nothing was flown, and why.
+    """
+    config = loaded.config
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
+    tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
+    # First of all, so that a second daemon is refused at once.
+    with (
+        sole_daemon(config.daemon.vehicle) as tenure,
+        listening(control_folder(control), daemon_name(config)) as listener,
+        onlookers(view_port) as looking,
+        new_recording(out, config.name, config.log.free_bytes) as path,
+    ):
+        with located(loaded):
+            design = design_of(config)
+            check_places(config, design, take_off_m, engagement.goal)
+            prepared = prepare(config, design)
+        begun = time.perf_counter()
+        with (
+            as_realtime(as_realtime_process) as collect,
+            stop_on_signals() as stopped,
+            connected(config) as connections,
+        ):
+            checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
+            recorder = Recorder(path, config.log, onlookers=looking)
+            loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+            engagement.begin(loop)
+            asked_for = False
+            try:
+                put_header(recorder, prepared, monotonic_ns())
+                record_items(recorder, checked, monotonic_ns())
+                for warning in warnings(config.security, config.daemon):
+                    messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+                if tenure.left_ns is not None:
+                    stand_by(loop, tenure.left_ns)
+                messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
+                with (
+                    live_line(loop, recorder, duration_s, config.daemon.tick_s),
+                    operation(loop, config, path, recorder.status, listener) as beside,
+                    ending_noted(loop),
+                ):
+                    asked_for = run_daemon(
+                        loop,
+                        connections,
+                        Ticker(tick_ns, dt_ns),
+                        stopped,
+                        duration_s=duration_s,
+                        stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
+                        after_tick=(
+                            lambda *_: tenure.note(loop.leaves_vehicle),
+                            lambda *_: recorder.catch_up(),
+                            lambda *_: engagement.follow(loop),
+                            *beside,
+                            *collect,
+                        ),
+                    )
+                if asked_for:
+                    tenure.note(False)
+            finally:
+                ending = loop.ending
+                recorder.put(ENDED, monotonic_ns(), ending)
+                status = recorder.close()
+                tell_ending(final(ending, status))
+    return conclude(path, time.perf_counter() - begun, status, ending)

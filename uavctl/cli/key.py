@@ -1,0 +1,42 @@
+"""`uavctl key`: files of signing keys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+from rich.table import Table
+
+from uavctl.cli.common import Common
+from uavctl.io.signed_connection import new_key, read_key
+
+Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
+
+key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.")
+
+
+@key_app.command
+def new(
+    file: Annotated[Path, Parameter(help="file to make; one that is there is not written over")], *, json: Json = False
+) -> int:
+    """Make a random key in a file that only its owner can read.
+
+    The file holds a passphrase, so that ground stations that ask for one can be given the same key.
+    """
+    return _show(file, new_key(file).name, json=json)
+
+
+@key_app.command
+def show(file: Annotated[Path, Parameter(help="file to read")], *, json: Json = False) -> int:
+    """Say which key a file holds: equal names are equal keys. Nothing of the key itself is shown."""
+    return _show(file, read_key(file).name, json=json)
+
+
+def _show(file: Path, name: str, *, json: bool) -> int:
+    table = Table.grid(padding=(0, 2))
+    table.add_row("file", str(file))
+    table.add_row("name of the key", name)
+    table.add_row("to use it", f'key_file = "{file.absolute()}" in \\[security]')
+    Common(json=json).show({"file": str(file.absolute()), "name": name}, lambda: table)
+    return 0

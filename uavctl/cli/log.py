@@ -1,0 +1,251 @@
+"""Uavctl log: info, recover, export."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from logs.recording.export import Exported, TableFormat, Watch, export_tables
+from logs.recording.info import PositionLoss, RecordingInfo
+from logs.recording.info import info as recording_info
+from logs.recording.reader import RecordedMessage, lacks_end
+from logs.recording.recover import RecoverResult
+from logs.recording.recover import recover as restore
+from logs.recording.summary import count
+from logs.recording.tlog import ExportedTlog, export_tlog
+from uavctl.cli.common import Common, Flight, Json, messages, two_columns, warn
+from uavctl.errors import UsageError
+
+# `uavctl log export`: a recording for other programs.
+
+
+TLOG = "tlog"
+
+
+def export(
+    flight: Flight,
+    /,
+    *,
+    to: Annotated[Literal["csv", "parquet", "tlog"], Parameter(help="format")],
+    out: Annotated[
+        Path | None, Parameter(help="folder of the tables, or the .tlog to write; else beside the recording")
+    ] = None,
+    link: Annotated[str | None, Parameter(help="with tlog: this connection alone, as in vehicle; else all")] = None,
+    force: Annotated[bool, Parameter(negative=(), help="write anew the files that exist")] = False,
+    json: Json = False,
+) -> int:
+    """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog."""
+    if to == TLOG:
+        _export_tlog(flight, _tlog_file(flight, out), link, force=force, common=Common(json=json))
+    elif link is not None:
+        raise UsageError("--link is for --to tlog: tables hold all topics, the raw bytes of each connection in its own")
+    else:
+        folder = out if out is not None else flight.with_name(f"{flight.stem}-{to}")
+        with _progress() as watch:
+            exported = export_tables(flight, folder, TableFormat(to), force=force, watch=watch)
+        Common(json=json).show(exported, lambda: _tables_picture(exported, folder))
+        for topic, number in exported.unknown.items():
+            warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
+    if cut := lacks_end(flight):
+        warn(f"{cut}: exported up to there")
+    return 0
+
+
+def _export_tlog(flight: Path, file: Path, link: str | None, *, force: bool, common: Common) -> None:
+    with _progress() as watch:
+        exported = export_tlog(flight, file, link=link, force=force, watch=watch)
+    common.show(exported, lambda: _tlog_picture(exported))
+    if exported.left_out_bytes:
+        warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
+
+
+def _tlog_file(flight: Path, out: Path | None) -> Path:
+    if out is None:
+        return flight.with_suffix(".tlog")
+    return out / f"{flight.stem}.tlog" if out.is_dir() else out
+
+
+@contextmanager
+def _progress() -> Iterator[Watch]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+
+        def watch(records: Iterable[RecordedMessage], total: int | None, what: str) -> Iterable[RecordedMessage]:
+            return progress.track(records, total=total, description=what)
+
+        yield watch
+
+
+def _tables_picture(exported: Exported, folder: Path) -> RenderableType:
+    table = Table()
+    for column in ("file", "rows", "columns"):
+        table.add_column(column, justify="left" if column == "file" else "right", overflow="fold")
+    for one in exported.tables:
+        table.add_row(Text(Path(one.file).name), str(one.rows), str(one.columns))
+    return Group(table, Text(f"in {folder}"))
+
+
+def _tlog_picture(exported: ExportedTlog) -> RenderableType:
+    table = Table()
+    table.add_column("topic")
+    table.add_column("packets", justify="right")
+    for topic, packets in exported.packets.items():
+        table.add_row(Text(topic), str(packets))
+    return Group(table, Text(f"in {exported.file}"))
+
+
+# `uavctl log info` as a table.
+
+
+def info_table(found: RecordingInfo) -> RenderableType:
+    """Topics with rates and gaps, and below what else is worth knowing."""
+    title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
+    if len(found.files) > 1:
+        title += f" in {len(found.files)} files"
+    table = Table()
+    for column in ("topic", "messages", "rate", "longest gap", "at"):
+        table.add_column(column, justify="left" if column == "topic" else "right")
+    for topic in found.topics:
+        rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
+        gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
+        table.add_row(Text(topic.topic), str(topic.messages), rate, *gap)
+    return Group(Text(title), table, *map(Text, _lines(found)))
+
+
+def _lines(found: RecordingInfo) -> Iterator[str]:
+    if not found.finished:
+        yield "not closed: `uavctl log recover` makes a clean file"
+    elif found.damage:
+        yield "damaged: `uavctl log recover` restores the rest"
+    else:
+        yield "closed in order"
+    yield (
+        f"records lost: {found.dropped} dropped, {found.refused} refused, {found.missing} missing; "
+        f"{found.failures} failed writes"
+    )
+    if len(found.segments) > 1:
+        for one in found.segments:
+            state = "" if one.finished else ", not closed"
+            yield f"{one.file}: {one.messages} messages, {one.bytes:,} bytes{state}"
+    yield from found.damage
+    for note in found.notes:
+        yield f"{note.at_s:.1f} s: {note.text}"
+    for link in found.connections:
+        lost = "".join(
+            f"; {what}: {_counts(counts)}" for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts
+        )
+        yield (
+            f"connection {link.link}: {link.datagrams} datagrams, {link.messages} messages, "
+            f"{link.samples} positions{lost}"
+        )
+    yield from _loss(found.position_loss)
+    if found.origin is not None:
+        yield f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})"
+    if found.library is not None:
+        yield f"policy library {found.library.library_id}, {found.library.bytes:,} bytes"
+
+
+def _loss(loss: PositionLoss) -> Iterator[str]:
+    if loss.believed is not None:
+        bursts = ", in bursts" if loss.bursts else ""
+        promise = ", more than promised" if loss.below_promise else ""
+        yield f"positions: {100 * loss.believed:.0f} % of the steps without news, as last estimated{bursts}{promise}"
+    if loss.simulated_sent:
+        yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """Counts in words, as in "3 checksum, 1 length"."""
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
+
+
+# `uavctl log`: its commands by name; what a recording holds, its repair, and a viewer's layout.
+
+
+RECOVERED_WITH_LOSS = 3
+log_app = App(name="log", help="Recordings: info, recover, replay, report, compare, whatif, export; a layout.")
+# Imported when they run: a replay does not wait for what draws pages.
+_COMMANDS = {
+    "replay": (
+        "replay:replay",
+        """Drive the recorded inputs through the same control loop and compare all that it decides.
+
+        Somebody else's flight (a `.tlog`, or an MCAP with raw MAVLink in it) goes through parser, clock offset,
+        estimator and controller of `--config`. With `--set KEY=VALUE` a recording of ours is replayed with that key
+        changed: what the changed controller would have decided of the same inputs, from the first decision that
+        differs on.
+        """,
+    ),
+    "report": ("log_report:report", "Write the page of a recording: one HTML file that needs nothing else."),
+    "compare": (
+        "log_report:compare_command",
+        "Put flights beside each other: parameters that differ, figures, and where they part.",
+    ),
+    "whatif": (
+        "whatif:whatif",
+        """Fly a recorded flight again with something changed, in the same disturbance, and compare.
+
+        The recorded inputs of the control loop come again at their times; positions are moved by as much as the
+        vehicle, by its model, would have been elsewhere. docs/what-if.md says what that can tell, and what not.
+        """,
+    ),
+    "export": (
+        "log:export",
+        """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog.
+
+        One table for each topic of records. Topics made for viewers (/view, /plot) are left out: they hold nothing
+        that the records do not. docs/recordings.md says what the columns are.
+        """,
+    ),
+}
+for _name, (_path, _help) in _COMMANDS.items():
+    log_app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
+
+
+@log_app.command
+def info(flight: Flight, /, *, json: Json = False) -> int:
+    """Say what a recording holds: topics, rates, gaps, losses, and how it was made."""
+    found = recording_info(flight)
+    Common(json=json).show(found, lambda: info_table(found))
+    return 0
+
+
+@log_app.command
+def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
+    """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
+    result = restore(flight, out)
+    Common(json=json).show(result, lambda: _recover_table(result, out))
+    return 0 if result.lossless else RECOVERED_WITH_LOSS
+
+
+@log_app.command
+def layout() -> int:
+    """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
+    sys.stdout.write(resources.files("logs").joinpath("foxglove-layout.json").read_text(encoding="utf-8"))
+    return 0
+
+
+def _recover_table(result: RecoverResult, out: Path) -> Table:
+    lost = str(result.messages_lost)
+    if not result.ended:
+        lost += " known; those after the last restored one cannot be counted"
+    return two_columns(
+        "Recovered",
+        [
+            ("written to", out),
+            ("messages", result.messages),
+            ("messages lost", lost),
+            ("bytes lost", result.lost_bytes),
+            *(("damage", text) for text in result.damage),
+        ],
+    )

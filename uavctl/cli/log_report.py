@@ -1,0 +1,134 @@
+"""Uavctl log report and compare: what draws pages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from logs.recording.flight import FlightData
+from logs.recording.outputs import spare_recording, write_whole
+from logs.recording.reader import lacks_end, read
+from logs.recording.summary import render, summarise
+from logs.report.compare import (
+    ComparedFlight,
+    FlightComparison,
+    compare,
+    difference,
+    for_people,
+    label,
+    likeness,
+    load_all,
+    measured,
+    parameter,
+    write_page,
+)
+from logs.report.figures import picture
+from logs.report.flight_page import verdict_rows, write_report
+from logs.report.verdicts import judge
+from uavctl.cli.common import Column, Common, Flight, Json, WideTable, can_be_read, messages, warn
+
+# `uavctl log compare`: recordings beside each other.
+
+
+def compare_command(
+    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=can_be_read)],
+    second: Annotated[Path, Parameter(help="another one", validator=can_be_read)],
+    /,
+    *more: Annotated[Path, Parameter(help="and more", validator=can_be_read)],
+    out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
+    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+) -> int:
+    """Put flights beside each other: parameters that differ, figures, and where they part."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        paths = (first, second, *more)
+        task = progress.add_task("reading", total=len(paths))
+        loaded = load_all(paths, lambda: progress.advance(task))
+        progress.update(task, description="comparing")
+        found = compare(loaded)
+    if out is not None:
+        write_page(found, loaded, out)
+    Common(json=json).show(found, lambda: comparison_picture(found))
+    return 0
+
+
+def comparison_picture(found: FlightComparison) -> RenderableType:
+    """What is compared, how far it is the same, parameters, figures, and what to mind."""
+    parts: list[RenderableType] = [_sides(found.recordings)]
+    parts += [Text(text) for text in map(likeness, found.likenesses)]
+    parts.append(_parameters(found) if found.parameters else Text("No parameter differs."))
+    parts.append(_figures(found))
+    parts += [Text(f"Mind: {text}.", style="yellow") for text in found.notes]
+    return Group(*parts)
+
+
+def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for one in sides:
+        state = "" if one.finished else ", torn"
+        made = f"config {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
+        table.add_row(one.name, Text(f"{one.recording}\n{made}"))
+    return table
+
+
+def _parameters(found: FlightComparison) -> Table:
+    table = Table(title="Parameters that differ", title_justify="left")
+    for name in ("", *(one.name for one in found.recordings)):
+        table.add_column(name, overflow="fold")
+    for one in found.parameters:
+        table.add_row(Text(one.key), *(Text(parameter(value)) for value in one.values))
+    return table
+
+
+def _figures(found: FlightComparison) -> WideTable:
+    rows = list(map(for_people, found.figures))
+    first, *others = (one.name for one in found.recordings)
+    groups = [[Column(first, [measured(row.values[0]) for row in rows])]]
+    for place, name in enumerate(others):
+        groups.append(
+            [
+                Column(name, [measured(row.values[place + 1]) for row in rows]),
+                Column(f"{name} − {first}", [difference(row.differences[place]) for row in rows]),
+                Column(f"{name} / {first}", [measured(row.ratios[place]) for row in rows]),
+            ]
+        )
+    ends = frozenset(place for place in range(len(rows) - 1) if rows[place].group != rows[place + 1].group)
+    return WideTable(Column("figure", list(map(label, rows)), "left"), groups, ends)
+
+
+# `uavctl log report`: the page of a recording.
+
+
+def report(
+    flight: Flight,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="page to write; else beside the recording")] = None,
+    svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
+    json: Json = False,
+) -> int:
+    """Write the page of a recording: one HTML file that needs nothing else."""
+    page = out if out is not None else flight.with_suffix(".html")
+    for target in (page, *(() if svg is None else (svg,))):
+        spare_recording(target)
+    data = FlightData.from_records(read(flight), flight)
+    dropped = max((note.dropped for note in data.notes), default=0)
+    summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
+    judged = judge(data)
+    if svg is not None:
+        write_whole(svg, picture(data))
+    write_report(data, summary, page, judged)
+    if cut := lacks_end(flight):
+        warn(f"{cut}: shown up to there")
+    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
+    Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
+    return 0

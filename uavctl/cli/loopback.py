@@ -1,0 +1,301 @@
+"""`uavctl loopback`: simulated vehicle, cameras, lossy channel and the controller together."""
+
+from __future__ import annotations
+
+import multiprocessing
+import socket
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import Connection as Pipe
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.progress import Progress
+
+from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
+from logs.recording.summary import FlightSummary, render
+from logs.recording.topics import ENDED
+from logs.recording.views import Views
+from sim.server import Ready, serve_in_child
+from sim.simulation import World
+from sim.vehicle.linear import Script
+from uavctl.build.controller import design_of
+from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
+from uavctl.cli.flying import (
+    Engagement,
+    Live,
+    LivePort,
+    check_places,
+    checked_take_off,
+    conclude,
+    ending_noted,
+    final,
+    goto_overrides,
+    live_line,
+    live_view_port,
+    new_recording,
+    onlookers,
+    put_header,
+    stop_limit_s,
+    stop_on_signals,
+    tell_ending,
+)
+from uavctl.cli.prepare import Prepared, prepare
+from uavctl.cli.sim import make_door
+from uavctl.clock import Ticker, monotonic_ns
+from uavctl.config import Config, LoadedConfig
+from uavctl.daemon.daemon import fly
+from uavctl.daemon.realtime import collected_between_ticks
+from uavctl.errors import UavctlError, UsageError
+from uavctl.io.signed_connection import connected
+from uavctl.loop import ControlLoop
+from uavctl.outcome import Cause
+from uavctl.records import Outgoing, Sink, Truth
+
+START_LIMIT_S = 60.0
+TRUTH = "/sim/truth"
+
+
+def loopback(
+    *,
+    common: Common = DEFAULTS,
+    udp: Annotated[bool, Parameter(negative=(), help="real UDP sockets and real time, else lockstep")] = False,
+    duration: Annotated[
+        float | None, Parameter(help="length of the flight [s]; else duration_s", validator=SPAN_S)
+    ] = None,
+    seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed", validator=SEED)] = None,
+    arm: Annotated[bool, Parameter(negative=(), help="begin on the ground, disarmed; needs --takeoff")] = False,
+    takeoff: Annotated[
+        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
+    ] = None,
+    goto: Annotated[
+        str | None, Parameter(help="x,y,z in local NED [m]: fly there and stay", allow_leading_hyphen=True)
+    ] = None,
+    out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
+    live: Live = False,
+    live_port: LivePort = None,
+) -> int:
+    """Fly the simulated vehicle over a lossy link, record it, and report.
+
+    In virtual time the same seed gives the same flight, bit for bit. It begins in the air; with --arm --takeoff HEIGHT
+    on the ground, and after its duration it ends there too.
+    """
+    take_off_m = checked_take_off(arm, takeoff)
+    view_port = live_view_port(live=live, port=live_port)
+    if live and not udp:
+        raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
+    given = {"duration_s": duration, "sim.seed": seed}
+    overrides = [*(f"{key}={value}" for key, value in given.items() if value is not None), *goto_overrides(goto)]
+    summary = fly_simulated(
+        common.with_overrides(overrides).load(),
+        udp=udp,
+        take_off_m=take_off_m,
+        goto=goto is not None,
+        out=out,
+        view_port=view_port,
+    )
+    common.show(summary, lambda: render(summary))
+    return summary.ending.exit_code
+
+
+def fly_simulated(
+    loaded: LoadedConfig,
+    *,
+    udp: bool = False,
+    take_off_m: float | None = None,
+    goto: bool = False,
+    out: Path | None = None,
+    view_port: int | None = None,
+) -> FlightSummary:
+    """Fly the simulated vehicle for the configured time, record it, and say on the console how it ended.
+
+    Args:
+        loaded: the configuration, with where it is from.
+        udp: over real sockets and in real time, else in lockstep and virtual time.
+        take_off_m: height of the climb above the ground [m]; None begins and ends in the air.
+        goto: whether the mission is the place of `--goto`.
+        out: folder of the recording; None makes a new one below `flights/`.
+        view_port: TCP port of a live view; None is none.
+
+    Raises:
+        UavctlError: nothing was flown, and why.
+    """
+    config = _on_loopback(loaded.config) if udp else loaded.config
+    if config.duration_s < config.daemon.tick_s:
+        raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
+    with located(loaded):
+        design = design_of(config)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
+    with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
+        with located(loaded):
+            check_places(config, design, take_off_m, engagement.goal)
+            prepared = prepare(config, design)
+        return _real_time(prepared, path, engagement, looking) if udp else lockstep(prepared, path, engagement)
+
+
+class _Timed:
+    """A loop in virtual time: nothing is ever late, and the time in the core is recorded."""
+
+    def __init__(self, loop: ControlLoop, engagement: Engagement) -> None:
+        self._loop = loop
+        self._engagement = engagement
+        self.stop = False
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        return self._loop.receive(link, data, at_ns)
+
+    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+        yield from self._loop.tick(tick, at_ns, stop=self.stop)
+        self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
+        self._engagement.follow(self._loop)
+
+
+class _InterruptedError(Exception):
+    """The operator asked for the end of a flight in virtual time."""
+
+
+def lockstep(prepared: Prepared, path: Path, engagement: Engagement, script: Script | None = None) -> FlightSummary:
+    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn."""
+    config, takes_off = prepared.config, engagement.takes_off
+    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(Views()))
+    begun = time.perf_counter()
+    loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+    engagement.begin(loop)
+    loop.course.in_flight = not takes_off
+    try:
+        put_header(recorder, prepared, started_ns=0)
+        timed = _Timed(loop, engagement)
+        with (
+            ending_noted(loop),
+            suppress(_InterruptedError),  # inside: an end that the operator asked for is no failure
+            stop_on_signals() as stopped,
+            Progress(console=messages(), transient=True) as progress,
+        ):
+            task = progress.add_task("flying in virtual time", total=config.duration_s)
+
+            def show(flown_s: float) -> None:
+                progress.update(task, completed=flown_s)
+                if stopped():
+                    loop.course.stop(Cause.OPERATOR)
+                    raise _InterruptedError
+
+            def record(truth: Truth) -> None:
+                recorder.put(TRUTH, truth.at_ns, truth)
+
+            world = World(config, timed, on_truth=record, on_progress=show, airborne=not takes_off, script=script)
+            begun = time.perf_counter()
+            world.run(config.duration_s, lambda: takes_off and loop.finished)
+            if takes_off:
+                timed.stop = True
+                loop.course.stop(Cause.TIME)
+                world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: loop.finished)
+    finally:
+        wall_s = time.perf_counter() - begun
+        recorder.put(ENDED, loop.decision.at_ns if loop.decision is not None else 0, loop.ending)
+        status = recorder.close()
+        tell_ending(final(loop.ending, status))
+    return conclude(path, wall_s, status, loop.ending)
+
+
+def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: DerivedTopics) -> FlightSummary:
+    config, takes_off = prepared.config, engagement.takes_off
+    tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
+    with ExitStack() as stack:
+        stopped = stack.enter_context(stop_on_signals())
+        connections = stack.enter_context(connected(config))
+        recorder = Recorder(path, config.log, onlookers=looking)
+        loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
+        engagement.begin(loop)
+        loop.course.in_flight = not takes_off
+        wall_s = 0.0
+        try:
+            put_header(recorder, prepared, monotonic_ns())
+            simulator = stack.enter_context(ExitStack())
+            simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
+            simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            collector = simulator.enter_context(collected_between_ticks())
+            begun = time.perf_counter()
+            with ending_noted(loop):
+                fly(
+                    loop,
+                    connections,
+                    Ticker(tick_ns, dt_ns),
+                    stopped,
+                    duration_s=config.duration_s,
+                    stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                    after_tick=(
+                        lambda *_: recorder.catch_up(),
+                        lambda *_: engagement.follow(loop),
+                        collector.after_tick,
+                    ),
+                )
+            wall_s = time.perf_counter() - begun
+            simulator.close()  # its last words go into the recording
+        finally:
+            recorder.put(ENDED, monotonic_ns(), loop.ending)
+            status = recorder.close()
+            tell_ending(final(loop.ending, status))
+    return conclude(path, wall_s, status, loop.ending)
+
+
+def _on_loopback(config: Config) -> Config:
+    """The same configuration with connections on free ports of this machine."""
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
+        one.bind(("127.0.0.1", 0))
+        other.bind(("127.0.0.1", 0))
+        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (one, other))
+    return msgspec.structs.replace(config, daemon=msgspec.structs.replace(config.daemon, vehicle=vehicle, mocap=mocap))
+
+
+@contextmanager
+def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
+    """The simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
+
+    Raises:
+        UavctlError: they do not start.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    stop = context.Event()
+    urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
+    arguments = (theirs, stop, config, *urls, None, airborne, make_door(config.security))
+    child = context.Process(target=serve_in_child, args=arguments, name="simulator")
+    child.start()
+    theirs.close()
+    listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)
+    try:
+        if not _ready(ours):
+            raise UavctlError(f"the simulator did not start within {START_LIMIT_S:g} s; see the messages above")
+        listener.start()
+        yield
+    finally:
+        stop.set()
+        child.join(START_LIMIT_S)
+        if child.is_alive():
+            child.kill()
+        if listener.ident is not None:
+            listener.join(START_LIMIT_S)
+        ours.close()
+
+
+def _ready(pipe: Pipe) -> bool:
+    """Wait for the simulator's ports; False if it ended or took too long."""
+    try:
+        return pipe.poll(START_LIMIT_S) and isinstance(pipe.recv(), Ready)
+    except EOFError:
+        return False
+
+
+def _listen(pipe: Pipe, sink: Sink) -> None:
+    """Hand the simulator's truth on until it hangs up."""
+    try:
+        while True:
+            told = pipe.recv()
+            if isinstance(told, Truth):
+                sink.put(TRUTH, told.at_ns, told)
+    except EOFError:
+        return

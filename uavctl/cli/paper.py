@@ -1,0 +1,216 @@
+"""`uavctl paper`: Section 5 of the paper, reproduced, with every claim beside what was measured."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from cyclopts import Parameter, validators
+from rich.console import Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from uavctl.build.controller import build_design, build_spec
+from uavctl.cli.common import SEED, WORKERS, Common, located, messages
+from uavctl.cli.prepare import ready_library
+from uavctl.errors import UsageError
+from uavctl.lab.paper.claims import (
+    PRESET,
+    PRINTED,
+    VARIANTS,
+    Claim,
+    Complexity,
+    Depth,
+    DesignTried,
+    Variant,
+    VariantResult,
+    assess,
+    claims_of_depth,
+)
+from uavctl.lab.paper.runs import HERE_UP_TO, Advance, Flights, Setup, fly_all
+from uavctl.labels import percent_above
+
+_RUNS = validators.Number(gte=1, lte=1_000_000)
+# Beyond, a second design would take minutes more to say the same of the claims.
+BOTH_UP_TO = 20_000
+
+
+def paper(
+    *,
+    runs: Annotated[int, Parameter(help="number of runs", validator=_RUNS)] = 200,
+    steps: Annotated[int, Parameter(help="steps of a run", validator=validators.Number(gte=4, lte=10_000))] = 50,
+    seed: Annotated[int, Parameter(help="seed of every random draw", validator=SEED)] = 0,
+    tau: Annotated[
+        Literal[4, 3] | None,
+        Parameter(
+            help=f"one design only: 4 as printed, or 3; else both, and the printed one above {BOTH_UP_TO} runs",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[Path, Parameter(help="folder of the figures")] = Path("flights/paper"),
+    workers: Annotated[
+        int | None,
+        Parameter(
+            help=f"processes for more than {HERE_UP_TO} runs; all cores by default. They change no figure",
+            validator=WORKERS,
+            show_default=False,
+        ),
+    ] = None,
+    full: Annotated[
+        bool,
+        Parameter(
+            negative=(),
+            show_default=False,
+            help="also which schedules make a design, complexity over τ, and the least cost within the input limits",
+        ),
+    ] = False,
+    json: Annotated[
+        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
+    ] = False,
+) -> int:
+    """Fly Section 5 of the paper, draw its figures, and hold every claim against what was measured."""
+    begun = time.perf_counter()
+    _make(out)
+    wanted = PRINTED.tau if tau is None and runs > BOTH_UP_TO else tau
+    chosen = [variant for variant in VARIANTS if wanted in (None, variant.tau)]
+    setups = [_setup(variant) for variant in chosen]
+    with _progress(runs * len(chosen), shown=runs > HERE_UP_TO) as advance:
+        flights = fly_all(setups, runs, steps, seed, workers or os.cpu_count() or 1, advance)
+    results = [
+        assess(setup, variant.note, flown, seed) for setup, variant, flown in zip(setups, chosen, flights, strict=True)
+    ]
+    depth = _measure_depth(seed) if full else None
+    figures = _draw(out, setups, flights)
+    claims = [*results[0].claims, *(claims_of_depth(depth, results[0].settled_cost) if depth else [])]
+    document = {
+        **msgspec.to_builtins(results[0]),
+        "claims": msgspec.to_builtins(claims),
+        "variants": msgspec.to_builtins(results),
+        "depth": None if depth is None else msgspec.to_builtins(depth),
+        "figures": [str(path) for path in figures],
+        "wall_s": time.perf_counter() - begun,
+    }
+    Common(json=json).show(document, lambda: paper_picture(results, claims, depth, figures))
+    return 0 if all(result.decisions and not result.infeasible and not result.failed for result in results) else 1
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out: {out} cannot be made ({error.strerror}); name another folder") from error
+
+
+def _setup(variant: Variant) -> Setup:
+    """Design and policy library of a variant, from the cache or made now."""
+    loaded = Common(config=PRESET, overrides=variant.overrides).load()
+    with located(loaded):
+        design = build_design(loaded.config)
+        stored = ready_library(loaded.config, design)
+    assert stored is not None  # the preset's solver is the library
+    return Setup(loaded.config, design, stored.library)
+
+
+@contextmanager
+def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
+    if not shown:
+        yield lambda _: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=messages(), transient=True) as progress:
+        task = progress.add_task("runs", total=total)
+        yield lambda done: progress.update(task, advance=done)
+
+
+def _measure_depth(seed: int) -> Depth:
+    from uavctl.lab.paper.depth import measure_depth  # the printed problem's CVXPY takes time to import
+
+    with messages().status("measuring") as status:
+        return measure_depth(seed, status.update)
+
+
+def _draw(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
+    """Fig. 3 of every design; Fig. 4 once: all have the same link."""
+    # matplotlib, when all is flown
+    from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
+
+    figures = {}
+    for setup, flown in zip(setups, flights, strict=True):
+        figures[f"paper-runs-tau{setup.design.terminal.tau}.svg"] = trajectories_svg(flown.drawn, setup.design)
+    first = setups[0]
+    link = AgeReference(first.design.terminal.tau, first.design.horizon, build_spec(first.config).link.outage(1))
+    figures["paper-ages.svg"] = ages_svg(flights[0].totals.ages, link)
+    for name, svg in figures.items():
+        (out / name).write_text(svg, encoding="utf-8")
+    return [out / name for name in figures]
+
+
+def paper_picture(
+    results: list[VariantResult], claims: list[Claim], depth: Depth | None, figures: list[Path]
+) -> RenderableType:
+    """The claims beside what each design came to; `claims` are those of the first one, and what was measured beyond."""
+    first = results[0]
+    table = Table(
+        title=f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}",
+        title_justify="left",
+        show_lines=True,
+    )
+    for heading in ("claim", "paper", *(f"τ = {result.tau}" for result in results)):
+        table.add_column(heading)
+    others = [{one.key: one for one in result.claims} for result in results[1:]]
+    for one in claims:
+        table.add_row(one.claim, one.paper, _cell(one), *(_cell(other.get(one.key)) for other in others))
+    more = [] if depth is None else [_designs(depth.designs), _complexity(depth.complexity)]
+    lines = [Text(f"{_costs(result)}\n{result.note}.") for result in results]
+    return Group(table, *lines, *more, Text(f"Figures: {', '.join(map(str, figures))}"))
+
+
+def _cell(claim: Claim | None) -> Text:
+    if claim is None:
+        return Text("")
+    word, style = {True: ("yes: ", "green"), False: ("no: ", "red"), None: ("", "")}[claim.holds]
+    return Text.assemble((word, style), claim.measured)
+
+
+def _costs(result: VariantResult) -> str:
+    spread = ", ".join(f"{std:.2f}" for std in result.settled_std)
+    return (
+        f"τ = {result.tau}: summed cost {result.mean_cost:.0f} ± {result.cost_stderr:.0f} (standard error), settled "
+        f"standard deviations {spread}, largest certified gap {percent_above(result.largest_gap)} of the cost"
+    )
+
+
+def _designs(tried: list[DesignTried]) -> Table:
+    table = Table(title="Schedules, and what comes of them", title_justify="left")
+    for heading in ("τ", "schedule", "delays", "γ^x_H", "cost at start", "refused"):
+        table.add_column(heading)
+    for one in tried:
+        table.add_row(
+            str(one.tau),
+            one.schedule,
+            "" if one.delays is None else " ".join(map(str, one.delays)),
+            "" if one.gamma_h is None else f"{one.gamma_h:.4f}",
+            "" if one.refused else "not reached" if one.cost is None else f"{one.cost:.0f}",
+            Text(one.refused),
+        )
+    return table
+
+
+def _complexity(sizes: list[Complexity]) -> Table:
+    table = Table(title="One decision of one axis over τ, medians", title_justify="left")
+    for heading in ("τ", "H", "terminal states", "gains", "as printed", "exact", "library", "refused"):
+        table.add_column(heading, justify="left" if heading == "refused" else "right")
+    for one in sizes:
+        times = (
+            "" if one.printed_ms is None else f"{one.printed_ms:.0f} ms",
+            "" if one.exact_ms is None else f"{one.exact_ms:.1f} ms",
+            "" if one.library_us is None else f"{one.library_us:.0f} µs",
+        )
+        table.add_row(str(one.tau), str(one.horizon), str(one.lifted), str(one.gains), *times, Text(one.refused))
+    return table

@@ -1,0 +1,413 @@
+"""Uavctl log replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.console import Group, RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from logs.recording.foreign import is_foreign, read_mcap
+from logs.recording.reader import good_messages, header, lacks_end, last_note, records
+from logs.recording.replay import (
+    MAKERS,
+    Chosen,
+    Context,
+    FieldDivergence,
+    ReplayDifference,
+    ReplayResult,
+    recorded_library,
+)
+from logs.recording.replay import replay as replay_recording
+from logs.recording.summary import count
+from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
+from logs.recording.topics import HOLES, RECOVERED, RecorderNote
+from uavctl.build.controller import build_controller, design_of
+from uavctl.build.library import check_fits, decode
+from uavctl.cli.common import DEFAULTS, Common, Flight, located, messages, two_columns, warn
+from uavctl.cli.prepare import Prepared, cpu, prepare, versions
+from uavctl.config import Config, LoadedConfig
+from uavctl.config.load import parse
+from uavctl.errors import LibraryError, RecordingError, UsageError
+from uavctl.flight.controller import Controller
+from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.records import Header, Sink, StepInput
+from uavctl.smpc.hahn_stursberg.design import Design
+
+# The controller of a recording: with the policy library that it carries, whatever the cache holds.
+
+
+def recorded_flyer(flight: Path, config: Config) -> Prepared:
+    """What flew.
+
+    Raises:
+        RecordingError: It carries no policy library though it flew with one, or one that does not fit.
+    """
+    design = design_of(config)
+    if not isinstance(design, Design) or not config.uses_library:
+        return prepare(config, design)
+    try:
+        return _with_library(flight, config, design)
+    except LibraryError as error:
+        raise RecordingError(
+            f"{flight}: {error.reason}; use the version that recorded it (`uavctl log info` tells)"
+        ) from error
+
+
+def changed_flyer(flight: Path, before: Config, loaded: LoadedConfig) -> Prepared:
+    """What flies with a changed configuration: the recorded policy library where that fits, else one of its own.
+
+    Raises:
+        ConfigError: The configuration leaves no design.
+        RecordingError: The recording carries no policy library though it flew with one.
+    """
+    config = loaded.config
+    with located(loaded):
+        design = design_of(config)
+        if isinstance(design, Design) and config.uses_library and before.uses_library:
+            with suppress(LibraryError):
+                return _with_library(flight, config, design)
+        return prepare(config, design)
+
+
+def _with_library(flight: Path, config: Config, design: Design) -> Prepared:
+    library = decode(recorded_library(flight).data)
+    check_fits(library.library, design)
+    return Prepared(config, design, library, build_controller(config, design, library.library))
+
+
+# What is replayed: a recording of ours from its file alone, as recorded or otherwise; another program's packets.
+
+
+class Changed(msgspec.Struct, frozen=True, kw_only=True):
+    """A key of the configuration that is another one in the replay."""
+
+    key: str
+    recorded: str
+    replayed: str
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A replay and what has to be known of its recording."""
+
+    result: ReplayResult  # what it found
+    lacks_end: str  # why the recording's end is not there, in words; nothing if it is
+    holes: str  # from what it was recovered, and what was lost before its end, in words; nothing if that is all there
+    changed: tuple[Changed, ...]  # what was asked to be different
+    other_versions: tuple[str, ...]  # what decides the last bits, and is not here what the recording was made with
+
+
+def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str] = ()) -> Replayed:
+    """Drive the recorded inputs through a new control loop of the recorded configuration.
+
+    Args:
+        flight: The recording, its first file if there are several.
+        tolerance: See `logs.recording.replay.replay`.
+        overrides: `key=value`, as for a flight: what is to be another value than in the recording.
+
+    Raises:
+        RecordingError: It cannot be read, is only a later file of one, or carries not what it was flown with.
+        ConfigError: An override does not fit, or leaves no design.
+        UsageError: An override changes over which connections the bytes came.
+    """
+    check_first(flight)
+    recorded = header(flight)
+    cut, note = lacks_end(flight), last_note(flight)
+    if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
+        nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
+        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded)))
+    name = f"{flight} (configuration)"
+    config = parse(recorded.config_toml, name).config
+    if overrides:
+        loaded = parse(recorded.config_toml, name, overrides)
+        if make_links(loaded.config).keys() != make_links(config).keys():
+            raise UsageError(
+                "daemon.vehicle and daemon.mocap say over which connections the recorded bytes came; leave them as "
+                "they are"
+            )
+        controller = changed_flyer(flight, config, loaded).controller
+        changed = tuple(_changes(msgspec.to_builtins(config), msgspec.to_builtins(loaded.config), ""))
+        config = loaded.config
+    else:
+        controller, changed = recorded_flyer(flight, config).controller, ()
+    holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""
+    result = replay_recording(
+        ((one.definition.topic, one.at_ns, one.data) for one in good_messages(flight)),
+        lambda sink: ControlLoop(config, controller, sink, lambda: 0),
+        tolerance,
+        finished=not cut and not holes,
+        # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
+        ignored=MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset(),
+    )
+    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded)))
+
+
+def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
+    """What another program has recorded, and None if the recording is one of ours; says what was left out.
+
+    Args:
+        topics: Of an MCAP: those to take; all that hold MAVLink if none is named.
+
+    Raises:
+        RecordingError: It cannot be read, or holds no MAVLink.
+        UsageError: It has no such topic.
+    """
+    if flight.suffix == ".tlog":
+        if topics:
+            raise UsageError("--topic is for an MCAP: a .tlog has no topics")
+        tlog = read_tlog(flight)
+        packets, notes = tlog.packets, tlog.notes
+    elif is_foreign(flight):
+        found = read_mcap(flight, topics)
+        messages().print(f"MAVLink in {', '.join(found.topics)}", markup=False, soft_wrap=True)
+        torn = ("the recording is torn: replayed up to its end",) if found.torn else ()
+        packets, notes = found.packets, (*found.notes, *torn)
+    else:
+        return None
+    for note in notes:
+        warn(note)
+    return packets
+
+
+def check_first(flight: Path) -> None:
+    """A later file alone has neither the first ticks nor what they left behind."""
+    note = next(records(flight, RecorderNote), None)
+    if note is None or note.segment == 1:
+        return
+    if not flight.exists():
+        raise RecordingError(f"{flight}: is missing, and a recording can be replayed from its beginning only")
+    first = flight.with_name(f"{flight.stem.removesuffix(f'-{note.segment}')}{flight.suffix}")
+    raise RecordingError(
+        f"{flight}: is file {note.segment} of a recording, which can be replayed from its beginning only; "
+        f"give the first one, {first}, with the others beside it"
+    )
+
+
+def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
+    """Keys of two configurations that differ."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in dict.fromkeys([*before, *now]):
+            yield from _changes(before.get(name), now.get(name), f"{key}.{name}" if key else str(name))
+    elif before != now:
+        yield Changed(key=key, recorded=str(before), replayed=str(now))
+
+
+def other_versions(recorded: Header) -> Iterator[str]:
+    """What decides a flight's last bits and is not what the recording was made with: code, libraries, CPU type."""
+    here = {**versions(), "cpu": cpu()}
+    there = {**recorded.versions, "cpu": recorded.cpu}
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
+            yield f"recorded with {name} {there.get(name, 'unknown')}, here is {here.get(name, 'none')}"
+
+
+# A replay as a person reads it: where it parts from the recording, why that may be, and what becomes of it.
+
+
+MOST_FIELDS = 12
+_LONGEST = 60
+
+
+def replay_table(replayed: Replayed) -> RenderableType:
+    """The whole outcome."""
+    result = replayed.result
+    rows: list[tuple[str, object]] = [
+        *(("changed", f"{one.key}: {_cut(one.recorded)} -> {_cut(one.replayed)}") for one in replayed.changed),
+        ("decisions", result.decisions),
+        ("records compared", result.compared),
+        ("identical, bit for bit", "yes" if result.identical else "no"),
+    ]
+    first = result.first_difference
+    if first is None:
+        return two_columns("Replay", rows)
+    rows += _difference("first difference", first)
+    if first.stage:
+        rows.append(("in question", first.stage))
+    rows += [("made otherwise", text) for text in replayed.other_versions]
+    if result.context is not None:
+        rows += _context(result.context)
+    decision = result.first_decision
+    if decision is None:
+        rows.append(("decisions that differ", "none"))
+    else:
+        since = result.decisions - (0 if result.context is None else result.context.decisions_before)
+        rows.append(("decisions that differ", f"{result.decisions_differing} of {since} from then on"))
+        if decision != first:
+            rows += _difference("the first of them", decision)
+    return Group(two_columns("Replay", rows), _course(result.course))
+
+
+def _difference(title: str, one: ReplayDifference) -> Iterator[tuple[str, object]]:
+    when = "before the first tick" if one.tick is None else f"{one.flight_s:.3f} s into the flight, tick {one.tick}"
+    yield title, f"{when} (log time {one.at_ns} ns)"
+    others = f", and {one.fields - 1} more fields of the record" if one.fields > 1 else ""
+    named = f" ({one.meaning})" if one.meaning else ""
+    yield "", f"{one.topic} {one.field}{named}".rstrip() + others
+    unit = f" {one.unit}" if one.unit else ""
+    change = "" if one.change is None else f", that is {one.change:+.3g}{unit}"
+    yield "", f"recorded {_cut(one.recorded)}{unit}, replayed {_cut(one.replayed)}{unit}{change}"
+
+
+def _context(context: Context) -> Iterator[tuple[str, object]]:
+    yield "before it", f"{context.decisions_before} decisions, {context.records_before} records: all identical"
+    newest = ""
+    if context.position_m is not None and context.position_age_s is not None:
+        place = ", ".join(f"{value:.3f}" for value in context.position_m)
+        newest = f", the newest {context.position_age_s:.3f} s old at ({place}) m"
+    parts = [
+        f"{context.positions} position{'' if context.positions == 1 else 's'}{newest}",
+        f"vehicle {context.vehicle}" if context.vehicle else "no vehicle heard",
+        *([f"orders {', '.join(context.orders)}"] if context.orders else []),
+        *([f"{context.missed_ticks} ticks missed before it"] if context.missed_ticks else []),
+        *(["the hand-over is asked for"] if context.stop else []),
+    ]
+    yield "that tick was given", "; ".join(parts)
+    if context.recorded is not None and context.recorded == context.replayed:
+        yield "and decided, both", _chosen(context.recorded)
+        return
+    yield "and decided, recorded", _chosen(context.recorded)
+    yield "and decided, replayed", _chosen(context.replayed)
+
+
+def _chosen(one: Chosen | None) -> str:
+    if one is None:
+        return "nothing"
+    age = "no age yet" if one.age_steps is None else f"age {one.age_steps} steps"
+    plan = "no plan" if one.plan_seq is None else f"plan {one.plan_seq}, index {one.plan_index}"
+    solve = "no solve" if one.solve is None else f"solve {one.solve}"
+    return f"{one.mode} ({one.reason}); {age}; {plan}; {solve}"
+
+
+def _course(course: tuple[FieldDivergence, ...]) -> Table:
+    """What becomes of the difference, on the recorded inputs."""
+    title = "What becomes of it, on the recorded inputs"
+    if len(course) > MOST_FIELDS:
+        title += f" ({MOST_FIELDS} of {len(course)} fields, all with --json)"
+    table = Table("field", title=title, title_justify="left")
+    for name in ("from [s]", "records that differ", "largest", "at [s]"):
+        table.add_column(escape(name), justify="right")
+    for one in course[:MOST_FIELDS]:
+        unit = f" {one.unit}" if one.unit else ""
+        entry = f" ({one.entry})" if one.entry else ""
+        table.add_row(
+            escape(f"{one.topic} {one.field or '(a record on one side only)'}"),
+            f"{one.first_s:.3f}",
+            f"{one.differing} of {one.records}",
+            "-" if one.largest is None else escape(f"{one.largest:.3g}{unit}{entry}"),
+            "-" if one.largest_s is None else f"{one.largest_s:.3f}",
+        )
+    return table
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+# `uavctl log replay`: the recorded inputs through the same control loop.
+
+
+def replay(
+    flight: Flight,
+    /,
+    *,
+    common: Common = DEFAULTS,
+    tolerance: Annotated[
+        float, Parameter(help="largest relative difference that counts as none; for another CPU type")
+    ] = 0.0,
+    topic: Annotated[
+        tuple[str, ...],
+        Parameter(negative=(), help="with the MCAP of another program: take this topic alone; may be repeated"),
+    ] = (),
+) -> int:
+    """Drive the recorded inputs through the same control loop and compare all that it decides."""
+    if not 0.0 <= tolerance < 1.0:
+        raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
+    packets = foreign_packets(flight, topic)
+    if packets is not None:
+        return _replay_foreign(flight, packets, common)
+    if common.config != DEFAULTS.config or topic:
+        raise UsageError(
+            "--config and --topic are for another program's recording: one of ours is replayed with its own "
+            "configuration, of which --set changes a key"
+        )
+    replayed = replay_flight(flight, tolerance, common.overrides)
+    result = replayed.result
+    for text in replayed.other_versions:
+        warn(f"{text}: decisions may differ")
+    if result.dropped:
+        text = f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
+        warn(text)
+    if replayed.holes:
+        warn(f"{replayed.holes}: where messages are missing, what came after cannot be compared")
+    if replayed.lacks_end:
+        compared = "compared up to there" if result.decisions else "before its first decision, so nothing was compared"
+        warn(f"{replayed.lacks_end}: {compared}")
+    document = {
+        **msgspec.structs.asdict(result),
+        "changed": replayed.changed,
+        "other_versions": replayed.other_versions,
+    }
+    common.show(document, lambda: replay_table(replayed))
+    return 0 if result.identical else 1
+
+
+def _loop_maker(config: Config, controller: Controller) -> Callable[[Sink], ControlLoop]:
+    return lambda sink: ControlLoop(config, controller, sink, lambda: 0)
+
+
+def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Common) -> int:
+    loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
+    config = loaded.config
+    with located(loaded):
+        controller = prepare(config, design_of(config)).controller
+        # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
+        make_loop = _loop_maker(config, replace(controller, envelope=None))
+    packets = ((packet.at_ns, packet.data) for packet in recorded if not packet.outgoing)
+    tick_ns = round(config.daemon.tick_s * 1e9)
+    result = replay_tlog(packets, make_loop, link=VEHICLE, tick_ns=tick_ns)
+    if not result.positions:
+        raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
+    common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
+    return 0
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """Counts in words, as in "126 track, 20 hold"."""
+    return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
+
+
+def _ages(ages: Mapping[str, int], horizon: int) -> str:
+    """Ages at decisions, in a few classes."""
+    classes: dict[str, int] = {}
+    for age, decisions in ages.items():
+        steps = int(age)
+        name = age if steps < 2 else f"2 to {horizon - 1}" if steps < horizon else f"{horizon} and more"
+        classes[name] = classes.get(name, 0) + decisions
+    return ", ".join(f"{name}: {decisions}" for name, decisions in classes.items())
+
+
+def _foreign_table(result: ForeignReplay, horizon: int) -> Table:
+    ages = result.age_ms
+    rows: list[tuple[str, object]] = [
+        ("datagrams", result.datagrams),
+        ("positions", result.positions),
+        ("out of order", result.out_of_order),
+        ("accepted / refused", f"{result.accepted} / {result.rejected}"),
+        ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
+        ("solves", _counts(result.solves)),
+        ("ticks by mode", _counts(result.modes)),
+        *([("not taken by the connection", _counts(result.left_out))] if result.left_out else []),
+        ("decisions by age in steps", _ages(result.age_steps, horizon)),
+    ]
+    if ages is not None:
+        spread = f"{ages.min:.0f}, {ages.p05:.0f}, {ages.p50:.0f}, {ages.p95:.0f}, {ages.max:.0f}"
+        rows.append(("capture to arrival, ms: min, 5 %, median, 95 %, max", spread))
+    return two_columns("Foreign recording through our controller", rows)

@@ -1,0 +1,302 @@
+"""Uavctl sim."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from cyclopts import Parameter, validators
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.markup import escape
+
+from sim.faults import problems
+from sim.server import Door, Port, Ready, Seat, fleet, serve_all
+from sim.simulation import VehicleSnapshot
+from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages
+from uavctl.cli.flying import stop_on_signals
+from uavctl.clock import monotonic_ns
+from uavctl.config.connections import MOCAP_LINK, SecurityConfig
+from uavctl.config.load import with_faults
+from uavctl.io.signed_connection import read_key
+from uavctl.mavlink.connection import MOCAP
+from uavctl.mavlink.framing import scan
+from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.records import Truth, Vec3
+
+# The simulated peers behind a door of their own, so that signing can be tried without a vehicle.
+
+
+LINK_ID = 100  # of the simulated vehicle; its cameras' is one more
+
+
+class SignedPort:
+    """A port whose frames are signed both ways; implements `sim.server.Port`."""
+
+    def __init__(self, inner: Port, gate: Gate) -> None:
+        self._inner, self._gate = inner, gate
+
+    @property
+    def url(self) -> str:
+        """See `Port`."""
+        return self._inner.url
+
+    def sockets(self) -> tuple[socket.socket, ...]:
+        """See `Port`."""
+        return self._inner.sockets()
+
+    def read(self) -> list[bytes]:
+        """See `Port`; what holds no verified frame is dropped."""
+        at_ns = monotonic_ns()
+        admitted = (self._gate.admit(data, at_ns) for data in self._inner.read())
+        return [data for data in admitted if data]
+
+    def write(self, data: bytes) -> None:
+        """See `Port`; what the channel has damaged goes out damaged."""
+        found = scan(data, final=True)
+        if found.frames and not found.bad:
+            at_ns = monotonic_ns()
+            data = b"".join(self._gate.seal(frame.data, at_ns) for frame in found.frames)
+        self._inner.write(data)
+
+    def close(self) -> None:
+        """See `Port`."""
+        self._inner.close()
+
+
+def make_door(security: SecurityConfig) -> Door | None:
+    """What puts ports behind doors as `[security]` asks of the daemon; None if it asks for nothing.
+
+    Raises:
+        KeyFileError: the key cannot be used.
+    """
+    if not security.key_file:
+        return None
+    read_key(Path(security.key_file).expanduser())  # an error belongs to the caller, not to a child process
+    return partial(_behind_door, security)
+
+
+def _behind_door(security: SecurityConfig, name: str, port: Port) -> Port:
+    if name not in security.require:
+        return port
+    key: SigningKey = read_key(Path(security.key_file).expanduser())
+    link_id = LINK_ID + (MOCAP_LINK if name == MOCAP else 0)
+    signing = Signing(key, link_id, Stamps(), time.time_ns() - monotonic_ns())
+    return SignedPort(port, Gate(signing, stream=False))
+
+
+# `uavctl sim --view`: what the simulated vehicles do, while they do it.
+
+
+REFRESH_S = 0.25
+LINE_S = 1.0  # between two lines, without a terminal
+END_S = 1.0  # longest wait for a terminal that takes nothing any more
+LANDED = {"ground": "on the floor", "air": "in the air", "climb": "taking off", "descent": "landing"}
+HEADINGS = (
+    "id",
+    "mode",
+    "armed",
+    "landed",
+    "position NED [m]",
+    "velocity [m/s]",
+    "battery",
+    "setpoint",
+    "sent",
+    "lost",
+    "faults",
+    "last text",
+)
+
+Looks = Sequence[VehicleSnapshot]
+
+
+def view(looks: Looks) -> RenderableType:
+    """A table, one row a vehicle and one column a quantity; several below each other where the terminal is narrow."""
+    rows = zip(*(_cells(one) for one in looks), strict=True)
+    # What vehicles say, and units in brackets, are no markup.
+    columns = [
+        Column(escape(heading), [escape(cell) for cell in row]) for heading, row in zip(HEADINGS, rows, strict=True)
+    ]
+    time_s = max(one.time_s for one in looks)
+    return Group(f"simulated time {time_s:.1f} s", WideTable(columns[0], [[column] for column in columns[1:]]))
+
+
+def _cells(one: VehicleSnapshot) -> tuple[str, ...]:
+    return (
+        str(one.system_id),
+        one.mode,
+        "yes" if one.armed else "no",
+        LANDED[one.phase],
+        _vector(one.position_m),
+        _vector(one.velocity_mps),
+        f"{one.battery:.0%}",
+        _setpoint(one),
+        str(one.sent),
+        str(one.lost),
+        ", ".join(one.faults) or "-",
+        one.text or "-",
+    )
+
+
+def _vector(vector: Vec3) -> str:
+    return " ".join(f"{component:+.2f}" for component in vector)
+
+
+def _setpoint(one: VehicleSnapshot) -> str:
+    if one.steered_by is None or one.setpoint_age_s is None:
+        return "-"
+    system, component = one.steered_by
+    return f"{system}/{component}, {one.setpoint_age_s:.2f} s ago"
+
+
+def line(one: VehicleSnapshot) -> str:
+    """The same of one vehicle in a line of plain text."""
+    names = ("mode", "armed", "landed", "position", "velocity", "battery", "setpoint", "sent", "lost", "faults", "text")
+    told = "  ".join(f"{name} {cell}" for name, cell in zip(names, _cells(one)[1:], strict=True))
+    return f"{one.time_s:.1f} s  vehicle {one.system_id}  {told}"
+
+
+@contextmanager
+def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]], None]]:
+    """Show what the yielded function is told: a live table, or a line a second and vehicle where there is no terminal.
+
+    A thread of its own draws, so whoever tells never waits, not even for a terminal that has stopped.
+    """
+    latest: list[tuple[VehicleSnapshot, ...]] = []
+    done = threading.Event()
+
+    def tell(looks: tuple[VehicleSnapshot, ...]) -> None:
+        latest[:] = [looks]
+
+    draw = _draw if console.is_terminal else _write
+    if not console.is_terminal:
+        console.print("--view: no terminal to draw in, so a line a second", soft_wrap=True)
+    thread = threading.Thread(target=draw, args=(console, latest, done), name="view", daemon=True)
+    thread.start()
+    try:
+        yield tell
+    finally:
+        done.set()
+        thread.join(END_S)
+
+
+def _draw(console: Console, latest: list[tuple[VehicleSnapshot, ...]], done: threading.Event) -> None:
+    # Standard output stays what it is: the line that says that the ports are open may go to another program.
+    with Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
+        ended = False
+        while not ended:
+            ended = done.wait(REFRESH_S)
+            for looks in latest:
+                live.update(view(looks), refresh=True)
+
+
+def _write(console: Console, latest: list[tuple[VehicleSnapshot, ...]], done: threading.Event) -> None:
+    ended = False
+    while not ended:
+        ended = done.wait(LINE_S)
+        for looks in latest:
+            for one in looks:
+                console.print(line(one), markup=False, highlight=False, soft_wrap=True)
+
+
+# `uavctl sim`: the simulated vehicle and cameras alone, for any MAVLink client.
+
+
+VEHICLES = {"px4": "udpout://127.0.0.1:14540,udpout://127.0.0.1:14550", "ardupilot": "tcpin://127.0.0.1:5760"}
+MOST_VEHICLES = 10
+FASTEST = 1000.0
+LONGEST_S = 1e6
+
+
+def sim(
+    *,
+    common: Common = DEFAULTS,
+    vehicle: Annotated[
+        str | None,
+        Parameter(
+            help="udpout://host:port, udpin or tcpin; several, separated by commas, are one link. As the real ones do: "
+            "PX4 sends to udpout://127.0.0.1:14540 and 14550, ArduPilot listens at tcpin://127.0.0.1:5760"
+        ),
+    ] = None,
+    mocap: Annotated[str, Parameter(help="the same for the cameras; an equal URL is one connection")] = (
+        "udpout://127.0.0.1:14560"
+    ),
+    autopilot: Annotated[
+        Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot.autopilot")
+    ] = None,
+    airborne: Annotated[bool, Parameter(negative=(), help="start flying in OFFBOARD or GUIDED")] = False,
+    duration: Annotated[
+        float | None,
+        Parameter(
+            help="end after this simulated time [s], at most 1e6; else on Ctrl-C",
+            validator=validators.Number(gt=0, lte=LONGEST_S),
+        ),
+    ] = None,
+    speed: Annotated[
+        float,
+        Parameter(help="simulated time per real time, at most 1000", validator=validators.Number(gt=0, lte=FASTEST)),
+    ] = 1.0,
+    faults: Annotated[
+        Path | None, Parameter(help="TOML file of what happens, as [[fault]] tables with the keys of [[sim.fault]]")
+    ] = None,
+    vehicles: Annotated[
+        int,
+        Parameter(
+            help="how many at once, 1 to 10. Each has the system id and the seed of the one before plus one, starts "
+            "1 m from it, and its ports lie 1 (UDP) or 10 (TCP) higher",
+            validator=validators.Number(gte=1, lte=MOST_VEHICLES),
+        ),
+    ] = 1,
+    view: Annotated[
+        bool, Parameter(negative=(), help="show on standard error what happens; without a terminal a line a second")
+    ] = False,
+) -> int:
+    """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""
+    overrides = () if autopilot is None else (f'sim.autopilot.autopilot="{autopilot}"',)
+    config = common.with_overrides(overrides).load().config
+    if faults is not None:
+        config = with_faults(config, faults, problems)
+
+    def forget(truth: Truth) -> None:
+        del truth
+
+    seats = fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
+    opened: list[Ready] = []
+
+    def ready(ports: Ready) -> None:
+        opened.append(ports)
+        if len(opened) == len(seats):
+            _announce(seats, opened, as_json=common.json)
+
+    watch = watching(messages()) if view else nullcontext()
+    with stop_on_signals() as stopped, watch as on_look:
+        serve_all(
+            seats,
+            duration_s=duration,
+            airborne=airborne,
+            on_ready=ready,
+            stop=stopped,
+            speed=speed,
+            on_look=on_look,
+            door=make_door(config.security),
+        )
+    return 0
+
+
+def _announce(seats: Sequence[Seat], opened: Sequence[Ready], *, as_json: bool) -> None:
+    listed = [
+        {"system_id": seat.config.sim.system_id, "vehicle": ports.vehicle, "mocap": ports.mocap}
+        for seat, ports in zip(seats, opened, strict=True)
+    ]
+    lines = [" ".join(f"{key} {value}" for key, value in one.items()) for one in listed]
+    text = msgspec.json.encode({"vehicles": listed}).decode() if as_json else "\n".join(lines)
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()

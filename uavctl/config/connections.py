@@ -1,0 +1,350 @@
+"""[mocap] [vehicle] [security] [hand_over] [check] [relay]: whom the loop talks to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from ipaddress import ip_network
+from pathlib import PurePath
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from uavctl.config.document import LONGEST_PATH, LONGEST_URL, ConfigProblem, Position, Section
+
+# How the vehicle is asked for modes, arming and take-off, and how long its answers are waited for.
+
+
+class HandOverConfig(Section, frozen=True, kw_only=True):
+    """Requests to the vehicle; nothing here arms: that takes `--arm --takeoff`."""
+
+    answer_s: Annotated[
+        float, Meta(ge=0.2, le=10, description="a request that shows no effect is repeated after this time [s]")
+    ] = 1.0
+    retry_s: Annotated[
+        float, Meta(ge=0.2, le=10, description="a request that was refused for now is repeated after this time [s]")
+    ] = 2.0
+    tries: Annotated[int, Meta(ge=1, le=100, description="times that one request is made at most")] = 30
+    ground_s: Annotated[
+        float,
+        Meta(
+            le=600,
+            ge=0.1,
+            description="time that the vehicle and the positions are given to get ready, and then the mode, and then "
+            "arming [s]",
+        ),
+    ] = 60.0
+    fresh_s: Annotated[
+        float, Meta(le=5, ge=0.001, description="nothing is armed while the newest position is older than this [s]")
+    ] = 1.0
+    climb_s: Annotated[
+        float, Meta(le=120, ge=0.1, description="time for the vehicle's own climb; then it is asked to land [s]")
+    ] = 20.0
+    reached: Annotated[
+        float, Meta(le=1, ge=0.01, description="share of the take-off height at which the climb counts as done")
+    ] = 0.9
+    engage_s: Annotated[
+        float,
+        Meta(
+            le=60, ge=0.1, description="time for the external mode in the air; after a take-off, then it must land [s]"
+        ),
+    ] = 5.0
+    land_s: Annotated[
+        float, Meta(le=600, ge=0.1, description="time from the landing mode to disarmed, after a take-off of ours [s]")
+    ] = 60.0
+    disarm_s: Annotated[
+        float, Meta(le=60, ge=0.1, description="a vehicle that has landed and stays armed so long is disarmed [s]")
+    ] = 5.0
+    origin_deg_m: Annotated[
+        Position,
+        Meta(
+            description="latitude, longitude [deg] and altitude [m] told to an ArduPilot that flies by external "
+            "positions and knows no place on the globe, before arming; any will do indoors"
+        ),
+    ] = (47.397742, 8.545594, 488.0)
+
+
+# Whom the control loop talks to: frame and clock of the positions' source, and the connections.
+
+
+CAMERAS = ("natnet:",)  # URLs of camera systems that are listened to without a bridge
+CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
+
+
+class FrameConfig(Section, frozen=True, kw_only=True):
+    """Camera frame to local NED."""
+
+    convention: Annotated[Literal["ned", "enu"], Meta(description="axes of the source's positions")] = "ned"
+    origin_m: Annotated[Position, Meta(description="position of the camera frame's origin in local NED [m]")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    yaw_deg: Annotated[
+        float,
+        Meta(
+            ge=-180, le=180, description="heading of the camera frame's first axis (after conversion to NED axes) [deg]"
+        ),
+    ] = 0.0
+
+
+class SourceConfig(Section, frozen=True, kw_only=True):
+    """Which messages count as external positions."""
+
+    messages: Annotated[
+        tuple[
+            Literal[
+                "VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LOCAL_POSITION_NED"
+            ],
+            ...,
+        ],
+        Meta(
+            min_length=1,
+            max_length=10,
+            description="messages that are taken; LOCAL_POSITION_NED is the vehicle's own estimate only if named",
+        ),
+    ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
+    system_id: Annotated[
+        int, Meta(ge=0, le=255, description="MAVLink system id that positions must come from; 0 takes any")
+    ] = 0
+    rate_hz: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1000,
+            description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]",
+        ),
+    ] = 0.0
+
+
+class ClockConfig(Section, frozen=True, kw_only=True):
+    """The source's clock."""
+
+    latency_s: Annotated[
+        float,
+        Meta(ge=0, le=60, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]"),
+    ] = 0.0
+    window_s: Annotated[
+        float, Meta(ge=0.001, le=600, description="window of the sliding minimum of (received − stamp) [s]")
+    ] = 10.0
+    future_tolerance_s: Annotated[
+        float, Meta(ge=0, le=60, description="a stamp further in the future is refused [s]")
+    ] = 0.02
+
+
+class DaemonConfig(Section, frozen=True, kw_only=True):
+    """The control loop and its connections."""
+
+    tick_s: Annotated[float, Meta(le=0.1, ge=0.001, description="time between setpoints; divides Δt [s]")]
+    vehicle: Annotated[str, Meta(max_length=LONGEST_URL, description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
+    mocap: Annotated[
+        str,
+        Meta(
+            max_length=LONGEST_URL,
+            description="URL of the source of positions; the same URL as the vehicle's is one connection. "
+            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)",
+        ),
+    ] = "udpin://0.0.0.0:14560"
+    vehicle_system_id: Annotated[
+        int, Meta(ge=0, le=255, description="MAVLink system id of the vehicle; 0 takes the first one that is heard")
+    ] = 0
+    system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
+    component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
+        25
+    )
+
+
+# Who is believed: signing, and the addresses that are listened to.
+
+
+MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
+
+
+class SecurityConfig(Section, frozen=True, kw_only=True):
+    """Signing of MAVLink 2, allow-list and budgets of the UDP connections."""
+
+    key_file: Annotated[
+        str,
+        Meta(
+            max_length=LONGEST_PATH,
+            description="file of the signing key, from `/` or `~` on, readable by its owner only (`uavctl key new` "
+            "makes one); empty neither signs nor verifies",
+        ),
+    ] = ""
+    require: Annotated[
+        tuple[Literal["vehicle", "mocap"], ...],
+        Meta(
+            min_length=1,
+            max_length=2,
+            description="connections on which, with a key, only signed frames are taken and ours are signed; one for "
+            'both roles is the "vehicle"',
+        ),
+    ] = ("vehicle", "mocap")
+    link_id: Annotated[
+        int, Meta(ge=0, le=254, description="our link id on the vehicle's connection; the cameras' is one more")
+    ] = 0
+    peer_link_ids: Annotated[
+        tuple[Annotated[int, Meta(ge=0, le=255)], ...],
+        Meta(max_length=256, description="link ids that peers may sign with; none takes the first that each one uses"),
+    ] = ()
+    allow: Annotated[
+        tuple[str, ...],
+        Meta(
+            max_length=1000,
+            description="addresses and networks that UDP datagrams are taken from, as in "
+            '`["192.168.7.20", "10.0.0.0/24"]`; none takes anybody\'s',
+        ),
+    ] = ()
+    max_datagrams_per_s: Annotated[
+        int,
+        Meta(
+            ge=100,
+            le=1_000_000,
+            description="datagrams a second that are taken of one sender (address and port), and of all strangers "
+            "together; of the vehicle four times as many. UDP only [1/s]",
+        ),
+    ] = 2000
+    max_frames_per_s: Annotated[
+        int,
+        Meta(
+            ge=100,
+            le=1_000_000,
+            description="the same for the frames in them, counted before any checksum or hash is taken [1/s]",
+        ),
+    ] = 800
+    max_bytes_per_s: Annotated[int, Meta(ge=10_000, le=1_000_000_000, description="the same for their bytes [1/s]")] = (
+        200_000
+    )
+
+
+def check(security: SecurityConfig) -> Iterator[ConfigProblem]:
+    """All problems of `[security]`."""
+    path = security.key_file
+    if path and not (PurePath(path).is_absolute() or path.startswith("~")):
+        yield ConfigProblem(
+            "security.key_file", f'"{path}" depends on where the command is run', "begin it with / or ~"
+        )
+    for i, text in enumerate(security.allow):
+        try:
+            ip_network(text, strict=False)
+        except ValueError:
+            yield ConfigProblem(
+                f"security.allow[{i}]",
+                f'"{text}" is no address or network (names are not looked up)',
+                "give numbers, as in 192.168.7.20 or 192.168.7.0/24",
+            )
+
+
+def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
+    """What is open to strangers in a configuration that is not wrong; for people, before a flight."""
+    urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
+    if daemon.vehicle == daemon.mocap:
+        del urls["mocap"]
+    found = []
+    for name, url in urls.items():
+        signed = bool(security.key_file) and name in security.require
+        if url.startswith("udpin:") and not security.allow:
+            found.append(f"{name}: {url} listens to any address; list the peers in security.allow")
+        if url.startswith("udp") and not signed:
+            found.append(f"{name}: {url} is not signed, so a sender's address can be forged; see security.key_file")
+        if url.startswith(CAMERAS):
+            found.append(f"{name}: {url} has no signatures, so a sender's address can be forged; see docs/sources.md")
+    return tuple(found)
+
+
+# Checks of a camera system that is listened to without a bridge to MAVLink.
+
+
+def roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
+    """A camera system flies nothing."""
+    if daemon.vehicle.startswith(CAMERAS):
+        yield ConfigProblem("daemon.vehicle", f'"{daemon.vehicle}" is a camera system', "give it as daemon.mocap")
+
+
+def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
+    """Its positions have to be among those that count."""
+    if not daemon.mocap.startswith(CAMERAS):
+        return
+    if CAMERA_MESSAGE not in source.messages:
+        yield ConfigProblem(
+            "source.messages", f"leaves out {CAMERA_MESSAGE}, which {daemon.mocap} comes as", f'add "{CAMERA_MESSAGE}"'
+        )
+    if source.system_id not in (0, CAMERA_SYSTEM_ID):
+        yield ConfigProblem(
+            "source.system_id",
+            f"{source.system_id} is another system than the cameras of daemon.mocap, {CAMERA_SYSTEM_ID}",
+            f"give {CAMERA_SYSTEM_ID}, or 0",
+        )
+
+
+def signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
+    """It cannot sign."""
+    if daemon.mocap.startswith(CAMERAS) and security.key_file and "mocap" in security.require:
+        yield ConfigProblem(
+            "security.require",
+            f'"mocap" cannot be: {daemon.mocap} has no signatures',
+            'write require = ["vehicle"], and keep the cameras\' network to itself',
+        )
+
+
+# The sections `[check]` and `[relay]`: what is looked at before a flight, and positions passed on to the vehicle.
+
+
+class CheckConfig(Section, frozen=True, kw_only=True):
+    """`uavctl check`, and what it has to say before `uavctl fly --arm` arms (docs/check.md)."""
+
+    seconds: Annotated[
+        float, Meta(le=600, ge=0.001, description="how long positions and vehicle are listened to [s]")
+    ] = 8.0
+    wait_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=600,
+            description="how much longer, if the vehicle has no position of its own yet: its estimator may be starting "
+            "[s]",
+        ),
+    ] = 15.0
+    same_origin: Annotated[
+        bool,
+        Meta(
+            description="the vehicle's own position counts from the same origin as the cameras' after [frame]; `false` "
+            "if it counts from where it was switched on: then only its movements are compared"
+        ),
+    ] = True
+    offset_m: Annotated[
+        float,
+        Meta(ge=0.001, le=1e6, description="largest distance between the vehicle's own position and the cameras' [m]"),
+    ] = 0.5
+    move_m: Annotated[
+        float, Meta(ge=0.001, le=1000, description="shortest movement of the body that shows axes [m]")
+    ] = 0.3
+    yaw_deg: Annotated[
+        float, Meta(le=45, ge=0.01, description="largest turn between the cameras' north and the vehicle's [deg]")
+    ] = 10.0
+    margin_m: Annotated[
+        float,
+        Meta(ge=0, le=1000, description="how far outside the limits of `sets` a vehicle may stand before a flight [m]"),
+    ] = 0.25
+    battery_v: Annotated[
+        float, Meta(ge=0, le=1000, description="least voltage of the battery; 0 does not judge it [V]")
+    ] = 0.0
+    accept: Annotated[
+        tuple[str, ...],
+        Meta(
+            max_length=100,
+            description="names of items that may fail: they are told, and arming is not refused for them",
+        ),
+    ] = ()
+
+
+class RelayConfig(Section, frozen=True, kw_only=True):
+    """External positions, passed on to the vehicle's own estimator on the vehicle's link (docs/check.md)."""
+
+    enabled: Annotated[bool, Meta(description="pass positions on")] = False
+    message: Annotated[
+        Literal["vision-position-estimate", "odometry"],
+        Meta(description="as which MAVLink message, in local NED; PX4 and ArduPilot take both"),
+    ] = "vision-position-estimate"
+    rate_hz: Annotated[
+        float, Meta(ge=0.1, le=1000, description="at most so many a second; the newest are sent [1/s]")
+    ] = 50.0

@@ -1,0 +1,321 @@
+"""The operator's orders while flying: a Unix socket that the daemon looks at after each tick and never waits for.
+
+An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder
+0700,
+socket 0600) and again by the kernel's word on who is at the other end.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import socket
+import stat
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import msgspec
+
+from uavctl.clock import Due
+from uavctl.config import Config
+from uavctl.config.checks import outside
+from uavctl.daemon.health import Health
+from uavctl.daemon.lock import runtime_folders
+from uavctl.errors import UsageError, VehicleTakenError
+from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Vec3
+
+# What is said on a daemon's control socket, and where its socket is.
+#
+# One JSON object a line in each direction: a `Request`, then its `Reply`.
+
+
+FOLDER_VARIABLE = "UAVCTL_CONTROL"
+SUFFIX = ".sock"
+MAX_LINE = 4096  # bytes of a request
+_LONGEST_NAME = 48
+_LONGEST_PATH = 107  # bytes that the kernel takes for the path of a socket
+
+
+class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A question or an order."""
+
+    ask: Literal["goto", "hold", "resume", "land", "engage", "status"]
+    position_m: Vec3 | None = None  # local NED; with goto only
+
+    def problem(self) -> str | None:
+        """What is wrong with it as such; None if nothing is."""
+        if (self.ask == "goto") != (self.position_m is not None):
+            return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
+        if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
+            return "position_m has to be finite"
+        return None
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
+    """What was decided on an order, or the flight as it is."""
+
+    ok: bool
+    text: str
+    status: Health | None = None
+
+
+def daemon_name(config: Config) -> str:
+    """Name of the daemon that flies a configuration: that of the configuration, and the vehicle's URL."""
+    url = config.daemon.vehicle.replace("://", "-")
+    return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_LONGEST_NAME]
+
+
+def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
+    """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's own runtime folder.
+
+    Raises:
+        UsageError: the user has none.
+    """
+    if chosen is not None:
+        return chosen
+    if environ.get(FOLDER_VARIABLE):
+        return Path(environ[FOLDER_VARIABLE])
+    return runtime_folders(environ)[0]
+
+
+def socket_path(folder: Path, name: str) -> Path:
+    """Where the daemon of this name listens.
+
+    Raises:
+        UsageError: the path is too long for a socket.
+    """
+    path = folder / f"{name}{SUFFIX}"
+    if len(os.fsencode(path)) > _LONGEST_PATH:
+        raise UsageError(
+            f"{path}: longer than the {_LONGEST_PATH} bytes of a socket's path; choose a shorter folder with --control"
+        )
+    return path
+
+
+MAX_CLIENTS = 8
+IDLE_NS = 10_000_000_000
+_CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
+_REQUEST = msgspec.json.Decoder(ControlRequest)
+
+
+class Orderly(Protocol):
+    """What takes orders: the control loop."""
+
+    answers: tuple[tuple[Command, Event], ...]  # the orders that the last tick took, each with its answer
+
+    def order(self, command: Command) -> bool:
+        """Queue an order for the next tick; False if too many wait."""
+        ...
+
+    def against(self, order: Order) -> str:
+        """Why an order would come to nothing now; empty if it may be given."""
+        ...
+
+
+@dataclass(eq=False)
+class _Client:
+    socket: socket.socket
+    heard_ns: int
+    buffer: bytes = b""
+
+
+class ControlServer:
+    """Serves one listening socket; its `after_tick` is for the daemon.
+
+    Args:
+        config: for the limits that a place has to keep.
+    """
+
+    def __init__(self, listener: socket.socket, config: Config, flight: Orderly, look: Callable[[], Health]) -> None:
+        self._listener, self._config, self._flight, self._look = listener, config, flight, look
+        self._clients: list[_Client] = []
+        self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
+
+    def after_tick(self, due: Due, lateness_ns: int) -> None:
+        """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
+        del lateness_ns
+        self._answer()
+        self._accept(due.at_ns)
+        waiting = [client for client, _ in self._waiting]
+        for client in [one for one in self._clients if one not in waiting]:
+            self._serve(client, due.at_ns)
+
+    def close(self) -> None:
+        """End the service; who still waits is told so."""
+        for client, _ in self._waiting:
+            self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
+        for client in self._clients:
+            client.socket.close()
+        self._clients.clear()
+        self._waiting.clear()
+
+    def _answer(self) -> None:
+        answers = list(self._flight.answers)
+        waiting, self._waiting = self._waiting, []
+        for client, command in waiting:
+            found = next((one for one in answers if one[0] == command), None)
+            if found is None:
+                self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
+            else:
+                answers.remove(found)
+                self._reply(client, Reply(ok=found[1].code == ORDER_ACCEPTED, text=found[1].text))
+
+    def _accept(self, now_ns: int) -> None:
+        while len(self._clients) < MAX_CLIENTS:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return  # nobody, or gone again
+            connection.setblocking(False)
+            _, uid, _ = _CREDENTIALS.unpack(
+                connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            )
+            if uid in (os.geteuid(), 0):
+                self._clients.append(_Client(connection, now_ns))
+            else:
+                connection.close()
+
+    def _serve(self, client: _Client, now_ns: int) -> None:
+        """Read what a client has said and act on its first whole line."""
+        try:
+            data = client.socket.recv(MAX_LINE)
+        except BlockingIOError:
+            data = None
+        except OSError:
+            data = b""
+        if data:
+            client.heard_ns = now_ns
+            client.buffer += data
+        line, whole, rest = client.buffer.partition(b"\n")
+        if whole and len(line) <= MAX_LINE:
+            client.buffer = rest
+            self._act(client, line)
+        elif len(client.buffer) > MAX_LINE:
+            self._reply(client, Reply(ok=False, text=f"a request has {MAX_LINE} bytes at most"))
+            self._drop(client)
+        elif data == b"" or now_ns - client.heard_ns > IDLE_NS:
+            self._drop(client)
+
+    def _act(self, client: _Client, line: bytes) -> None:
+        try:
+            request = _REQUEST.decode(line)
+        except msgspec.MsgspecError as error:  # of msgspec's own, a subclass of ValueError
+            self._reply(client, Reply(ok=False, text=f"not understood: {error}"))
+            return
+        if request.ask == "status":
+            self._reply(client, Reply(ok=True, text="", status=self._look()))
+            return
+        problem = request.problem() or self._misplaced(request) or self._flight.against(Order(request.ask)) or None
+        if problem is not None:
+            self._reply(client, Reply(ok=False, text=problem))
+            return
+        command = Command(order=Order(request.ask), position_m=request.position_m)
+        if self._flight.order(command):
+            self._waiting.append((client, command))
+        else:
+            self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
+
+    def _misplaced(self, request: ControlRequest) -> str | None:
+        """In which coordinates a place is outside the limits; None if it is inside, or there is none."""
+        if request.position_m is None:
+            return None
+        config = self._config
+        found = outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        return "; ".join(problem.reason for problem in found) or None
+
+    def _reply(self, client: _Client, reply: Reply) -> None:
+        data = msgspec.json.encode(reply) + b"\n"
+        try:
+            sent = client.socket.send(data)
+        except OSError:
+            sent = 0
+        if sent < len(data):  # reads too slowly, or is gone
+            self._drop(client)
+
+    def _drop(self, client: _Client) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+            client.socket.close()
+
+
+@contextmanager
+def listening(folder: Path, name: str) -> Iterator[socket.socket]:
+    """The listening socket of a daemon, gone at the end.
+
+    Args:
+        folder: where it is; made if there is none.
+
+    Raises:
+        UsageError: the folder is not ours alone, or the path too long.
+        VehicleTakenError: a daemon of this name is running.
+    """
+    _own(folder)
+    path = socket_path(folder, name)
+    listener = _listen(path, name)
+    try:
+        yield listener
+    finally:
+        listener.close()
+        path.unlink(missing_ok=True)
+
+
+def _own(folder: Path) -> None:
+    """See to a folder that only this user can enter."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; choose another folder with --control") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
+    if found.st_mode & 0o077:
+        raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
+
+
+def _listen(path: Path, name: str) -> socket.socket:
+    """Bind and listen; a socket that a dead daemon left is taken over."""
+    if path.is_socket():
+        try:
+            alive = _alive(path)
+        except OSError as error:
+            raise UsageError(
+                f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
+                f"run: sudo rm {path}"
+            ) from error
+        if alive:
+            raise VehicleTakenError(
+                f"{path}: a daemon named {name} is running; end it, or give this one another --set 'name=\"...\"'"
+            )
+        path.unlink(missing_ok=True)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(os.fspath(path))
+        path.chmod(0o600)
+        listener.listen(MAX_CLIENTS)
+    except OSError as error:
+        listener.close()
+        raise UsageError(f"{path}: {error.strerror}; choose another folder with --control") from error
+    listener.setblocking(False)
+    return listener
+
+
+def _alive(path: Path) -> bool:
+    """Whether somebody listens there.
+
+    Raises:
+        OSError: it is not ours.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(os.fspath(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except BlockingIOError:
+            return True  # its queue is full
+    return True

@@ -1,0 +1,179 @@
+"""The flight daemon: wait, receive, step, send, record; nothing else.
+
+The loop stops sending when it dies: there is no other thread that could re-send a setpoint.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from uavctl.clock import Due, Ticker, monotonic_ns
+from uavctl.errors import ConnectionClosedError
+from uavctl.io.base import Connection
+from uavctl.io.transport import wait
+from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
+from uavctl.mavlink.connection import OVERRUN
+from uavctl.outcome import Cause
+
+PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
+STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
+FRESH_NS = 150_000_000  # a look is so old at most when a setpoint goes out
+MAX_LOOKS = 10  # at a backlog, before a tick
+WITHHELD = "withheld"
+
+
+def fly(
+    loop: ControlLoop,
+    connections: Mapping[str, Connection],
+    ticker: Ticker,
+    stop_requested: Callable[[], bool],
+    *,
+    duration_s: float | None = None,
+    stop_limit_s: float,
+    after_tick: Sequence[Callable[[Due, int], None]] = (),
+    wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
+    now: Callable[[], int] = monotonic_ns,
+) -> bool:
+    """Run the control loop in real time until it has handed the vehicle over.
+
+    Args:
+        loop: the loop, which records whatever it sees and does.
+        stop_requested: asked once a tick; the first True begins the hand-over.
+        duration_s: the hand-over begins by itself after this time [s]; None flies on.
+        stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
+            that are relayed to it; 0 ends without one.
+        after_tick: called with each tick and its lateness [ns] once its setpoint is out; none may wait or raise.
+        wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
+        now: the clock [ns].
+
+    Returns:
+        Whether the end was asked for, by `stop_requested` or `duration_s`.
+
+    Raises:
+        ConnectionClosedError: the vehicle's connection was closed by the other side.
+    """
+    first_ns: int | None = None
+    stop_ns: int | None = None
+    refusals = _Refusals(loop, connections)
+    reader = _Reader(loop, connections, now)
+    try:
+        while not loop.finished:
+            due = ticker.next()
+            while True:
+                heard = reader.read(wait_for(connections, due.at_ns))
+                if now() >= due.at_ns:
+                    break
+                if not heard:  # a flood: take what comes by the handful, not each by itself
+                    wait_for({}, min(due.at_ns, now() + PAUSE_NS))
+            if connections[VEHICLE].closed:
+                loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
+                raise ConnectionClosedError(
+                    f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
+                    "the vehicle's own failsafe has it. See to the link and start again"
+                )
+            reader.read_everything()
+            due = ticker.overslept(due)
+            started_ns = now()
+            first_ns = due.at_ns if first_ns is None else first_ns
+            over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
+            if stop_ns is None and (over or stop_requested()):
+                stop_ns = due.at_ns
+                loop.course.stop(Cause.TIME if over else Cause.OPERATOR)
+            late = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
+            if late and not (stop_limit_s and loop.carries):
+                break
+            withheld = 0
+            for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):
+                if message.link == VEHICLE and not reader.fresh:
+                    withheld += 1  # who has the vehicle may have changed since the look
+                    continue
+                connections[message.link].send(message.data)
+            if withheld:
+                loop.refused(VEHICLE, {WITHHELD: withheld}, now())
+            loop.timing(due.tick, due.at_ns, started_ns - due.at_ns, now() - due.at_ns)
+            refusals.tell(due.at_ns)
+            for follow in after_tick:
+                follow(due, started_ns - due.at_ns)
+    finally:
+        refusals.tell(now(), last=True)
+    return stop_ns is not None
+
+
+class _Reader:
+    """Hands on what arrives, and knows how old the last look is at what the vehicle says."""
+
+    def __init__(self, loop: ControlLoop, connections: Mapping[str, Connection], now: Callable[[], int]) -> None:
+        self._loop, self._connections, self._now = loop, connections, now
+        self._looked_ns = now()  # when the last read ended
+        self._whole_ns: int | None = None  # when the last read began after which nothing was left
+        self._lost = dict.fromkeys(connections, 0)
+
+    @property
+    def fresh(self) -> bool:
+        """Whether everything has been read that the vehicle had said a moment ago."""
+        return self._whole_ns is not None and self._now() - self._whole_ns <= FRESH_NS
+
+    def read(self, names: Iterable[str], *, everything: bool = False) -> bool:
+        """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
+        began_ns = self._now()
+        stalled = began_ns - self._looked_ns > STALL_NS
+        heard = False
+        for name in names:
+            connection = self._connections[name]
+            arrived = connection.receive(everything=everything or stalled)
+            heard = heard or (bool(arrived) and connection.known)
+            for index, (data, received_ns) in enumerate(arrived):
+                self._hand_on(name, index, data, received_ns)
+        self._look_at_losses(stalled)
+        self._looked_ns = self._now()
+        return heard
+
+    def read_everything(self) -> None:
+        """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
+        for _ in range(MAX_LOOKS):
+            began_ns = self._now()
+            self.read(self._connections, everything=True)
+            if not self._connections[VEHICLE].unread:
+                self._whole_ns = began_ns
+                if self.fresh:
+                    return
+
+    def _hand_on(self, name: str, index: int, data: bytes, received_ns: int) -> None:
+        connection = self._connections[name]
+        answers = self._loop.receive(name, data, received_ns)
+        if self._loop.heard_vehicle:  # cameras or a ground station may share the port
+            connection.answer(index)
+        elif self._loop.heard_source:
+            connection.trust(index)
+        for answer in answers:
+            self._connections[answer.link].send(answer.data)
+
+    def _look_at_losses(self, stalled: bool) -> None:
+        """Tell what the system dropped while nobody looked. A flood's losses are told by nobody, and change nothing."""
+        for name, connection in self._connections.items():
+            before, lost = self._lost[name], connection.lost()
+            self._lost[name] = lost
+            if stalled and lost > before:
+                self._loop.refused(name, {OVERRUN: lost - before}, self._now())
+
+
+class _Refusals:
+    """Tells the loop once a second what the connections dropped."""
+
+    def __init__(self, loop: ControlLoop, connections: Mapping[str, Connection]) -> None:
+        self._loop, self._connections = loop, connections
+        self._told: dict[str, Counter[str]] = {name: Counter() for name in connections}
+        self._next_ns = 0
+
+    def tell(self, at_ns: int, *, last: bool = False) -> None:
+        """Do so if the time has come, or the last one, and there is something to tell."""
+        if at_ns < self._next_ns and not last:
+            return
+        self._next_ns = at_ns + SECOND_NS
+        for name, connection in self._connections.items():
+            refused = Counter(connection.refused)
+            new = refused - self._told[name]
+            if new:
+                self._told[name] = refused
+                self._loop.refused(name, dict(new), at_ns)

@@ -1,1 +1,0 @@
-"""What a recording tells of the vehicle and of the link: plant, lag, disturbance, losses and delays."""

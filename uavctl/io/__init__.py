@@ -1,0 +1,1 @@
+"""Sockets, serial ports and cameras: where bytes come in and go out."""

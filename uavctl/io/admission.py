@@ -1,0 +1,288 @@
+"""Who may speak to a connection, and how much work each may make: counted before anything looks into a datagram."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+
+Address = tuple[str, int] | tuple[str, int, int, int]
+NOT_LISTED = "not-listed"
+TOO_MANY = "too-many"
+TOO_MUCH = "too-much"
+MAX_SENDERS = 64  # strangers with a budget of their own; who is heard longest ago gives its place to another
+MAX_TRUSTED = 16  # senders of what the flight needs, beside the vehicle
+MAX_KNOWN = 1024  # addresses whose verdict is kept
+SILENCE_NS = 5_000_000_000  # who has not been heard for so long gives its place to another
+MAGIC = (0xFD, 0xFE)  # the first byte of a frame of MAVLink 2, and 1
+SHORTEST_FRAME, MAX_TRIES = 8, 64  # bytes; tries after which a datagram is given up (`uavctl.mavlink.framing`)
+_HEARTBEAT = re.compile(rb"\xfd.{6}\0\0\0|\xfe.{4}\0", re.DOTALL)
+_HEARTBEATS = 8  # of a backlog of the vehicle's; what looks like one may be none
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a UDP connection lets in."""
+
+    allow: tuple[str, ...] = ()  # addresses and networks; none lets anybody in
+    max_per_s: float = 2000.0  # datagrams a second of one sender
+    max_frames_per_s: float = 800.0  # frames a second of one sender
+    max_bytes_per_s: float = 200_000.0  # bytes a second of one sender
+
+
+class AllowList:
+    """Addresses that are listened to.
+
+    Args:
+        allow: addresses and networks, of IP version 4 or 6; none lets anybody in.
+    """
+
+    def __init__(self, allow: Sequence[str]) -> None:
+        self._networks: list[IPv4Network | IPv6Network] = [ip_network(text, strict=False) for text in allow]
+        self._known: dict[str, bool] = {}
+
+    def lets_in(self, host: str) -> bool:
+        """Whether a numeric address is listed; a look into a table for one that has been seen."""
+        if not self._networks:
+            return True
+        verdict = self._known.get(host)
+        if verdict is None:
+            if len(self._known) >= MAX_KNOWN:  # forged senders must not fill the memory
+                self._known.clear()
+            verdict = self._known[host] = self._look_up(host)
+        return verdict
+
+    def _look_up(self, host: str) -> bool:
+        address = ip_address(host.partition("%")[0])  # a link-local address has its interface behind a "%"
+        if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+            address = address.ipv4_mapped
+        return any(address in network for network in self._networks)
+
+
+def frames_in(data: bytes) -> int:
+    """How many frames a datagram can make us look at, at most: no checksum and no hash is taken more often.
+
+    Each begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given up.
+    """
+    return max(1, min(data.count(MAGIC[0]) + data.count(MAGIC[1]), len(data) // SHORTEST_FRAME + MAX_TRIES + 1))
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """How much one may send: datagrams, frames and bytes."""
+
+    per_s: tuple[float, float, float]  # of each, a second
+    burst: tuple[float, float, float]  # of each, at once
+
+    @staticmethod
+    def of(rules: Rules, times: float, burst: tuple[float, float, float]) -> Allowance:
+        """So many times what the rules give one sender."""
+        return Allowance(_times(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
+
+
+# A link that was held up delivers what it kept. Of strangers little is taken, of what the flight needs a stall's worth.
+STRANGER_BURST = (64.0, 128.0, 32_768.0)
+# Of the one that will turn out to be the vehicle much is taken, until anybody is known whom the flight needs: a PX4
+# says up to 420 messages in a second, and which of them is its first heartbeat shows only a look into them.
+FIRST_BURST = (1024.0, 2048.0, 131_072.0)
+TRUSTED_BURST = (512.0, 1024.0, 131_072.0)
+VEHICLE_BURST = (16_384.0, 16_384.0, 2_097_152.0)
+VEHICLE_TIMES, ALL_TRUSTED_TIMES = 4.0, 2.0
+FAIR_TIMES = 1.0 / 16.0  # of what one may send; who sends less has sent little
+RESERVED = 0.5  # share of what all have together that is left to those who have sent little
+
+
+def _times(factor: float, those: tuple[float, float, float]) -> tuple[float, float, float]:
+    return factor * those[0], factor * those[1], factor * those[2]
+
+
+class _Budget:
+    """What may still be sent now."""
+
+    __slots__ = ("_allowance", "_at_ns", "bytes", "datagrams", "frames")
+
+    def __init__(self, allowance: Allowance, now_ns: int) -> None:
+        self._allowance, self._at_ns = allowance, now_ns
+        self.datagrams, self.frames, self.bytes = allowance.burst
+
+    def refill(self, now_ns: int) -> None:
+        """Earn what the time since the last call gives."""
+        seconds, self._at_ns = (now_ns - self._at_ns) * 1e-9, now_ns
+        per_s, burst = self._allowance.per_s, self._allowance.burst
+        self.datagrams = min(burst[0], self.datagrams + seconds * per_s[0])
+        self.frames = min(burst[1], self.frames + seconds * per_s[1])
+        self.bytes = min(burst[2], self.bytes + seconds * per_s[2])
+
+    @property
+    def spent(self) -> float:
+        """Share of the burst that is used, of whichever is scarcest: who has sent least lately has least."""
+        burst = self._allowance.burst
+        return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
+
+    def refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
+        """Why a datagram does not fit; None if it does.
+
+        Args:
+            keep: share of the burst that has to be left afterwards.
+        """
+        burst = self._allowance.burst
+        if self.datagrams - 1.0 < keep * burst[0]:
+            return TOO_MANY
+        poor = self.frames - frames < keep * burst[1] or self.bytes - size < keep * burst[2]
+        return TOO_MUCH if poor else None
+
+    def pay(self, frames: int, size: int) -> None:
+        """Take a datagram."""
+        self.datagrams -= 1.0
+        self.frames -= frames
+        self.bytes -= size
+
+
+class _Sender:
+    """One sender's budget, and what it may send before it has sent much."""
+
+    __slots__ = ("budget", "fair")
+
+    def __init__(self, allowance: Allowance, now_ns: int) -> None:
+        self.budget = _Budget(allowance, now_ns)
+        self.fair = _Budget(Allowance(_times(FAIR_TIMES, allowance.per_s), allowance.burst), now_ns)
+
+    def refill(self, now_ns: int) -> None:
+        """See `_Budget`."""
+        self.budget.refill(now_ns)
+        self.fair.refill(now_ns)
+
+    def take(self, frames: int, size: int, joint: _Budget | None) -> str | None:
+        """Take a datagram, or say why not."""
+        refusal = self.budget.refusal(frames, size)
+        if joint is not None and refusal is None:
+            little = self.fair.refusal(frames, size) is None
+            refusal = joint.refusal(frames, size, 0.0 if little else RESERVED)
+            if refusal is None:
+                joint.pay(frames, size)
+                if little:
+                    self.fair.pay(frames, size)
+        if refusal is None:
+            self.budget.pay(frames, size)
+        return refusal
+
+
+class Budgets:
+    """Keep each sender from taking the time that the others and the control loop need.
+
+    The flown vehicle has a budget of its own that nobody else can use up. Senders of what the flight needs have one
+    each and one together, and so have all others. Those who have sent least come first, and of what is there together
+    only they can use the last half: so who comes later is heard beside any flood. As long as nobody is known whom the
+    flight needs, a stranger may be the vehicle, and what a stall has kept of its words is taken.
+
+    Args:
+        rules: datagrams, frames and bytes a second of one sender (address and port).
+        refused: counter that refusals are added to, by reason.
+    """
+
+    def __init__(self, rules: Rules, refused: Counter[str]) -> None:
+        self._refused = refused
+        self._rules = rules
+        self._trusted = Allowance.of(rules, 1.0, TRUSTED_BURST)
+        self._of_vehicle = Allowance.of(rules, VEHICLE_TIMES, VEHICLE_BURST)
+        self._vehicle: tuple[Address, _Sender] | None = None
+        self._known: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
+        self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # who was heard last is last
+        self._all_trusted = _Budget(Allowance.of(rules, ALL_TRUSTED_TIMES, _times(2.0, TRUSTED_BURST)), 0)
+        self._meet_strangers(FIRST_BURST)
+
+    def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
+        """Give those who are not known budgets with this burst, and twice that together."""
+        self._strangers.clear()
+        self._stranger = Allowance.of(self._rules, 1.0, burst)
+        self._all_strangers = _Budget(Allowance.of(self._rules, 1.0, _times(2.0, burst)), 0)
+
+    def _know_somebody(self) -> None:
+        """Take little of strangers from now on."""
+        if self._vehicle is None and not self._known:
+            self._meet_strangers(STRANGER_BURST)
+
+    def answer(self, sender: Address, now_ns: int) -> None:
+        """Take a sender for the flown vehicle's."""
+        self._know_somebody()
+        if self._vehicle is None or self._vehicle[0] != sender:
+            self._vehicle = sender, _Sender(self._of_vehicle, now_ns)
+
+    def trust(self, sender: Address, now_ns: int) -> None:
+        """Take a sender for one that the flight needs; who was so longest ago gives its place."""
+        self._know_somebody()
+        known = self._known.pop(sender, None) or _Sender(self._trusted, now_ns)
+        if len(self._known) >= MAX_TRUSTED:
+            self._known.popitem(last=False)
+        self._known[sender] = known
+
+    def take(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
+        """Which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
+
+        Args:
+            senders: of the datagrams, in the order in which they came.
+        """
+        taken = [False] * len(data)
+        queues: dict[Address, list[int]] = {}
+        for index, sender in enumerate(senders):
+            queues.setdefault(sender, []).append(index)
+        trusted, strangers = [], []
+        for sender, indices in queues.items():
+            if self._vehicle is not None and sender == self._vehicle[0]:
+                self._vehicle[1].refill(now_ns)
+                self._share([(self._vehicle[1], self._state_last(indices, data))], None, data, taken)
+            elif sender in self._known:
+                trusted.append((self._known[sender], indices))
+            else:
+                strangers.append((self._of_stranger(sender, now_ns), indices))
+        for group, joint in ((trusted, self._all_trusted), (strangers, self._all_strangers)):
+            if group:
+                joint.refill(now_ns)
+                for one, _ in group:
+                    one.refill(now_ns)
+                group.sort(key=lambda one: one[0].fair.spent)
+                self._share(group, joint, data, taken)
+        return taken
+
+    def _of_stranger(self, sender: Address, now_ns: int) -> _Sender:
+        stranger = self._strangers.pop(sender, None)
+        if stranger is None:
+            if len(self._strangers) >= MAX_SENDERS:
+                self._strangers.popitem(last=False)
+            stranger = _Sender(self._stranger, now_ns)
+        self._strangers[sender] = stranger
+        return stranger
+
+    def _share(
+        self,
+        group: Iterable[tuple[_Sender, list[int]]],
+        joint: _Budget | None,
+        data: Sequence[bytes],
+        taken: list[bool],
+    ) -> None:
+        """Take the newest datagram of each sender in turn, as long as its budget and the joint one pay."""
+        waiting = [(one, reversed(indices)) for one, indices in group]
+        while waiting:
+            others = []
+            for one, newest in waiting:
+                index = next(newest, None)
+                if index is None:
+                    continue
+                others.append((one, newest))
+                refusal = one.take(frames_in(data[index]), len(data[index]), joint)
+                if refusal is None:
+                    taken[index] = True
+                else:
+                    self._refused[refusal] += 1
+            waiting = others
+
+    @staticmethod
+    def _state_last(indices: Sequence[int], data: Sequence[bytes]) -> list[int]:
+        """The newest datagrams that may hold the vehicle's heartbeat behind all others, so that they count first."""
+        found: list[int] = []
+        for index in reversed(indices):
+            if len(found) < _HEARTBEATS and _HEARTBEAT.search(data[index]):
+                found.append(index)
+        return [index for index in indices if index not in found] + found[::-1]

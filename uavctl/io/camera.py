@@ -1,0 +1,134 @@
+"""Camera interface, camera URLs, bytes of the pipe."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+from typing import Protocol, get_args
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from uavctl.errors import ConnectionSpecError, UavctlError
+from uavctl.frames import Quaternion, Up
+from uavctl.records import Vec3
+
+# What a camera system has to tell, whatever its protocol: the small interface that each one implements.
+
+
+class CameraError(UavctlError):
+    """The cameras answer, and cannot be used as they are set up; says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPose:
+    """A body as the cameras saw it."""
+
+    exposed_ns: int  # middle of the exposure in the cameras' clock [ns]
+    position_m: Vec3  # in the room's axes forward, right, down [m]
+    attitude: Quaternion  # body axes forward, right, down to the room's (w, x, y, z)
+
+
+@dataclass(frozen=True, slots=True)
+class Echo:
+    """The answer to a question for the time."""
+
+    token: int  # what the question held
+    clock_ns: int  # the cameras' clock when they answered [ns]
+
+
+class Camera(Protocol):
+    """One camera system and the body to follow, without input or output of its own: datagrams in, sights out."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has answered and knows the body."""
+        ...
+
+    @property
+    def awaits(self) -> str:
+        """What it lacks while it is not ready, for people."""
+        ...
+
+    @property
+    def group(self) -> tuple[str, int] | None:
+        """Multicast address and port that it sends to; None where it sends to who asks."""
+        ...
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """What came and gave no position, by reason."""
+        ...
+
+    def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
+        """Take a datagram of the server.
+
+        Raises:
+            CameraError: it cannot be used; only before it is `ready`.
+        """
+        ...
+
+    def due(self, at_ns: int) -> tuple[bytes, ...]:
+        """What is to be sent to the server now."""
+        ...
+
+    def ask_time(self, token: int) -> bytes:
+        """The question for the cameras' time."""
+        ...
+
+
+# natnet://SERVER[:PORT]/BODY[?up=y|z&interface=ADDRESS].
+
+
+SCHEME = "natnet"
+COMMAND_PORT = 1510  # Motive's own default
+FORM = "natnet://SERVER[:PORT]/BODY, and after it ?up=z where Motive streams Z up, interface=ADDRESS for our side"
+
+
+@dataclass(frozen=True)
+class NatNetUrl:
+    """A rigid body of a Motive server."""
+
+    host: str  # name or address of the computer that Motive runs on
+    port: int  # its command port
+    body: str  # name of the rigid body, as Motive has it
+    up: Up = "y"  # the axis that Motive streams as up
+    interface: str = "0.0.0.0"  # address of our network interface to the cameras
+
+
+def parse(url: str) -> NatNetUrl:
+    """Read a URL.
+
+    Raises:
+        ConnectionSpecError: it is not of this form.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+        options = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query)))
+    except ValueError as error:
+        raise ConnectionSpecError(f"connection {url!r}: {error}; write {FORM}") from error
+    body = unquote(parts.path.removeprefix("/"))
+    if parts.scheme != SCHEME or not host or not body or parts.fragment or port == 0:
+        raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; write {FORM}")
+    up, interface = options.pop("up", "y"), options.pop("interface", "0.0.0.0")
+    if options:
+        raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; write {FORM}")
+    for axis in get_args(Up):
+        if up == axis:
+            return NatNetUrl(host, COMMAND_PORT if port is None else port, body, axis, _address(url, interface))
+    raise ConnectionSpecError(f"connection {url!r}: up={up!r} is neither y nor z; see Motive's streaming settings")
+
+
+def _address(url: str, text: str) -> str:
+    try:
+        return str(IPv4Address(text))
+    except ValueError as error:
+        raise ConnectionSpecError(f"connection {url!r}: interface {error}; give this computer's address") from error
+
+
+# What daemon and camera process tell each other: the first byte of a message that is not MAVLink, and bounds.
+
+
+READY, REFUSED, UNREACHABLE, COUNTS = b"R", b"E", b"T", b"C"
+LARGEST = 65536
+ANSWER_S = 5.0  # within which the server has to answer and to name the body

@@ -1,0 +1,251 @@
+"""The process that listens to cameras for one daemon.
+
+Started as `python -m uavctl.io.camera_host FD SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of the
+pipe is gone, however the daemon died. The pipe is a pair of sockets that keep
+the bounds of messages; what a message is, its first byte says (MAVLink has its own).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+import select
+import socket
+import struct
+import sys
+import time
+from collections import Counter, deque
+from typing import cast
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.config.connections import CAMERA_SYSTEM_ID
+from uavctl.frames import Up
+from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, UNREACHABLE, BodyPose, Camera, CameraError, Echo
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.messages import TimeSync
+
+# A camera system's sights and clock as MAVLink.
+
+
+COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+_UNKNOWN = [math.nan, *([0.0] * 20)]
+
+
+class Words:
+    """Frames of one source, numbered modulo 256."""
+
+    def __init__(self) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
+
+    def say(self, told: BodyPose | Echo) -> bytes:
+        """ODOMETRY of a sight, in axes forward, right, down; TIMESYNC of an echo, whose token is our time."""
+        if isinstance(told, Echo):
+            return self._pack(mavlink.MAVLink_timesync_message(told.clock_ns, told.token))
+        return self._pack(
+            mavlink.MAVLink_odometry_message(
+                told.exposed_ns // 1000,
+                mavlink.MAV_FRAME_LOCAL_FRD,
+                mavlink.MAV_FRAME_BODY_FRD,
+                *told.position_m,
+                list(told.attitude),
+                *(math.nan,) * 6,  # rates are not measured
+                _UNKNOWN,
+                _UNKNOWN,
+                0,
+                mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
+            )
+        )
+
+    def _pack(self, message: mavlink.MAVLink_message) -> bytes:
+        data = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return data
+
+
+def questions(data: bytes) -> tuple[int, ...]:
+    """The times that the requests for TIMESYNC in some MAVLink hold [ns]."""
+    return tuple(
+        message.ts1_ns
+        for message in decode(data).messages
+        if isinstance(message, TimeSync) and message.tc1_ns == 0 and message.ts1_ns > 0
+    )
+
+
+WAITING = 64  # messages that wait for a daemon that does not read; the newest are kept
+OVERRUN = "source-queue"
+NOT_SERVER = "not-listed"
+_PIPE_BYTES = 8192  # asked of the kernel: what waits there cannot be replaced by newer
+_READS = 64
+_PAUSE_S = 0.1
+_COUNTS_S = 0.5
+_MEMORY = 2**30
+
+
+class Host:
+    """Passes on between a server of cameras and the daemon.
+
+    Args:
+        pipe: our end of the pair of sockets.
+        interface: address of our own network interface.
+    """
+
+    def __init__(self, camera: Camera, pipe: socket.socket, server: tuple[str, int], interface: str) -> None:
+        self._camera, self._pipe, self._server, self._interface = camera, pipe, server, interface
+        self._words = Words()
+        self._waiting: deque[bytes] = deque()
+        self._lost: Counter[str] = Counter()
+        self._told: Counter[str] = Counter()
+        self._told_s = 0.0
+        self._ready = False
+        self._group: tuple[str, int] | None = None
+        self._group_socket: socket.socket | None = None
+        self._command = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._command.bind((interface, 0))
+        for one in (self._command, pipe):
+            one.setblocking(False)
+
+    def run(self) -> None:
+        """Serve until the daemon has gone.
+
+        Raises:
+            CameraError: the server cannot be used as it is set up.
+            TimeoutError: it did not answer.
+        """
+        began_s = time.monotonic()
+        while self._turn():
+            if not self._ready and time.monotonic() - began_s > ANSWER_S:
+                raise TimeoutError(f"no {self._camera.awaits} within {ANSWER_S:g} s")
+            self._count()
+
+    def close(self) -> None:
+        """Release the sockets to the server."""
+        self._command.close()
+        if self._group_socket is not None:
+            self._group_socket.close()
+
+    def _turn(self) -> bool:
+        """Wait for something and pass it on; False once the daemon has gone."""
+        for data in self._camera.due(time.monotonic_ns()):
+            self._send(data)
+        self._follow_group()
+        sources = [one for one in (self._command, self._group_socket) if one is not None]
+        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._waiting else [], [], _PAUSE_S)
+        for one in sources:
+            if one in readable:
+                self._hear(one)
+        self._flush()
+        return self._pipe not in readable or self._ask()
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._command.sendto(data, self._server)
+        except OSError:  # no route for now: asked again
+            self._lost["unsent"] += 1
+
+    def _hear(self, source: socket.socket) -> None:
+        for _ in range(_READS):
+            try:
+                data, sender = source.recvfrom(LARGEST)
+            except BlockingIOError:
+                return
+            except OSError:  # the server's port is closed
+                continue
+            if sender[0] != self._server[0]:
+                self._lost[NOT_SERVER] += 1
+                continue
+            heard = self._camera.receive(data, time.monotonic_ns())
+            if self._camera.ready and not self._ready:  # before any position: the daemon waits for this word
+                self._ready = True
+                self._post(READY)
+            for told in heard:
+                self._post(self._words.say(told))
+
+    def _ask(self) -> bool:
+        """Pass on the daemon's questions for the time; False if it has gone."""
+        try:
+            data = self._pipe.recv(LARGEST)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        for token in questions(data):
+            self._send(self._camera.ask_time(token))
+        return bool(data)
+
+    def _post(self, message: bytes) -> None:
+        if len(self._waiting) >= WAITING:
+            self._waiting.popleft()
+            self._lost[OVERRUN] += 1
+        self._waiting.append(message)
+        self._flush()
+
+    def _flush(self) -> None:
+        while self._waiting:
+            try:
+                self._pipe.send(self._waiting[0])
+            except OSError:  # full: later. Gone: seen when it is read
+                return
+            self._waiting.popleft()
+
+    def _count(self) -> None:
+        counts = self._camera.dropped + self._lost
+        if counts != self._told and time.monotonic() - self._told_s >= _COUNTS_S:
+            self._told, self._told_s = counts, time.monotonic()
+            self._post(COUNTS + json.dumps(counts).encode())
+
+    def _follow_group(self) -> None:
+        """Join the group that the server streams to, if it streams to one."""
+        if self._camera.group == self._group:
+            return
+        self._group = self._camera.group
+        if self._group_socket is not None:
+            self._group_socket.close()
+            self._group_socket = None
+        if self._group is not None:
+            self._group_socket = _joined(self._group, self._interface)
+
+
+def _joined(group: tuple[str, int], interface: str) -> socket.socket:
+    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
+    member = struct.pack("4s4s", socket.inet_aton(group[0]), socket.inet_aton(interface))
+    try:
+        joined.bind(group)
+        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+    except OSError as error:
+        joined.close()
+        raise CameraError(
+            f"the server streams to group {group[0]}, which cannot be joined ({error.strerror}); "
+            "write interface=ADDRESS with this computer's address in the cameras' network, or stream unicast"
+        ) from error
+    joined.setblocking(False)
+    return joined
+
+
+def main(arguments: list[str]) -> int:
+    """Run for the daemon that started this process."""
+    descriptor, address, port, body, up, interface = arguments
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
+    from uavctl.io.natnet import NatNet  # the package is there only where OptiTrack is used
+
+    with socket.socket(fileno=int(descriptor)) as pipe:
+        pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
+        try:
+            host = Host(NatNet(body, cast(Up, up)), pipe, (address, int(port)), interface)
+            try:
+                host.run()
+            finally:
+                host.close()
+        except CameraError as error:
+            pipe.send(REFUSED + str(error).encode())
+        except OSError as error:
+            pipe.send(UNREACHABLE + str(error.strerror or error).encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

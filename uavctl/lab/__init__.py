@@ -1,0 +1,1 @@
+"""Experiments: campaigns, trials, the paper, identification, tuning, what-if and benchmarks."""

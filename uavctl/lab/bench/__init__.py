@@ -1,0 +1,1 @@
+"""Speed of decisions and of the control loop on this machine."""

@@ -1,0 +1,379 @@
+"""The control loop measured from outside: `uavctl fly` as a process, an empty loop beside it, a vehicle on real UDP.
+
+Both loops run at the same time, half a tick apart, so that what else the machine does meets both alike.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import select
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection as Pipe
+from pathlib import Path
+from statistics import median
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import common as mavlink
+
+from logs.recording.reader import read
+from logs.recording.topics import RecorderNote
+from uavctl.clock import Ticker, monotonic_ns
+from uavctl.config import Config
+from uavctl.daemon.realtime import realtime
+from uavctl.errors import UavctlError
+from uavctl.io.transport import open_connection, wait
+from uavctl.records import Decision, Timing
+
+# A vehicle with cameras for measuring a control loop: a point mass whose position comes just in time for each tick.
+
+
+LEAD_NS = 2_000_000  # a position is sent this long before the deadline of a tick
+_HEARTBEAT_TICKS = 10
+_OFFBOARD = 6 << 16
+_ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+_SO_TIMESTAMPNS = 35  # Linux: the kernel's own time of arrival, so that our waking up is not measured
+_TIMESPEC = struct.Struct("qq")
+
+
+@dataclass
+class LoopReplies:
+    """What came back."""
+
+    # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
+    in_to_out_ns: list[int] = field(default_factory=list)
+    positions: int = 0  # sent so far
+
+
+class Peer:
+    """Speaks to the daemon on one UDP connection; the grid of ticks is that of CLOCK_MONOTONIC."""
+
+    def __init__(self, port: int, tick_ns: int) -> None:
+        self.seen = LoopReplies()
+        self._tick_ns = tick_ns
+        self._socket = socket.socket(type=socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.connect(("127.0.0.1", port))
+        self._socket.setblocking(False)
+        self._out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._position, self._velocity = [0.5, 0.5, -1.0], [0.0, 0.0, 0.0]
+        self._accel = (0.0, 0.0, 0.0)
+        self._asked_ns: set[int] = set()  # deadlines of ticks that have a position and no setpoint yet
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._socket.close()
+
+    def tick(self) -> None:
+        """Send a position in time for the next tick, and take what comes until the next one is due."""
+        now_ns = time.monotonic_ns()
+        deadline_ns = (now_ns + LEAD_NS) // self._tick_ns * self._tick_ns + self._tick_ns
+        self._listen(deadline_ns - LEAD_NS)
+        if self.seen.positions % _HEARTBEAT_TICKS == 0:
+            self._beat(_ARMED)
+        sent_ns = time.monotonic_ns()
+        self._send(self._out.vision_position_estimate_encode(sent_ns // 1000, *self._position, 0.0, 0.0, 0.0))
+        self._asked_ns.add(sent_ns // self._tick_ns * self._tick_ns + self._tick_ns)
+        self.seen.positions += 1
+        self._move()
+
+    def finish(self) -> None:
+        """Take the answer to the last position, and be disarmed: there is nothing to hand over."""
+        self._listen(time.monotonic_ns() + self._tick_ns)
+        self._beat(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+
+    def _listen(self, until_ns: int) -> None:
+        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+            select.select([self._socket], [], [], left_ns * 1e-9)
+            self._drain()
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                data, ancillary, _, _ = self._socket.recvmsg(2048, 64)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+            stamp = next(value for level, kind, value in ancillary if kind == _SO_TIMESTAMPNS)
+            seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+            # The kernel stamps in wall time; both clocks are read now, a moment later.
+            arrived_ns = seconds * 1_000_000_000 + nanoseconds - time.time_ns() + time.monotonic_ns()
+            parser = mavlink.MAVLink(None)
+            for message in parser.parse_buffer(data) or []:
+                if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+                    self._accel = (message.afx, message.afy, message.afz)
+                    self._answer(arrived_ns)
+
+    def _answer(self, arrived_ns: int) -> None:
+        deadline_ns = arrived_ns // self._tick_ns * self._tick_ns
+        if deadline_ns in self._asked_ns:
+            self._asked_ns.remove(deadline_ns)
+            self.seen.in_to_out_ns.append(arrived_ns - deadline_ns)
+
+    def _move(self) -> None:
+        tick_s = self._tick_ns * 1e-9
+        for axis, accel in enumerate(self._accel):
+            self._velocity[axis] += accel * tick_s
+            self._position[axis] += self._velocity[axis] * tick_s
+
+    def _beat(self, base_mode: int) -> None:
+        kind, autopilot = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4
+        self._send(self._out.heartbeat_encode(kind, autopilot, base_mode, _OFFBOARD, mavlink.MAV_STATE_ACTIVE))
+
+    def _send(self, message: mavlink.MAVLink_message) -> None:
+        data = message.pack(self._out)
+        self._out.seq = (self._out.seq + 1) % 256
+        try:
+            self._socket.send(data)
+        except ConnectionRefusedError:
+            return  # the daemon is not there yet, or any more
+
+
+# What `uavctl bench --loop` measures; the fields are the keys of its JSON document.
+
+
+class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
+    """Quantiles of a time [µs]; over several runs the median of each."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+    @staticmethod
+    def of(times_ns: NDArray[np.int64]) -> TimeQuantiles:
+        """Of one run's times [ns] (n,)."""
+        p50, p99, p999, worst = (np.quantile(times_ns, [0.5, 0.99, 0.999, 1.0]) * 1e-3).tolist()
+        return TimeQuantiles(p50=p50, p99=p99, p999=p999, max=worst)
+
+    @staticmethod
+    def middle(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
+        """The median run, quantile by quantile."""
+        return TimeQuantiles(
+            p50=median(run.p50 for run in runs),
+            p99=median(run.p99 for run in runs),
+            p999=median(run.p999 for run in runs),
+            max=median(run.max for run in runs),
+        )
+
+
+class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
+    """One run, or the median of several."""
+
+    in_to_out_us: (
+        TimeQuantiles  # a position arrives in time for a tick: tick deadline -> its setpoint arrives at the vehicle
+    )
+    lateness_us: TimeQuantiles  # tick deadline -> start of the tick
+    empty_lateness_us: TimeQuantiles  # the same of an empty loop that ran at the same time
+    above_empty_us: float  # p99.9 of the lateness less that of the empty loop
+    step_us: TimeQuantiles  # in the control core
+    positions: float  # sent, one a tick
+    unanswered: float  # of which no setpoint came within the tick
+    missed_ticks: float
+    recorded: float  # records
+    dropped: float  # records that the recorder could not keep
+    memory_growth_kib: float  # resident memory, from a fifth of the run to its end
+    memory_mib: float  # at the end
+
+    @staticmethod
+    def middle(runs: Sequence[LoopRun]) -> LoopRun:
+        """The medians over runs."""
+        spreads = ("in_to_out_us", "lateness_us", "empty_lateness_us", "step_us")
+        fields: dict[str, TimeQuantiles | float] = {}
+        for name in LoopRun.__struct_fields__:
+            values = [getattr(run, name) for run in runs]
+            fields[name] = TimeQuantiles.middle(values) if name in spreads else float(median(values))
+        return msgspec.convert(fields, LoopRun)
+
+
+class LoopBench(msgspec.Struct, frozen=True, kw_only=True):
+    """The control loop of `uavctl fly` on real UDP, recording, beside an empty loop: without and with `--realtime`."""
+
+    seconds: float  # of a run
+    runs: int  # of each kind, in turns
+    tick_s: float
+    plain: LoopRun
+    realtime: LoopRun
+    permitted: bool  # whether all that --realtime does was permitted
+
+
+START_LIMIT_S = 600.0  # a design may have to be made first
+_END_LIMIT_S = 60.0
+_WARM_SHARE = 0.2
+_SAMPLE_NS = 1_000_000_000
+
+
+def run_loop_bench(
+    config: Config, options: Sequence[str], seconds: float, runs: int, told: Callable[[str, int, int], None]
+) -> LoopBench:
+    """Measure, with and without `--realtime` in turns.
+
+    Args:
+        options: the command line that gives this configuration: --config and --set.
+        told: what is done, how many runs are, of how many.
+
+    Raises:
+        UavctlError: a daemon did not fly.
+    """
+    found: dict[bool, list[LoopRun]] = {False: [], True: []}
+    permitted = True
+    for number in range(runs):
+        for real in (False, True):
+            told("with --realtime" if real else "without --realtime", 2 * number + real, 2 * runs)
+            run, held = _run(config, options, seconds, real)
+            found[real].append(run)
+            permitted = permitted and held
+    return LoopBench(
+        seconds=seconds,
+        runs=runs,
+        tick_s=config.daemon.tick_s,
+        plain=LoopRun.middle(found[False]),
+        realtime=LoopRun.middle(found[True]),
+        permitted=permitted,
+    )
+
+
+def _run(config: Config, options: Sequence[str], seconds: float, real: bool) -> tuple[LoopRun, bool]:
+    """One run, and whether real time was permitted where it was asked for."""
+    tick_ns = round(config.daemon.tick_s * 1e9)
+    with tempfile.TemporaryDirectory(prefix="uavctl-bench-") as name, socket.socket(type=socket.SOCK_DGRAM) as free:
+        folder = Path(name)
+        free.bind(("127.0.0.1", 0))
+        port = int(free.getsockname()[1])
+        free.close()
+        with _daemon(port, options, folder, real) as process, _empty_loop(tick_ns, seconds, real) as empty:
+            peer = Peer(port, tick_ns)
+            memory_kib = _fly(peer, process, round(seconds * 1e9) // tick_ns)
+            peer.finish()
+            peer.close()
+            process.terminate()
+            process.communicate(timeout=_END_LIMIT_S)
+            if not empty.poll(_END_LIMIT_S):
+                raise UavctlError("the empty loop beside the control loop gave no result; try again")
+            idle_ns, held = empty.recv()
+        return _measured(folder / "flight.mcap", peer, memory_kib, idle_ns), held
+
+
+def _measured(path: Path, peer: Peer, memory_kib: Sequence[int], idle_ns: list[int]) -> LoopRun:
+    timings: list[Timing] = []
+    missed = recorded = dropped = 0
+    for _, _, record in read(path):
+        recorded += 1
+        if isinstance(record, Timing):
+            timings.append(record)
+        elif isinstance(record, Decision):
+            missed += record.missed_ticks
+        elif isinstance(record, RecorderNote):
+            dropped = record.dropped + record.refused
+    late = TimeQuantiles.of(np.array([timing.lateness_ns for timing in timings]))
+    empty = TimeQuantiles.of(np.array(idle_ns))
+    return LoopRun(
+        in_to_out_us=TimeQuantiles.of(np.array(peer.seen.in_to_out_ns)),
+        lateness_us=late,
+        empty_lateness_us=empty,
+        above_empty_us=late.p999 - empty.p999,
+        step_us=TimeQuantiles.of(np.array([timing.step_ns for timing in timings])),
+        positions=peer.seen.positions,
+        unanswered=peer.seen.positions - len(peer.seen.in_to_out_ns),
+        missed_ticks=missed,
+        recorded=recorded,
+        dropped=dropped,
+        memory_growth_kib=memory_kib[-1] - memory_kib[int(_WARM_SHARE * (len(memory_kib) - 1))],
+        memory_mib=memory_kib[-1] / 1024,
+    )
+
+
+@contextmanager
+def _daemon(port: int, options: Sequence[str], folder: Path, real: bool) -> Iterator[subprocess.Popen[str]]:
+    """`uavctl fly`, ready."""
+    url = f"udpin://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "uavctl", "fly", *options, "--vehicle", url, "--mocap", url, "--json"]
+    places = ["--out", str(folder), "--control", str(folder / "control")]
+    log = folder / "messages"
+    with log.open("w", encoding="utf-8") as stream:
+        process = subprocess.Popen(
+            [*command, *places, *(["--realtime"] if real else [])], stdout=subprocess.PIPE, stderr=stream, text=True
+        )
+    try:
+        end_s = time.monotonic() + START_LIMIT_S
+        while "recording to" not in log.read_text(encoding="utf-8"):
+            if process.poll() is not None or time.monotonic() > end_s:
+                raise UavctlError(f"the daemon did not start:\n{log.read_text(encoding='utf-8').strip()}")
+            time.sleep(0.05)
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@contextmanager
+def _empty_loop(tick_ns: int, seconds: float, real: bool) -> Iterator[Pipe]:
+    """The empty loop in a process of its own; its result comes through the pipe."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    child = context.Process(target=empty_loop, args=(theirs, tick_ns, seconds, real), name="empty loop")
+    child.start()
+    theirs.close()
+    try:
+        yield ours
+    finally:
+        if child.is_alive():
+            child.kill()
+        child.join()
+        ours.close()
+
+
+def empty_loop(pipe: Pipe, tick_ns: int, seconds: float, real: bool) -> None:
+    """Wait for ticks as the daemon does, and for nothing else; sends how late they were [ns] and what was permitted."""
+    if real:
+        with realtime() as outcomes:
+            pipe.send((_lateness(tick_ns, seconds), all(outcome.ok for outcome in outcomes)))
+    else:
+        pipe.send((_lateness(tick_ns, seconds), True))
+
+
+def _lateness(tick_ns: int, seconds: float) -> list[int]:
+    offset_ns = tick_ns // 2
+    ticker = Ticker(tick_ns, tick_ns, lambda: monotonic_ns() - offset_ns)
+    connections = {"idle": open_connection("udpin://127.0.0.1:0")}
+    late_ns: list[int] = []
+    for _ in range(round(seconds * 1e9) // tick_ns):
+        due_ns = ticker.next().at_ns + offset_ns
+        while monotonic_ns() < due_ns:
+            wait(connections, due_ns)
+        late_ns.append(monotonic_ns() - due_ns)
+    return late_ns
+
+
+def _fly(peer: Peer, process: subprocess.Popen[str], positions: int) -> list[int]:
+    """Be the vehicle for as many ticks as the empty loop has; gives the daemon's resident memory by the second [KiB].
+
+    Ticks and not a time: one that the machine slept through has no position, and takes none from the others.
+    """
+    memory_kib: list[int] = []
+    next_ns = time.monotonic_ns()
+    while peer.seen.positions < positions:
+        now_ns = time.monotonic_ns()
+        peer.tick()
+        if now_ns >= next_ns:
+            next_ns += _SAMPLE_NS
+            if process.poll() is not None:
+                raise UavctlError(f"the daemon ended with code {process.returncode} while it was measured")
+            memory_kib.append(_resident_kib(process.pid))
+    return memory_kib
+
+
+def _resident_kib(pid: int) -> int:
+    for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1])
+    return 0

@@ -1,0 +1,456 @@
+"""One benchmark: states, run, picture."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import chain, cycle, islice, zip_longest
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import NDArray
+
+from logs.report.svg import canvas, colour, standalone
+from uavctl.errors import UavctlError
+from uavctl.lab.bench.timing import (
+    EXACT,
+    FROZEN,
+    MIXTURE,
+    BenchResult,
+    Case,
+    ConditionedTimes,
+    Memory,
+    Quantiles,
+    Shares,
+    Timed,
+    clock_us,
+    growth_with_axes,
+    growth_with_horizon,
+    median,
+    time_frozen_qp,
+    timed,
+)
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.exact import KEPT, ConicSolver, PartSolver
+from uavctl.smpc.hahn_stursberg.horizon import decompose
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, make_library, state_box
+from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+
+# The decision of scheme `age-conditioned` as a flight asks for it.
+
+
+Array = NDArray[np.float64]
+
+_COVARIANCES = 7  # in turns: a filter's is hardly ever the last one's
+
+
+class InFlight:
+    """A solver whose every question has a covariance other than the last one's, and a setpoint sent before it.
+
+    What was sent is the target's own input, so a state in transit has all of its way to slew.
+    """
+
+    def __init__(self, solver: ConditionedSolver) -> None:
+        self._solver, plant = solver, solver.problem.plant
+        noise = plant.e @ plant.w @ plant.e.T
+        shares = np.linspace(0.1, 0.5, _COVARIANCES)
+        self._outlooks = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
+        self._asked = 0
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:  # noqa: ARG002
+        """See `Solver`; the outlook is its own."""
+        self._asked = (self._asked + 1) % _COVARIANCES
+        return self._solver.solve(seq, x, target, self._outlooks[self._asked])
+
+
+# The states of a benchmark: half uniform over the feasible box, half along closed loops, in turns.
+
+
+LOOP_STEPS = 50
+# Where no state of a component is feasible, so many draws say so.
+_MOST_MISSES = 2000
+# States without limits are drawn within so many standard deviations around the target.
+_SPREAD = 3.0
+# A loop ends at once where the solver has no plan; more than so many loops a state are not begun.
+_MOST_LOOPS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """The states of one benchmark."""
+
+    points: tuple[Array, ...]  # states (n_x,): box, loop, box, loop …
+    feasible_share: float  # share of the box from which the paper's problem is feasible
+
+
+def draw_states(
+    design: Design, solver: Solver, count: int, loss: float, seed: int, told: Callable[[int], None]
+) -> States:
+    """Seeded states; the same arguments give the same ones.
+
+    Args:
+        loss: Probability that a step of a closed loop brings no news.
+        told: Told how many states there are, now and then.
+
+    Raises:
+        UavctlError: No state of the box is feasible.
+    """
+    rng = np.random.default_rng(seed)
+    inside, share = _box_states(design, count - count // 2, rng, told)
+    loops = closed_loops(design, solver, inside, count // 2, loss, rng, lambda done: told(len(inside) + done))
+    both = chain.from_iterable(zip_longest(inside, loops))
+    return States(tuple(x for x in both if x is not None), share)
+
+
+def _box_states(
+    design: Design, count: int, rng: np.random.Generator, told: Callable[[int], None]
+) -> tuple[list[Array], float]:
+    """Uniform over the feasible part of the box.
+
+    Components are independent, so each is drawn until it is feasible. Feasible: the exact program keeps all limits and
+    reaches the target (slack, offset and terminal miss below 1e-6).
+    """
+    found = np.zeros((count, design.plant.n_x))
+    share = 1.0
+    for component in decompose(design):
+        solver, (lower, upper) = (
+            PartSolver(design, component),
+            state_box(component, design.target[component.states], _SPREAD),
+        )
+        tried, done, misses = 0, 0, 0
+        while done < count:
+            x = design.target.copy()
+            x[component.states] = rng.uniform(lower, upper)
+            answer = solver.solve(x, design.target)
+            tried += 1
+            if answer.status is SolveStatus.OPTIMAL and answer.slack + answer.offset + answer.terminal_miss < KEPT:
+                found[done, component.states] = x[component.states]
+                done, misses = done + 1, 0
+                told(done)
+                continue
+            misses += 1
+            if misses == _MOST_MISSES:
+                raise UavctlError(
+                    "no state was found from which the target is reached with all limits kept; "
+                    "widen the limits in [sets]"
+                )
+        share *= done / tried
+    return list(found), share
+
+
+def closed_loops(
+    design: Design,
+    solver: Solver,
+    starts: list[Array],
+    count: int,
+    loss: float,
+    rng: np.random.Generator,
+    told: Callable[[int], None],
+) -> list[Array]:
+    """States that a closed loop asks from: each step brings news or does not; the plan is played out in between.
+
+    The starts themselves are left out. Fewer than `count` states come back only where loops find no plan.
+    """
+    plant = design.plant
+    values, vectors = np.linalg.eigh(plant.w)
+    effect = plant.e @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    asked: list[Array] = []
+    for x in islice(cycle(starts), _MOST_LOOPS * count):
+        inputs, age = np.zeros((0, plant.n_u)), 0
+        for step in range(LOOP_STEPS):
+            age += 1
+            if age >= len(inputs) or rng.random() >= loss:
+                answer = solver.solve(step, x, design.target)
+                if answer.status is not SolveStatus.OPTIMAL:
+                    break
+                inputs, age = answer.inputs, 0
+                if step:
+                    asked.append(x)
+                    told(len(asked))
+            if len(asked) == count:
+                return asked
+            x = plant.a @ x + plant.b @ inputs[age] + effect @ rng.standard_normal(plant.n_w)
+    return asked
+
+
+# One benchmark, from a design to its figures.
+
+
+# Told what is being done, how much of it is done, and of how much; None where nobody knows.
+Advance = Callable[[str, int, int | None], None]
+
+_MEGABYTE = 1e6
+
+
+@dataclass(frozen=True)
+class BenchSizes:
+    """How much is measured."""
+
+    states: int = 1000  # asked of the library; the others are asked the first of them
+    printed: int = 3  # asked of the joint problem as printed; it ends badly, and a few say so
+    cvxpy: int = 20  # asked of the printed problem axis by axis
+    exact: int = 50  # asked of the exact program
+    runs: int = 5  # of the library and of the exact program over their states; a state's time is the median
+    horizons: tuple[int, ...] = (8, 12, 16, 24, 32, 40)  # H of the growth with the horizon
+    policies: int = 6  # in each of its libraries
+    growth_states: int = 300  # states of each measurement of growth
+    axes: int = 6  # most axes of the growth with axes
+
+
+DEFAULT_SIZES = BenchSizes()
+
+
+def run_bench(
+    design: Design,
+    loss: float,
+    seed: int,
+    advance: Advance,
+    sizes: BenchSizes = DEFAULT_SIZES,
+    conditioned: ConditionedSolver | None = None,
+) -> BenchResult:
+    """Measure everything on the same states.
+
+    Args:
+        loss: Probability that a step of a closed loop brings no news.
+        conditioned: Solver of scheme `age-conditioned` for the same plant; None: it is left out.
+
+    Raises:
+        UavctlError: No state is feasible.
+        DesignError: The design has no library.
+    """
+    begin = time.perf_counter()
+    memory = [_peak_mb()]
+    library, library_s = _library(design, seed, advance)
+    start = time.perf_counter()
+    solver = LibrarySolver(design, library)
+    ready_s = time.perf_counter() - start
+    memory.append(_peak_mb())
+
+    def phase(what: str, total: int) -> Callable[[int], None]:
+        advance(what, 0, total)
+        return lambda done: advance(what, done, total)
+
+    states = draw_states(design, solver, sizes.states, loss, seed, phase("states", sizes.states))
+    points, target = states.points, design.target
+    count = len(points)
+    compared = [
+        Case(solver, points, target),
+        Case(ConicSolver(design), points[: sizes.exact], target),
+        Case(PrintedSolver(design), points[: sizes.cvxpy], target, once=True),
+    ]
+    if conditioned is not None:
+        compared.append(Case(InFlight(conditioned), points, target))
+    asked = sum(len(case.asked(run, sizes.runs)) for case in compared for run in range(sizes.runs))
+    by_library, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
+    few = points[: sizes.printed]
+    whole = Case(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), few, target)
+    (joint,) = timed([whole], 1, phase("printed, jointly", len(few)))
+    qp = time_frozen_qp(design, decompose(design)[0], library.variants[0][0], points[: sizes.growth_states], sizes.runs)
+    growth_axes = growth_with_axes(
+        design, library, points[: sizes.growth_states], sizes.axes, sizes.runs, _each(phase("more axes", sizes.axes))
+    )
+    told = _each(phase("longer horizons", len(sizes.horizons)))
+    growth_h = growth_with_horizon(design, sizes.horizons, sizes.policies, sizes.growth_states, sizes.runs, seed, told)
+    memory.append(_peak_mb())
+
+    components = len(decompose(design))
+    library_us, gaps = Quantiles.of(by_library.us), np.array([answer.gap for answer in by_library.answers])
+    exact_ms, axes_ms, joint_ms = (float(np.median(found.us)) / 1e3 for found in (exact, axes, joint))
+    endings = [answer.status for answer in joint.answers]
+    parts = [part for variant in library.variants for part in variant]
+    return BenchResult(
+        states=count,
+        components=components,
+        feasible_share=states.feasible_share,
+        printed_ms=joint_ms,
+        printed_status=", ".join(sorted(set(endings))),
+        printed_optimal=endings.count(SolveStatus.OPTIMAL),
+        printed_states=len(endings),
+        cvxpy_axis_ms=axes_ms / components,
+        cvxpy_ms=axes_ms,
+        cvxpy_states=len(axes.answers),
+        exact_axis_ms=exact_ms / components,
+        exact_ms=exact_ms,
+        exact_states=len(exact.answers),
+        library_us=library_us,
+        frozen_us=median(by_library.of(FROZEN)),
+        mixture_us=median(by_library.of(MIXTURE)),
+        fallback_us=median(by_library.of(EXACT)),
+        ratio_printed_library=joint_ms * 1e3 / library_us.p50,
+        ratio_cvxpy_library=axes_ms * 1e3 / library_us.p50,
+        ratio_exact_library=exact_ms * 1e3 / library_us.p50,
+        conditioned=_conditioned(ours[0], axes_ms) if ours else None,
+        shares=_shares(by_library),
+        gap=Quantiles.of(gaps),
+        certificate_excess=_excess(by_library.answers, exact.answers),
+        cost_difference=None if design.estimate_cov.any() else _cost_difference(axes.answers, exact.answers),
+        library_s=library_s,
+        library_policies=[len(part.level) for part in parts],
+        library_bytes=sum(part.theta.nbytes + part.level.nbytes + part.slope.nbytes for part in parts),
+        ready_s=ready_s,
+        memory_mb=Memory(before=memory[0], library=memory[1], after=memory[2]),
+        growth_h=growth_h,
+        growth_axes=growth_axes,
+        qp_us=qp,
+        clock_us=clock_us(),
+        wall_s=time.perf_counter() - begin,
+    )
+
+
+def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
+    us = Quantiles.of(found.us)
+    return ConditionedTimes(
+        us=us,
+        iterations=Quantiles.of(np.array([answer.iterations for answer in found.answers])),
+        left_alone=sum(answer.iterations == 0 for answer in found.answers) / len(found.answers),
+        ratio_cvxpy=axes_ms * 1e3 / us.p50,
+    )
+
+
+def _library(design: Design, seed: int, advance: Advance) -> tuple[Library, float]:
+    """The library, made anew, and the time that it took [s]."""
+    advance("making the library", 0, None)
+    start = time.perf_counter()
+    library = make_library(
+        design, seed, lambda name, policies, _: advance(f"making the library, {name}", policies, None)
+    )
+    return library, time.perf_counter() - start
+
+
+def _each(told: Callable[[int], None]) -> Callable[[], None]:
+    """Counts calls."""
+    done = 0
+
+    def one() -> None:
+        nonlocal done
+        done += 1
+        told(done)
+
+    return one
+
+
+def _peak_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / _MEGABYTE if sys.platform == "darwin" else peak * 1024 / _MEGABYTE
+
+
+def _shares(found: Timed) -> Shares:
+    methods = [answer.method for answer in found.answers]
+    frozen, mixture, exact = (methods.count(method) / len(methods) for method in (FROZEN, MIXTURE, EXACT))
+    return Shares(frozen=frozen, mixture=mixture, exact=exact)
+
+
+def _excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:
+    """How far exact optima are outside the certified bounds, relative; an optimum is known up to its own gap."""
+    most = 0.0
+    for ours, theirs in zip(certified, exact, strict=False):  # the exact program is asked fewer
+        beyond = max(ours.cost_lower - theirs.cost, theirs.cost_lower - ours.cost)
+        most = max(most, beyond / max(1.0, abs(theirs.cost)))
+    return most
+
+
+def _cost_difference(printed: Sequence[Answer], exact: Sequence[Answer]) -> float | None:
+    """Of the states that the printed problem can be solved from; None without any."""
+    pairs = [(one.cost, other.cost) for one, other in zip(printed, exact, strict=False) if np.isfinite(one.cost)]
+    return max((abs(one / other - 1.0) for one, other in pairs), default=None)
+
+
+# A benchmark as a picture: one decision by every method, and how the library's grows.
+
+
+_WIDTH_IN, _HEIGHT_IN = 10.0, 3.9
+_BAR = 0.62
+_ROOM = 12.0  # of the time axis, right of the longest bar, for its label
+
+
+def bench_svg(result: BenchResult, name: str) -> str:
+    """A complete SVG file, readable on light and dark pages."""
+    with canvas("bench", _HEIGHT_IN, _WIDTH_IN) as one:
+        bars, horizon, axes = one.figure.subplots(1, 3, width_ratios=(1.5, 1.0, 1.0))
+        _draw_methods(bars, result, name)
+        growth = result.growth_h
+        _draw_growth(horizon, "Longer horizons, one axis", "H", growth.horizon, growth.mixture_us, growth.frozen_us)
+        _guide(horizon, growth.horizon, growth.mixture_us, 2, "H²")
+        many = result.growth_axes
+        _draw_growth(axes, "More axes", "number of axes", many.axes, many.mixture_us, many.frozen_us)
+        _guide(axes, many.axes, many.mixture_us, 1, "linear")
+    label = (
+        f"Time of one decision with {name}: policy library {_time(result.library_us.p50)} in the median, exact program "
+        f"{_time(result.exact_ms * 1e3)}, problem as printed axis by axis {_time(result.cvxpy_ms * 1e3)}; "
+        "growth of the library's with horizon and number of axes"
+    )
+    return standalone(one.svg, label)
+
+
+def _draw_methods(ax: Axes, result: BenchResult, name: str) -> None:
+    """Medians of all methods as bars, the slowest above."""
+    methods = [
+        ("as printed,\njointly", result.printed_ms * 1e3, "muted"),
+        ("as printed,\naxis by axis", result.cvxpy_ms * 1e3, "muted"),
+        ("exact", result.exact_ms * 1e3, "limit"),
+        ("library", result.library_us.p50, "estimate"),
+    ]
+    for place, (_, us, role) in enumerate(reversed(methods)):
+        ax.barh(place, us, _BAR, color=colour(role))
+        text = _time(us) if place else f"{_time(us)}, p99 {_time(result.library_us.p99)}"
+        ax.annotate(text, (us, place), (5, 0), textcoords="offset points", va="center")
+    axis_names = "axis" if result.components == 1 else "axes"
+    ax.set_title(f"{name}: one decision, {result.components} {axis_names}, median")
+    ax.set_xscale("log")
+    ax.set_xlim(10.0, _ROOM * max(us for _, us, _ in methods))
+    ax.set_yticks(range(len(methods)), [label for label, _, _ in reversed(methods)])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(False, axis="y")
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda us, _: _time(us)))
+
+
+def _draw_growth(
+    ax: Axes,
+    title: str,
+    label: str,
+    sizes: Sequence[int],
+    mixture: Sequence[float | None],
+    frozen: Sequence[float | None],
+) -> None:
+    """Two curves in a logarithmic frame, each with its name at its end."""
+    ax.set_title(title)
+    ax.set_xlabel(label)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    for name, times, role in (("mixture", mixture, "plan"), ("frozen", frozen, "estimate")):
+        known = np.array([[size, us] for size, us in zip(sizes, times, strict=True) if us is not None]).reshape(-1, 2)
+        if known.size:
+            ax.plot(*known.T, color=colour(role), marker="o", markersize=3.5)
+            x, y = known[len(known) // 2]
+            ax.annotate(name, (x, y), (4, -5), textcoords="offset points", va="top", color=colour(role))
+    ax.xaxis.set_major_locator(FixedLocator(list(sizes)))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda size, _: f"{size:g}"))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda us, _: _time(us)))
+
+
+def _guide(ax: Axes, sizes: Sequence[int], times: Sequence[float | None], power: int, name: str) -> None:
+    """A power law from the first time on."""
+    if not sizes or times[0] is None:
+        return
+    guide = [times[0] * (size / sizes[0]) ** power for size in sizes]
+    ax.plot(sizes, guide, color=colour("muted"), lw=1.0, ls=(0, (4, 3)), zorder=1)
+    middle = (sizes[len(sizes) // 2], guide[len(sizes) // 2])
+    ax.annotate(name, middle, (-4, 3), textcoords="offset points", ha="right", color=colour("muted"))
+
+
+def _time(us: float) -> str:
+    """A time in the unit that suits it."""
+    for unit, size in (("s", 1e6), ("ms", 1e3)):
+        if us >= size:
+            return f"{us / size:.3g} {unit}"
+    return f"{us:.3g} µs"

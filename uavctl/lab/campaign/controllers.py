@@ -1,0 +1,388 @@
+"""Settings and controllers of cells; baselines in the flight core."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import threading
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
+
+from uavctl.build.controller import (
+    build_conditioned,
+    build_design,
+    build_plant,
+    build_problem,
+    build_solver,
+    needed,
+    start_state,
+)
+from uavctl.build.library import StoredLibrary, decode
+from uavctl.config import Config
+from uavctl.config.link import LinkConfig
+from uavctl.config.types import PlantConfig
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
+from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.baselines import (
+    CascadedPid,
+    ControlProblem,
+    Governor,
+    HoldLast,
+    Lqg,
+    MeanQp,
+    PacketisedPredictive,
+    PidGains,
+    WorstCaseDelay,
+    ZeroOnLoss,
+    tune,
+)
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, News, OneByOne
+from uavctl.smpc.conditioned.planner import ConditionedDecider
+from uavctl.smpc.estimate import innovations
+from uavctl.smpc.hahn_stursberg.design import Design, kappa
+from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
+from uavctl.smpc.hahn_stursberg.library import Library
+
+# Disturbances of many runs: each kind a transform of the same standard normal draws.
+
+
+Array = NDArray[np.float64]
+
+_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
+
+
+def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
+    """w(k) of every run (N, T, n_w).
+
+    Args:
+        spec: The kind; all have mean `bias` and covariance scale² W, gusts as they are once they have long blown.
+        w: W (n_w, n_w).
+        normal: Standard normal draws (N, T, n_w), see `Chances.normal`.
+    """
+    shaped = spec.scale * _shaped(spec, normal) @ _root(w)
+    return np.asarray(shaped + spec.bias * np.sqrt(np.diag(w)), dtype=np.float64)
+
+
+def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
+    """Draws of mean 0 and covariance I."""
+    if spec.kind == "uniform":
+        return np.asarray(np.sqrt(3.0) * (2.0 * ndtr(normal) - 1.0), dtype=np.float64)
+    if spec.kind == "heavy":
+        # By the lower tail on either side: the upper one's probability would be rounded to 1.
+        tail = stdtrit(_DEGREES, ndtr(-np.abs(normal)))
+        return np.asarray(-np.sign(normal) * tail * np.sqrt((_DEGREES - 2.0) / _DEGREES), dtype=np.float64)
+    if spec.kind == "gusts":
+        gusts = normal.copy()
+        for k in range(1, normal.shape[1]):
+            gusts[:, k] = spec.memory * gusts[:, k - 1] + np.sqrt(1.0 - spec.memory**2) * normal[:, k]
+        return gusts
+    return normal
+
+
+def _root(w: Array) -> Array:
+    """The symmetric root of W: there is one, and it is unique, for every covariance."""
+    values, vectors = np.linalg.eigh(w)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)
+
+
+# What a cell's runs meet, whoever flies them: plant, limits, costs, start, link, disturbance.
+
+
+_START = 2  # child of a run's seed that draws its start; 0 and 1 are those of `chance.draw`
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A cell without its controller."""
+
+    spec: CampaignSpec  # the campaign's specification: steps, seed, start
+    base: Config  # the base configuration, which every cell is judged by
+    plant: PlantConfig  # the plant that flies
+    link: LinkConfig  # the link that it flies on
+    disturbance: DisturbanceSpec  # the disturbance
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """What N runs of T steps meet."""
+
+    scene: Scene  # the scene
+    newest: Counts  # capture step of the newest position known in each step (N, T)
+    disturbances: Array  # w (N, T, n_w)
+    known: Counts  # step that knows the position of each step first (N, T)
+    noise: Array | None  # noise of the positions (N, T, n_axes) [m]; None where the state is measured
+
+
+def met(setting: Setting, first: int, runs: int) -> Met:
+    """What the runs `first` … `first` + `runs` - 1 meet.
+
+    Raises:
+        DesignError: The plant that flies is none.
+    """
+    spec, flown = setting.spec, msgspec.structs.replace(setting.base, plant=setting.plant)
+    plant, judged = build_plant(flown), build_problem(setting.base)
+    chances = draw(spec.master, first, runs, spec.steps, plant.n_w)
+    scene = Scene(
+        plant=plant,
+        state_set=judged.state_set,
+        input_set=judged.input_set,
+        q_x=judged.q_x,
+        q_u=judged.q_u,
+        target=judged.target,
+        u_target=judged.u_target,
+        start=_starts(setting, first, runs),
+    )
+    first_known = known(setting.link, plant.dt_s, chances.link)
+    noise = None
+    if spec.measured == "position":
+        std_m = setting.base.sim.camera.noise_std_m
+        noise = std_m * draw_noise(spec.master, first, runs, spec.steps, len(plant.axes))
+    return Met(
+        scene, newest_of(first_known), disturbances(setting.disturbance, plant.w, chances.normal), first_known, noise
+    )
+
+
+def start_of(spec: CampaignSpec, base: Config) -> Array:
+    """The state in which runs start (n_x,); with a box, its middle."""
+    if spec.start:
+        return np.array(spec.start, dtype=np.float64)
+    if spec.start_box:
+        middle: Array = np.array(spec.start_box, dtype=np.float64).mean(axis=0)
+        return middle
+    return start_state(base, build_plant(base))
+
+
+def _starts(setting: Setting, first: int, runs: int) -> Array:
+    """x(0) of every run (N, n_x)."""
+    spec = setting.spec
+    if not spec.start_box:
+        return np.tile(start_of(spec, setting.base), (runs, 1))
+    lower, upper = np.array(spec.start_box, dtype=np.float64)
+    draws = np.empty((runs, lower.size))
+    for i in range(runs):
+        seed = np.random.SeedSequence([spec.master, first + i]).spawn(_START + 1)[_START]
+        np.random.default_rng(seed).random(out=draws[i])
+    return np.asarray(lower + (upper - lower) * draws, dtype=np.float64)
+
+
+# From what a controller is to believe to the controller: first a recipe, once, then as many controllers as workers.
+
+
+# Runs that a PID is tuned on: beyond the last index that a campaign can fly.
+TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
+TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies them all
+
+LibraryFor = Callable[[Config, Design], StoredLibrary | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """All that a controller is built from; it can be sent to another process."""
+
+    key: str  # hash of all the others
+    kind: Kind  # what it is
+    config: Config  # the configuration that it believes in
+    design: Design | None = None  # its design, of the SMPC with scheme `hahn-stursberg`
+    # Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`
+    library: bytes | None = None
+    library_id: str | None = None  # the library's hash
+    gains: PidGains | None = None  # the gains of a PID
+    margin: float = 0.0  # of an MPC without back-offs, see `ControllerSpec`
+    # Covariance (n_x, n_x) that the simple margins begin with; None: the state is measured
+    cov: NDArray[np.float64] | None = None
+
+
+def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
+    """Make design, library and gains: what takes its time, or depends on chance.
+
+    Args:
+        config: The configuration that it believes in.
+        library_for: Gives the policy library of a design.
+
+    Raises:
+        DesignError: There is no such controller.
+    """
+    made = Recipe("", given.kind, config, margin=given.margin)
+    if spec.measured == "position":
+        sight = sight_of(config)
+        made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
+    if given.kind == "smpc" and not config.conditioned:
+        design = build_design(config)
+        stored = library_for(config, design)
+        if stored is None:
+            made = replace(made, design=design)
+        else:
+            made = replace(made, design=design, library=stored.data, library_id=stored.library_id)
+    elif given.kind == "pid":
+        made = replace(made, gains=_tuned(config, spec))
+    made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
+    if made.design is None:
+        build(made)  # what needs no design is refused here, not in a worker
+    return made
+
+
+def build(recipe: Recipe) -> BatchController:
+    """A controller of a recipe.
+
+    Raises:
+        DesignError: There is none.
+    """
+    config = recipe.config
+    if recipe.kind == "smpc":
+        return _smpc(recipe)
+    problem = build_problem(config)
+    if recipe.kind == "lqg":
+        return Lqg(problem)
+    if recipe.kind == "packetised":
+        return PacketisedPredictive(problem, recipe.margin)
+    if recipe.kind == "mean-qp":
+        return MeanQp(problem, recipe.margin, recipe.cov)
+    if recipe.kind == "governor":
+        return Governor(problem, recipe.margin, recipe.cov)
+    if recipe.kind == "hold-last":
+        return HoldLast(problem, recipe.margin)
+    if recipe.kind == "zero-on-loss":
+        return ZeroOnLoss(problem, recipe.margin)
+    if recipe.kind == "worst-case-delay":
+        plant, allocation = problem.plant, config.risk.allocation
+        kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)
+        kappa_u = kappa(needed(config.smpc.delta_u, "smpc.delta_u"), plant.n_u, len(problem.input_set.b), allocation)
+        return WorstCaseDelay(problem, needed(config.smpc.tau, "smpc.tau"), kappa_x, kappa_u)
+    if recipe.gains is None:
+        raise ValueError("a PID without gains")
+    return CascadedPid(problem, recipe.gains)
+
+
+def sight_of(config: Config) -> FilterBelief:
+    """What a controller that believes in a configuration makes of positions."""
+    return FilterBelief(build_plant(config), config.estimator.position_std_m, config.estimator.initial_std)
+
+
+_built = threading.local()  # a controller has a state: each thread of a worker has its own
+
+
+def built(recipe: Recipe) -> BatchController:
+    """A controller of a recipe; the last one is kept, since a worker mostly goes on with the same."""
+    if getattr(_built, "key", None) != recipe.key:
+        _built.key = None
+        _built.controller = build(recipe)
+        _built.key = recipe.key
+    controller: BatchController = _built.controller
+    return controller
+
+
+def _smpc(recipe: Recipe) -> BatchSmpc:
+    config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
+    brake_gain_1ps = config.fallback.brake_gain_1ps
+    if config.conditioned:
+        solver, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
+        return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
+    if design is None:
+        raise ValueError("an SMPC without a design")
+    library = None if recipe.library is None else decode(recipe.library).library
+    decider = _decider(design, library, build_solver(design, config, library))
+    return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
+
+
+def _decider(design: Design, library: Library | None, solver: Solver) -> Decider:
+    if library is None:
+        return OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+    return ExplicitDecider(design, library, solver, design.target)
+
+
+def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
+    """The gains that suit what the PID believes in, from where the campaign starts."""
+    spec = msgspec.structs.replace(spec, steps=min(spec.steps, TUNING_STEPS))
+    believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
+    meets = met(believed, TUNING_FIRST, TUNING_RUNS)
+    start = start_of(spec, config)
+    return tune(build_problem(config), np.asarray(start), meets.newest, meets.disturbances)
+
+
+# Controllers of others in place of the SMPC, within the flight core: its filter, fallback and last gate stay.
+#
+# The flight core asks for a plan when there is news, and plays it out in silence. So a baseline is asked now, and
+# again for each step of silence to come: what it would do then is its plan. It is told the filter's estimate as its
+# state.
+
+
+class BaselineSolver:
+    """A baseline as a solver; implements `uavctl.smpc.answer.Solver`.
+
+    Args:
+        name: What plans say that they were found by.
+        make: Makes the problem and the controller that fly to a target (n_x,).
+    """
+
+    def __init__(self, name: str, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
+        self._name, self._make = name, make
+        self._target: Array | None = None
+        self._begun = 0  # step in which it was asked first
+        self._asked: list[Array] = []  # its inputs (n_u,) step by step, as far as they are flown
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+        """See `Solver`; `outlook` is for those who know what to do with it."""
+        del outlook
+        if self._target is None or not np.array_equal(target, self._target):
+            self._problem, self._controller = self._make(target)
+            self._controller.begin(1)
+            self._target, self._begun, self._asked = target.copy(), seq, []
+        problem, step = self._problem, seq - self._begun
+        # What was flown since: its own plan, and nothing where that had run out.
+        flown = [*self._asked[:step], *([problem.u_target] * max(0, step - len(self._asked)))]
+        inputs: list[Array] = []
+        later = self._controller
+        low, high = problem.input_set.bounds
+        for silence in range(problem.horizon):
+            if silence == 1:
+                later = _twin(self._controller)
+            acted = np.clip(np.array([*flown, *inputs]).reshape(1, -1, problem.plant.n_u), low, high)
+            inputs.append(later.act(News(step + silence, np.array([step]), x[np.newaxis], acted))[0])
+        self._asked = [*flown, *inputs]
+        return _answer(seq, self._name, problem, x, np.array(inputs))
+
+
+def _twin(controller: BatchController) -> BatchController:
+    """The same controller with a state of its own, which of all baselines is in arrays."""
+    twin = copy(controller)
+    for name, value in vars(twin).items():
+        if isinstance(value, np.ndarray):
+            setattr(twin, name, value.copy())
+    return twin
+
+
+def _answer(seq: int, name: str, problem: ControlProblem, x: Array, inputs: Array) -> Answer:
+    """A plan without back-offs; its states are those without disturbance, inputs cut to their limits."""
+    if not np.isfinite(inputs).all():
+        return Answer.failed(seq, SolveStatus.FAILED, name)
+    low, high = problem.input_set.bounds
+    states, cost = [x], 0.0
+    for u in np.clip(inputs, low, high):
+        off_x, off_u = states[-1] - problem.target, u - problem.u_target
+        cost += float(off_x @ problem.q_x @ off_x + off_u @ problem.q_u @ off_u)
+        states.append(problem.plant.a @ states[-1] + problem.plant.b @ u)
+    return Answer(
+        seq=seq,
+        status=SolveStatus.OPTIMAL,
+        method=name,
+        inputs=inputs,
+        states=np.array(states),
+        backoff_x=np.zeros((problem.horizon + 1, problem.state_set.b.size)),
+        backoff_u=np.zeros((problem.horizon, problem.input_set.b.size)),
+        reference=problem.target,
+        slack=0.0,
+        offset=0.0,
+        terminal_miss=0.0,
+        cost=cost,
+        cost_lower=-np.inf,
+        gap=np.inf,
+        iterations=0,
+    )

@@ -1,0 +1,388 @@
+"""Figures of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from textwrap import fill
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
+
+from logs.report.figures import WIDE_IN
+from logs.report.plots import DASHED, DOTTED
+from logs.report.svg import WIDTH_IN, Drawing, canvas, colour
+from uavctl.lab.campaign.intervals import Pair
+from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
+
+# Legends of a campaign's figures, with the markers that the figures have.
+
+
+# By matplotlib's name of the marker, around (13, 7).
+_SHAPES = {
+    "o": "M16.6 7a3.6 3.6 0 1 1-7.2 0a3.6 3.6 0 1 1 7.2 0z",
+    "s": "M9.8 3.8h6.4v6.4h-6.4z",
+    "^": "M13 3l4 7.2h-8z",
+    "D": "M13 2.6l4.4 4.4l-4.4 4.4l-4.4-4.4z",
+    "v": "M13 11l4-7.2h-8z",
+    "P": "M11.6 3h2.8v2.6h2.6v2.8h-2.6v2.6h-2.8v-2.6h-2.6v-2.8h2.6z",
+}
+
+
+@dataclass(frozen=True)
+class MarkerStyle:
+    """How a controller or a link is drawn: a role's colour and a marker, full or hollow."""
+
+    role: str
+    marker: str
+    full: bool
+
+
+def legend(entries: Iterable[tuple[MarkerStyle, str]], limit: str = "", cross: str = "") -> str:
+    """The legend as HTML.
+
+    Args:
+        limit: What a dashed line is; none where it is empty.
+        cross: What a cross instead of a marker is; none where it is empty.
+    """
+    items = [(_swatch(look), text) for look, text in entries]
+    if limit:
+        items.append(('<path d="M1 7H25" style="stroke:var(--limit);stroke-width:2.2;stroke-dasharray:6 4"/>', limit))
+    if cross:
+        items.append(('<path d="M9 3l8 8M17 3l-8 8" style="stroke:var(--ink);stroke-width:2.2"/>', cross))
+    rows = "".join(
+        f'<li><svg viewBox="0 0 26 14" aria-hidden="true">{drawn}</svg>{escape(text)}</li>' for drawn, text in items
+    )
+    return f'<ul class="legend">{rows}</ul>'
+
+
+def _swatch(look: MarkerStyle) -> str:
+    paint = f"var(--{look.role})"
+    face = paint if look.full else "var(--card)"
+    return (
+        f'<path d="M1 7H25" style="stroke:{paint};stroke-width:2.2"/>'
+        f'<path d="{_SHAPES[look.marker]}" style="fill:{face};stroke:{paint};stroke-width:1.4"/>'
+    )
+
+
+# Rows of a figure, one a link, with the names of the links beside the axis.
+
+
+_LETTER_IN = 0.08  # of the page's font, the widest that browsers take for it
+
+
+def offset(place: int, count: int) -> float:
+    """Within a row, from -0.36 to 0.36."""
+    return 0.0 if count == 1 else 0.72 * (place / (count - 1) - 0.5)
+
+
+def rows_in(labels: Sequence[str], count: int) -> float:
+    """Height of all rows [in]; they are alike, so the name of most lines counts."""
+    lines = max(label.count("\n") + 1 for label in labels)
+    return len(labels) * max(0.13 * count + 0.08, 0.15 * lines + 0.06)
+
+
+def lower(ax: Axes, room_in: float) -> None:
+    """Move the upper edge of axes down, for a title of several lines."""
+    box = ax.get_position()
+    height_in = ax.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
+    ax.set_position((box.x0, box.y0, box.width, box.height - room_in / height_in))
+
+
+def left_in(labels: Sequence[str]) -> float:
+    """Room for the names of links beside the axis [in]."""
+    return 0.2 + _LETTER_IN * max(len(line) for label in labels for line in label.splitlines())
+
+
+def draw_rows(ax: Axes, labels: Sequence[str]) -> None:
+    """Names of the rows, the first on top, with lines between them."""
+    ax.set_yticks(range(len(labels)), labels)
+    ax.set_ylim(len(labels) - 0.5, -0.5)
+    ax.grid(visible=False, axis="y")
+    for row in range(1, len(labels)):
+        ax.axhline(row - 0.5, color=colour("grid"), lw=0.6, ls=DOTTED)
+
+
+# Numbers below a logarithmic axis: short, and apart from each other.
+
+
+LINEAR_PERCENT = 3.0  # of the axis of differences; logarithmic beyond
+_TICK_LETTER_IN, _TICK_GAP_IN = 0.075, 0.08  # of the axis of differences
+
+
+def spread_ticks(ax: Axes) -> None:
+    """Ticks at 1 and 3 of each decade, at 1 only where their numbers would touch."""
+    low, high = ax.get_xlim()
+    dots_an_inch = ax.get_figure(root=True).dpi  # type: ignore[union-attr]
+    for subs in ((1.0, 3.0), (1.0,)):
+        locator = SymmetricalLogLocator(base=10.0, linthresh=LINEAR_PERCENT, subs=subs)
+        ax.xaxis.set_major_locator(locator)
+        shown = sorted({float(value) for value in locator.tick_values(low, high) if low <= value <= high})
+        places_in = ax.transData.transform([(value, 0.0) for value in shown])[:, 0] / dots_an_inch
+        letters = np.array([len(plain(value, 0)) for value in shown])
+        wanted_in = _TICK_GAP_IN + 0.5 * _TICK_LETTER_IN * (letters[1:] + letters[:-1])
+        if (np.diff(places_in) >= wanted_in).all():
+            return
+
+
+def plain(value: float, _place: int) -> str:
+    """A number without an exponent, as a formatter of matplotlib is called."""
+    for least, suffix in ((1e6, "M"), (1e4, "k")):
+        if abs(value) >= least:
+            return f"{value / (1e6 if suffix == 'M' else 1e3):.6g}{suffix}"
+    return f"{value:.4g}"
+
+
+# Figures of a campaign's page: cost, violation rates, inputs, ages and differences, by controller and link.
+
+
+# Beyond this ratio of the largest to the smallest, a logarithmic axis.
+_WIDE = 4.0
+_NUMERIC_AT_LEAST = 3  # links with a plain loss, for a line over it
+_FARTHEST_PERCENT = 1e6  # what is beyond stands there
+# A controller that diverges would press all others together: beyond this times the least, it leaves the frame.
+_TALLEST = 1e5
+_TITLE_WIDTH = 48
+_TITLE_LINE_IN = 0.18
+_LABEL_WIDTH = 16  # characters of a link's name in a line
+_ROLES = ("estimate", "sample", "target", "plan", "truth", "muted")
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+# A colour comes again with the next marker, hollow.
+_LOOKS = tuple(
+    MarkerStyle(role, _MARKERS[(place + turn) % len(_MARKERS)], turn == 0)
+    for turn in range(2)
+    for place, role in enumerate(_ROLES)
+)
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How each controller is drawn, the same in all figures."""
+
+    controllers: tuple[str, ...]
+
+    def of(self, controller: str) -> MarkerStyle:
+        """How one is drawn."""
+        return _LOOKS[self.controllers.index(controller) % len(_LOOKS)]
+
+    def entries(self, shown: Collection[str]) -> Iterator[tuple[MarkerStyle, str]]:
+        """The legend of those that are shown."""
+        return ((self.of(name), name) for name in self.controllers if name in shown)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a figure shows of each cell."""
+
+    key: str  # in the figure's id
+    title: str  # of the figure
+    label: str  # of its axis
+    # The figure of a cell and its interval; None where it has none
+    value: Callable[[CellSummary], tuple[float | None, Pair | None]]
+    # The share that a cell's design allows; None where that is no matter
+    promised: Callable[[CellSummary], float | None]
+    scale: float = 1.0  # to the unit of the axis
+
+
+COST = Quantity("cost", "Cost", "cost of a run", lambda c: (c.cost, c.cost_ci), lambda _: None)
+SETTLED = Quantity(
+    "settled", "Settled cost", "cost of a step", lambda c: (c.settled_cost, c.settled_cost_ci), lambda _: None
+)
+STATES = Quantity(
+    "states",
+    "States outside the limits",
+    "steps with a state outside [%]",
+    lambda c: (c.violation_rate, c.violation_ci),
+    lambda c: c.promised_x,
+    100.0,
+)
+INPUTS = Quantity(
+    "inputs",
+    "Inputs asked for outside the limits",
+    "steps with an input outside [%]",
+    lambda c: (c.input_violation_rate, c.input_violation_ci),
+    lambda c: c.promised_u,
+    100.0,
+)
+QUANTITIES = (COST, STATES, SETTLED, INPUTS)
+
+
+def compared(cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str) -> Iterator[Drawing]:
+    """Every quantity of the cells of one disturbance and plant: over the loss where it is a number, by link else.
+
+    Args:
+        losses: Loss of the links that are nothing but a loss.
+    """
+    flown = [cell for cell in cells if cell.cost is not None]
+    named = {cell.link for cell in flown}
+    numeric = {link: loss for link, loss in losses.items() if link in named}
+    if len(set(numeric.values())) < _NUMERIC_AT_LEAST:
+        numeric = {}
+    others = [cell for cell in flown if cell.link not in numeric]
+    if numeric:
+        shown = [cell for cell in flown if cell.link in numeric]
+        yield from (_over_loss(one, shown, numeric, looks, key) for one in QUANTITIES)
+    if others:
+        yield from (_by_link(one, others, looks, key) for one in QUANTITIES)
+
+
+def _over_loss(
+    quantity: Quantity, cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str
+) -> Drawing:
+    name = f"{quantity.key}-loss-{key}"
+    with canvas(name, 2.8) as one:
+        ax = one.axes(quantity.title, "positions lost [%]", quantity.label)
+        floor = _scale(ax, quantity, cells, ax.set_yscale)
+        for controller in dict.fromkeys(cell.controller for cell in cells):
+            look = looks.of(controller)
+            paint, face = _paint(look)
+            mine = sorted((cell for cell in cells if cell.controller == controller), key=lambda c: losses[c.link])
+            x = np.array([100.0 * losses[cell.link] for cell in mine])
+            value, low, high = _figures(quantity, mine)
+            ax.fill_between(x, np.maximum(low, floor), high, color=paint, alpha=0.16, lw=0)
+            there = np.where(value > floor, value, np.nan)
+            ax.plot(x, there, marker=look.marker, ms=3.8, color=paint, mfc=face)
+            none = value <= floor
+            ax.plot(x[none], high[none], ls="", marker=CARETDOWNBASE, ms=5, color=paint, mfc=face)
+        for share in {quantity.promised(cell) for cell in cells} - {None}:
+            ax.axhline(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
+    return Drawing(name, one.svg, f"{quantity.title} of each controller over the loss of the link")
+
+
+def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key: str) -> Drawing:
+    """Grouped dots: a row for each link, a dot with its interval for each controller."""
+    name = f"{quantity.key}-link-{key}"
+    links = list(dict.fromkeys(cell.link for cell in cells))
+    who = list(dict.fromkeys(cell.controller for cell in cells))
+    labels = [fill(link, _LABEL_WIDTH) for link in links]
+    with canvas(name, 0.9 + rows_in(labels, len(who))) as one:
+        ax = one.axes(quantity.title, quantity.label, "", left_in(labels))
+        floor = _scale(ax, quantity, cells, ax.set_xscale)
+        for place, controller in enumerate(who):
+            look = looks.of(controller)
+            paint, face = _paint(look)
+            mine = [cell for cell in cells if cell.controller == controller]
+            rows = np.array([links.index(cell.link) + offset(place, len(who)) for cell in mine])
+            value, low, high = _figures(quantity, mine)
+            ax.hlines(rows, np.maximum(low, floor), high, color=paint, lw=1.6)
+            there = value > floor
+            ax.plot(value[there], rows[there], ls="", marker=look.marker, ms=4.2, color=paint, mfc=face)
+            ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=paint, mfc=face)
+        _promise(ax, quantity, cells, links)
+        draw_rows(ax, labels)
+    return Drawing(name, one.svg, f"{quantity.title} of each controller by link")
+
+
+def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, key: str) -> Drawing | None:
+    """Paired cost differences of each baseline to one SMPC by link, over the SMPC's cost."""
+    shown = [verdict for verdict in verdicts if any(one.share is not None for one in verdict.comparisons)]
+    if not shown:
+        return None
+    labels = [fill(verdict.group[0], _LABEL_WIDTH) for verdict in shown]
+    who = list(dict.fromkeys(one.baseline.controller for verdict in shown for one in verdict.comparisons))
+    name = f"difference-{key}"
+    heading = fill(title, _TITLE_WIDTH)
+    more_in = _TITLE_LINE_IN * heading.count("\n")
+    with canvas(name, 0.9 + rows_in(labels, len(who)) + more_in) as one:
+        ax = one.axes(heading, "what the baseline costs more [%]", "", left_in(labels))
+        lower(ax, more_in)
+        ax.set_xscale("symlog", linthresh=LINEAR_PERCENT, linscale=0.8)
+        ax.axvline(0.0, color=colour("ink"), lw=0.9)
+        for row, verdict in enumerate(shown):
+            for comparison in verdict.comparisons:
+                place = row + offset(who.index(comparison.baseline.controller), len(who))
+                _difference(ax, comparison, place, looks)
+        spread_ticks(ax)
+        ax.xaxis.set_major_formatter(FuncFormatter(plain))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        draw_rows(ax, labels)
+    return Drawing(name, one.svg, f"{title}: what each baseline costs more, by link, with its interval")
+
+
+def _difference(ax: Axes, one: BaselineComparison, place: float, looks: Looks) -> None:
+    """The baseline's marker where the SMPC breaks no limit more often, else a cross."""
+    if one.share is None:
+        return
+    mean, low, high = np.clip(100.0 * np.array(one.share), -_FARTHEST_PERCENT, _FARTHEST_PERCENT)
+    look = looks.of(one.baseline.controller)
+    paint, face = _paint(look)
+    ax.hlines(place, low, high, color=paint, lw=1.6)
+    marker, width = (look.marker, 1.0) if one.as_safe else ("x", 1.8)
+    ax.plot(mean, place, ls="", marker=marker, ms=4.4, mew=width, color=paint, mfc=face)
+
+
+def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawing]:
+    """How often the age of information was at least j, by link: for a wide page and for a narrow one."""
+    by_link: dict[str, list[int]] = {}
+    for cell in cells:
+        if cell.ages and len(cell.ages) >= len(by_link.get(cell.link, [])):
+            by_link[cell.link] = cell.ages
+    steps = results.planned * results.steps
+    label = f"Share of {steps} steps in which the age of information is at least j, by link"
+    drawings = []
+    for key, width_in in (("ages-wide", WIDE_IN), ("ages-narrow", WIDTH_IN)):
+        with canvas(key, 2.8, width_in) as one:
+            _tails(one.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
+        drawings.append(Drawing(key, one.svg, label))
+    return drawings[0], drawings[1]
+
+
+def _tails(ax: Axes, histograms: list[list[int]]) -> None:
+    for place, counts in enumerate(histograms):
+        look = _LOOKS[place % len(_LOOKS)]
+        paint, face = _paint(look)
+        tail = 100.0 * np.cumsum(np.array(counts, dtype=np.float64)[::-1])[::-1] / max(1, sum(counts))
+        shown = np.flatnonzero(tail)
+        ax.plot(shown, tail[shown], marker=look.marker, ms=3.4, color=paint, mfc=face)
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(FuncFormatter(plain))
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    ax.set_xlim(left=-0.3)
+
+
+def age_entries(cells: Sequence[CellSummary]) -> Iterator[tuple[MarkerStyle, str]]:
+    """Its legend."""
+    links = dict.fromkeys(cell.link for cell in cells if cell.ages)
+    return ((_LOOKS[place % len(_LOOKS)], link) for place, link in enumerate(links))
+
+
+def _paint(look: MarkerStyle) -> tuple[str, str]:
+    """Colours of the line and of the marker's inside."""
+    return colour(look.role), colour(look.role if look.full else "card")
+
+
+def _figures(quantity: Quantity, cells: Sequence[CellSummary]) -> np.ndarray:
+    rows = [(value, *interval) for value, interval in map(quantity.value, cells) if value is not None and interval]
+    return quantity.scale * np.array(rows, dtype=np.float64).T
+
+
+def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale: Callable[[str], None]) -> float:
+    """A logarithmic axis where the figures lie far apart; at or below the value returned there is no place on it."""
+    value, _, high = _figures(quantity, cells)
+    above = value[value > 0.0]
+    if not high.size or not (high > 0.0).any():
+        return -np.inf
+    least = above.min() if above.size else high.min()
+    axis = ax.yaxis if set_scale == ax.set_yscale else ax.xaxis
+    if high.max() < _WIDE * least and (value > 0.0).all():
+        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_formatter(FuncFormatter(plain))
+        return -np.inf
+    set_scale("log")
+    axis.set_major_formatter(FuncFormatter(plain))
+    axis.set_minor_formatter(NullFormatter())
+    if high.max() > _TALLEST * least and quantity.scale == 1.0:
+        (ax.set_ylim if axis is ax.yaxis else ax.set_xlim)(0.5 * least, _TALLEST * least)
+    if high.max() < 100.0 * least:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    return 0.0
+
+
+def _promise(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], links: Sequence[str]) -> None:
+    """What is allowed, beside the link that it is allowed for."""
+    for share, row in {(quantity.promised(cell), links.index(cell.link)) for cell in cells}:
+        if share is not None:
+            ax.vlines(quantity.scale * share, row - 0.5, row + 0.5, color=colour("limit"), lw=1.3, ls=DASHED)

@@ -1,0 +1,254 @@
+"""Who flies tasks: processes of this machine, or the workers of a Dask cluster; the same futures either way.
+
+Every worker computes with one BLAS thread. With more, the last bits of a product depend on their number, and then
+the
+results would; the libraries read it from the environment before numpy is imported, so a campaign with one worker
+flies
+in a process of its own too.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import connection
+from typing import Any, Protocol
+
+from uavctl import __version__
+from uavctl.errors import UavctlError, UsageError
+from uavctl.lab.campaign.tasks import Columns, Work
+
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_CONNECT_S = 10.0
+_WORKERS_S = 60.0
+
+
+class Workers(Protocol):
+    """Workers."""
+
+    size: int  # tasks that they fly at a time
+
+    def submit(self, task: Work) -> Future[Columns]:
+        """Have a task flown."""
+        ...
+
+    def broken(self, error: BaseException) -> bool:
+        """Whether a future ended like this because a worker died, not because of its task's code."""
+        ...
+
+    def renew(self) -> None:
+        """Be ready for tasks again after a worker died."""
+        ...
+
+
+class Processes:
+    """Processes of this machine."""
+
+    def __init__(self, workers: int) -> None:
+        self.size = workers
+        self._pool = _pool(workers)
+
+    def submit(self, task: Work) -> Future[Columns]:
+        """See `Crew`."""
+        try:
+            return self._pool.submit(task.fly)
+        except BrokenProcessPool as error:  # it broke under another task
+            ended: Future[Columns] = Future()
+            ended.set_exception(error)
+            return ended
+
+    def broken(self, error: BaseException) -> bool:
+        """See `Crew`."""
+        return isinstance(error, BrokenProcessPool)
+
+    def renew(self) -> None:
+        """See `Crew`."""
+        self.close()
+        self._pool = _pool(self.size)
+
+    def close(self) -> None:
+        """End the processes once they have done what they do."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def processes(workers: int) -> Iterator[Processes]:
+    """That many worker processes."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)  # children inherit it
+    crew = Processes(workers)
+    try:
+        yield crew
+    finally:
+        crew.close()
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+class Cluster:
+    """Workers of a Dask scheduler."""
+
+    def __init__(self, pool: Executor, size: int) -> None:
+        self.size = size
+        self._pool = pool
+
+    def submit(self, task: Work) -> Future[Columns]:
+        """See `Crew`."""
+        return self._pool.submit(task.fly)
+
+    def broken(self, error: BaseException) -> bool:
+        """See `Crew`."""
+        from distributed.scheduler import KilledWorker  # an extra, and slow to import
+
+        return isinstance(error, KilledWorker)
+
+    def renew(self) -> None:
+        """The scheduler has its own way with workers that died."""
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Cluster]:
+    """The workers of the Dask scheduler at an address, as many as it has now.
+
+    Raises:
+        UsageError: There is no Dask here, no scheduler there, no worker, or one that would fly otherwise.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise UsageError("--dask needs the package distributed; install uavctl[cluster]") from error
+    connect: Callable[..., Any] = Client  # it is typed in part only
+    try:
+        client = connect(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"--dask {address}: no scheduler answers there ({error}); start one with `dask scheduler`"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError as error:
+            raise UsageError(
+                f"--dask {address}: the scheduler has no workers; start some with `dask worker`"
+            ) from error
+        _check(address, client.run(_about))
+        try:
+            yield Cluster(client.get_executor(), sum(client.nthreads().values()))
+        except CancelledError as error:
+            raise UavctlError(
+                f"--dask {address}: the scheduler went away; go on with --resume once it is back"
+            ) from error
+
+
+def _about() -> tuple[str, str]:
+    """Version and BLAS threads of the process that this runs in."""
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "all"))
+    return __version__, threads
+
+
+def _check(address: str, workers: dict[str, tuple[str, str]]) -> None:
+    for worker, (version, threads) in workers.items():
+        if version != __version__:
+            raise UsageError(
+                f"--dask {address}: worker {worker} has uavctl {version}, this is {__version__}; install the same"
+            )
+        if threads != "1":
+            raise UsageError(
+                f"--dask {address}: worker {worker} computes with {threads} BLAS threads, and the last bits depend on "
+                "them; start it with OPENBLAS_NUM_THREADS=1"
+            )
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin)
+
+
+def _begin() -> None:
+    """Leave Ctrl-C to the parent, and end with it however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent.sentinel,), name="parent", daemon=True).start()
+
+
+def _end_after(sentinel: int) -> None:
+    connection.wait([sentinel])
+    os._exit(1)
+
+
+# Flying a campaign: every task that is not there yet, whatever becomes of the workers.
+
+
+Keep = Callable[[Work, Columns], None]
+_LOOK_S = 0.2
+_AHEAD = 2  # tasks for each worker: the one that it flies, and the next
+
+
+def fly_tasks(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
+    """Fly tasks and keep what comes of them, in any order.
+
+    A task whose worker dies is flown once more, alone; if that ends the same way, its runs are kept as lost.
+
+    Args:
+        keep: Is given each task with its rows.
+        stopped: Asked from time to time: whether to end. What is under way is still kept.
+    """
+    waiting = iter(tasks)
+    under_way: dict[Future[Columns], Work] = {}
+    while True:
+        while len(under_way) < _AHEAD * crew.size and not stopped():
+            task = next(waiting, None)
+            if task is None:
+                break
+            under_way[crew.submit(task)] = task
+        if not under_way:
+            return
+        if stopped():
+            for future in list(under_way):
+                if future.cancel():
+                    del under_way[future]
+        done, _ = wait(under_way, _LOOK_S, FIRST_COMPLETED)
+        broken = [task for future in done if not _kept(future, task := under_way.pop(future), crew, keep)]
+        if broken:
+            # All that was under way in a broken pool is lost, and any of it may have broken it.
+            suspects = sorted([*broken, *under_way.values()], key=lambda task: task.name)
+            for future in under_way:
+                future.cancel()
+            under_way.clear()
+            crew.renew()
+            _fly_alone(suspects, crew, keep, stopped)
+
+
+def _fly_alone(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
+    """Fly tasks one after the other, so that it is clear which of them takes its worker with it."""
+    for task in tasks:
+        if stopped():
+            return
+        future = crew.submit(task)
+        wait([future])
+        if not _kept(future, task, crew, keep):
+            if stopped():
+                return  # who asked for the end may have ended the worker too
+            keep(task, task.lost("the worker died, twice"))
+            crew.renew()
+
+
+def _kept(future: Future[Columns], task: Work, crew: Workers, keep: Keep) -> bool:
+    """Keep what came of a task; False if its worker died."""
+    error = future.exception()
+    if error is None:
+        keep(task, future.result())
+    elif crew.broken(error):
+        return False
+    else:
+        raise error
+    return True

@@ -1,0 +1,373 @@
+"""Cells and tasks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from itertools import product
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl import __version__
+from uavctl.config import Config
+from uavctl.config.link import LinkConfig
+from uavctl.errors import DesignError
+from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
+from uavctl.lab.campaign.results import SMPC
+from uavctl.lab.campaign.spec import CHUNK, Campaign
+from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, fly
+from uavctl.lab.trial import NEAR_M, NEARER_M, room_of, usable_seen
+from uavctl.smpc.baselines import PidGains
+from uavctl.smpc.batch import Tally
+
+# The cells of a campaign: the product of its controllers, links, disturbances and plants, in the order given.
+
+
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One combination."""
+
+    index: int  # its number
+    names: tuple[str, str, str, str]  # of controller, link, disturbance and plant
+    kind: str  # kind of the controller
+    setting: Setting  # what its runs meet
+    recipe: Recipe | None  # who flies them; None if there is no such controller
+    refused: str  # why not
+
+
+def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
+    """Make every cell, and each controller's recipe once.
+
+    Args:
+        library_for: Gives the policy library of a design.
+    """
+    recipes = {key: _recipe(campaign, key, library_for) for key in campaign.believed}
+    return tuple(
+        _cell(campaign, index, which, recipes[which[0], campaign.believed_link(*which[:2])])
+        for index, which in enumerate(_product(campaign))
+    )
+
+
+def cell_of(campaign: Campaign, index: int, library_for: LibraryFor) -> Cell:
+    """One cell alone; see `cells_of`."""
+    which = _product(campaign)[index]
+    recipe = _recipe(campaign, (which[0], campaign.believed_link(*which[:2])), library_for)
+    return _cell(campaign, index, which, recipe)
+
+
+Which = tuple[int, int, int, int]  # indices of controller, link, disturbance and plant
+
+
+def _product(campaign: Campaign) -> list[Which]:
+    spec = campaign.spec
+    lists = (spec.controller, spec.link, spec.disturbance, spec.plant)
+    i, j, k, m = (range(len(one)) for one in lists)
+    return list(product(i, j, k, m))
+
+
+def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
+    """The recipe of a controller for the link that it believes in, or why there is none."""
+    try:
+        return recipe_for(campaign.tuned(*key), campaign.believed[key], campaign.spec, library_for)
+    except DesignError as error:
+        return str(error)
+
+
+def _cell(campaign: Campaign, index: int, which: Which, recipe: Recipe | str) -> Cell:
+    i, j, k, m = which
+    spec = campaign.spec
+    controller, link, disturbance, plant = spec.controller[i], spec.link[j], spec.disturbance[k], spec.plant[m]
+    setting = Setting(spec, campaign.base, campaign.flown_plant[m].plant, campaign.flown_link[j].link, disturbance)
+    refused = recipe if isinstance(recipe, str) else _refused(setting)
+    return Cell(
+        index=index,
+        names=(controller.name, link.name, disturbance.name, plant.name),
+        kind=controller.kind,
+        setting=setting,
+        recipe=None if refused or isinstance(recipe, str) else recipe,
+        refused=refused,
+    )
+
+
+def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
+    """What `campaign.json` holds: enough to fly every run again."""
+    spec = campaign.spec
+    return {
+        "version": VERSION,
+        "name": spec.name,
+        "uavctl_version": __version__,
+        "master": spec.master,
+        "runs": spec.runs,
+        "steps": spec.steps,
+        "spec": msgspec.to_builtins(spec),
+        "configuration": campaign.configuration,
+        "cells": [told(cell) for cell in cells],
+    }
+
+
+def told(cell: Cell) -> dict[str, object]:
+    """What `campaign.json` holds of a cell."""
+    recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
+    design = None if recipe is None else recipe.design
+    smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
+    delta_u = None if smpc is None else smpc.delta_u
+    return {
+        "index": cell.index,
+        "controller": controller,
+        "link": link,
+        "disturbance": disturbance,
+        "plant": plant,
+        "kind": cell.kind,
+        "design_id": None if design is None else design.design_id,
+        "library_id": None if recipe is None else recipe.library_id,
+        "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
+        "promised_u": None if delta_u is None else 1.0 - delta_u,
+        "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
+        "link_loss": _plain_loss(cell.setting.link),
+        "usable_room": None if smpc is None or recipe is None else _usable(recipe),
+        "refused": cell.refused,
+    }
+
+
+def _usable(recipe: Recipe) -> float | None:
+    """Share of the room in which a plan may rest; None where a wall is open, or the plant cannot rest anywhere."""
+    try:
+        share = usable_seen(recipe.config, recipe.design)
+    except DesignError:
+        return None
+    return share if math.isfinite(share) else None
+
+
+def _gains(gains: PidGains) -> dict[str, list[float]]:
+    return {field.name: getattr(gains, field.name).tolist() for field in fields(gains)}
+
+
+def _plain_loss(link: LinkConfig) -> float | None:
+    """Loss of a link on which nothing else happens to a position than to be lost, each by itself."""
+    plain = LinkConfig(loss=link.loss)
+    return link.loss if link == plain else None
+
+
+def _refused(setting: Setting) -> str:
+    """Why nothing can fly there, if nothing can."""
+    try:
+        met(setting, 0, 1)
+    except DesignError as error:
+        return str(error)
+    return ""
+
+
+# How runs of the linear world went through the room: to the target, at it, and how near to the walls.
+
+
+Array = NDArray[np.float64]
+
+_AXES = ("north", "east", "down")
+
+
+def ways(config: Config, states: Array) -> dict[str, Array]:
+    """Figures (N,) of runs, by column of the results.
+
+    `near_s` and `nearer_s` are when the target was first that near, infinite if it never was; `hold_rms_m` is of the
+    second half of a run; `beyond_m` is the furthest beyond a wall, negative for the room that was left.
+
+    Args:
+        config: The configuration by which runs are judged: room, target, Δt.
+        states: (N, T+1, n_x).
+    """
+    plant = config.plant
+    index = list(plant.position_index or (3 * i for i in range(len(plant.axes))))
+    axes = [_AXES.index(axis) for axis in plant.axes]
+    where = states[:, :, index]
+    off = np.linalg.norm(where - np.array(config.target.position_m)[axes], axis=2)
+    lower, upper = (side[axes] for side in room_of(config))
+    beyond = np.maximum(lower - where, where - upper).max(axis=(1, 2))
+    return {
+        "near_s": _first_s(off <= NEAR_M, plant.dt_s),
+        "nearer_s": _first_s(off <= NEARER_M, plant.dt_s),
+        "hold_rms_m": np.sqrt(np.square(off[:, off.shape[1] // 2 :]).mean(axis=1)),
+        "beyond_m": beyond,
+    }
+
+
+def _first_s(near: NDArray[np.bool_], dt_s: float) -> Array:
+    """Time of the first step (N,) in which it was so; infinite where it never was."""
+    return np.where(near.any(axis=1), near.argmax(axis=1) * dt_s, np.inf)
+
+
+# A task of a campaign: some runs of one cell, in; a row of figures for each, out. The same wherever it is done.
+
+
+Columns = dict[str, NDArray[np.generic]]
+
+_MET = ("decisions", "infeasible", "slack_used", "fallbacks")
+_WHOLE = ("steps", "state_violations", "input_violations", "saturated", "max_age", *_MET)
+_WAYS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")
+_REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap", *_WAYS)
+_AT_LIMIT = 1e-9
+
+
+class Work(Protocol):
+    """What a worker is given: some runs of a cell, in any world."""
+
+    @property
+    def cell(self) -> int:
+        """Index of the cell."""
+        ...
+
+    @property
+    def runs(self) -> int:
+        """How many."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Names it within its campaign; sorts as the rows do."""
+        ...
+
+    def fly(self) -> Columns:
+        """Fly the runs; what raises is told in a row, and stops nothing."""
+        ...
+
+    def lost(self, error: str) -> Columns:
+        """The rows of runs that all ended without figures."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Runs `first` … `first` + `runs` - 1 of a cell."""
+
+    cell: int
+    first: int
+    runs: int
+    setting: Setting
+    recipe: Recipe
+
+    @property
+    def name(self) -> str:
+        """Names it within its campaign; sorts as the rows do."""
+        return name_of(self.cell, self.first)
+
+    def fly(self) -> Columns:
+        """See `fly_task`."""
+        return fly_task(self)
+
+    def lost(self, error: str) -> Columns:
+        """The rows of a task whose runs all ended without figures."""
+        return _without_figures(self, self.first, self.runs, error)
+
+
+def name_of(cell: int, first: int) -> str:
+    """Name of a task that begins with a run of a cell; sorts as the rows do."""
+    return f"{cell:05d}-{first:08d}"
+
+
+def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:
+    """All tasks of a campaign, in order."""
+    for cell in cells:
+        if cell.recipe is not None:
+            runs = cell.setting.spec.runs
+            for first in range(0, runs, CHUNK):
+                yield Task(cell.index, first, min(CHUNK, runs - first), cell.setting, cell.recipe)
+
+
+def fly_task(task: Task) -> Columns:
+    """Fly the runs of a task at once; if that raises, one by one, and those that raise have its message.
+
+    Returns:
+        Columns as in the results, each with a row a run; `ages` and `outside` are (runs, steps).
+    """
+    try:
+        built(task.recipe)
+    except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
+        return task.lost(told_of(error))
+    try:
+        return _figures(task, task.first, task.runs)
+    except Exception:  # noqa: BLE001 as above
+        rows = [_alone(task, task.first + i) for i in range(task.runs)]
+        return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
+
+def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:
+    """Fly some runs: their trajectories, and what their controller met where it counts that."""
+    controller = built(task.recipe)
+    meets = met(task.setting, first, runs)
+    seen = None
+    if meets.noise is not None:
+        seen = MeasuredPositions(PositionFilter(sight_of(task.recipe.config), meets.known), meets.noise)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told as failed
+        found = fly(meets.scene, controller, meets.newest, meets.disturbances, seen)
+    tally = getattr(controller, "tally", None)
+    return found, tally if isinstance(tally, Tally) else None
+
+
+def _alone(task: Task, run: int) -> Columns:
+    try:
+        return _figures(task, run, 1)
+    except Exception as error:  # noqa: BLE001 as above
+        return _without_figures(task, run, 1, told_of(error))
+
+
+def told_of(error: Exception) -> str:
+    """What ended a run, in words."""
+    return f"{type(error).__name__}: {error}"
+
+
+def _without_figures(task: Task, first: int, runs: int, error: str) -> Columns:
+    columns: Columns = {
+        "cell": np.full(runs, task.cell, dtype=np.int32),
+        "run": np.arange(first, first + runs, dtype=np.int64),
+        "error": np.full(runs, error, dtype=object),
+        "age_sum": np.zeros(runs, dtype=np.int64),
+        **{name: np.zeros((runs, task.setting.spec.steps), dtype=np.int64) for name in ("ages", "outside")},
+    }
+    columns.update({name: np.zeros(runs, dtype=np.int32) for name in _WHOLE})
+    columns.update({name: np.full(runs, np.nan) for name in _REAL})
+    return columns
+
+
+def _figures(task: Task, first: int, runs: int) -> Columns:
+    found, tally = flown(task, first, runs)
+    steps = found.age.shape[1]
+    columns = _without_figures(task, first, runs, "")
+    finite = np.isfinite(found.states).all(axis=(1, 2)) & np.isfinite(found.cost).all(axis=1)
+    good = finite & ~found.failed
+    columns["error"][~good] = "ended in numbers that are not finite"
+    with np.errstate(over="ignore", invalid="ignore"):
+        figures = {
+            "cost": found.cost.sum(axis=1),
+            "settled_cost": found.cost[:, steps // 2 :].mean(axis=1),
+            "mean_square_input": np.square(found.inputs).sum(axis=2).mean(axis=1),
+            "steps": np.full(runs, steps),
+            "state_violations": found.state_violated.sum(axis=1),
+            "input_violations": found.input_violated.sum(axis=1),
+            "saturated": _at_limit(task, found).sum(axis=1),
+            "max_age": found.age.max(axis=1),
+            "age_sum": found.age.sum(axis=1),
+            "outside": found.state_violated,
+            "ages": np.stack([np.bincount(row, minlength=steps) for row in found.age]),
+            **ways(task.setting.base, found.states),
+        }
+    if tally is not None:
+        for name in _MET:
+            figures[name] = getattr(tally, name)
+        figures["largest_gap"] = np.where(tally.decisions > tally.infeasible, tally.largest_gap, np.nan)
+    for name, values in figures.items():
+        columns[name][good] = values[good]
+    return columns
+
+
+def _at_limit(task: Task, found: Flown) -> NDArray[np.bool_]:
+    """Steps in which an input acted at its limit (N, T)."""
+    sets = task.setting.base.sets
+    low, high = np.array(sets.input_lower), np.array(sets.input_upper)
+    near = np.where(np.isfinite(high - low), _AT_LIMIT * (high - low), 0.0)
+    return np.asarray(((found.inputs <= low + near) | (found.inputs >= high - near)).any(axis=2), dtype=np.bool_)

@@ -1,0 +1,495 @@
+"""Campaigns of quadrotor trials; reference of keys."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import product
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Literal, cast
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from msgspec import Meta
+
+from uavctl import __version__
+from uavctl.build.controller import build_controller, design_of
+from uavctl.config import Config, Source, dump_config, load, load_config, parse, presets
+from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section, key_lines, oversized
+from uavctl.config.load import decode, parse_toml
+from uavctl.config.reference import tables
+from uavctl.errors import ConfigError, DesignError, UavctlError
+from uavctl.lab.campaign.controllers import LibraryFor
+from uavctl.lab.campaign.results import DOCUMENT, RUNS
+from uavctl.lab.campaign.spec import (
+    CONFIGURATION,
+    MOST_CELLS,
+    MOST_OF_A_KIND,
+    CampaignSpec,
+    LinkSpec,
+    Name,
+    Overrides,
+    SpecProblems,
+    placed,
+    text_of,
+)
+from uavctl.lab.campaign.tasks import Columns, name_of, told_of
+from uavctl.lab.own_loop import TUNED, OwnTuning
+from uavctl.lab.trial import (
+    AUTOPILOTS,
+    SCENARIOS,
+    Air,
+    AutopilotName,
+    Scenario,
+    TrialCell,
+    TrialFlight,
+    TrialPilot,
+    believed,
+    fly,
+    usable_room,
+)
+from uavctl.smpc.hahn_stursberg.design import Design
+
+# What a campaign in the world of the quadrotor is asked to fly, as its TOML file says it.
+
+
+QUADROTOR = "quadrotor"
+MOST_TRIALS = 100_000
+Rate = Annotated[float, Meta(ge=0.01, le=1000)]
+
+
+class TrialControllerSpec(Section, frozen=True, kw_only=True):
+    """One that flies: a controller of ours, or the vehicle by its own position loop."""
+
+    name: Name
+    kind: Annotated[
+        Literal["smpc", "own-loop"],
+        Meta(description="`smpc`: ours; `own-loop`: the vehicle's own position loop on the same positions"),
+    ]
+    set: Annotated[Overrides, Meta(description="with `smpc`: overrides of the configuration that it is made from")] = ()
+    link: Annotated[
+        Literal["true", "configured"],
+        Meta(description="with `smpc`: the link that it is designed for: the one it flies on, or its configuration's"),
+    ] = "true"
+    tuned: Annotated[
+        bool, Meta(description="with `own-loop`: gains, delay and lead as tuned for preset `room`; else as delivered")
+    ] = False
+
+
+class TrialSpec(Section, frozen=True, kw_only=True):
+    """A campaign of flights of the true quadrotor: every controller in every scenario, each for the same runs."""
+
+    name: Annotated[
+        str,
+        Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", description="name of the campaign; part of its folder's name"),
+    ]
+    world: Annotated[
+        Literal["quadrotor"], Meta(description="`quadrotor`: rigid body, rotors, wind and an autopilot's loops")
+    ]
+    config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
+    set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
+    runs: Annotated[int, Meta(ge=1, le=MOST_TRIALS, description="flights of each cell")] = 20
+    master: Annotated[
+        int, Meta(ge=0, le=LARGEST_SEED, description="seed: flight i's draws come from (master, i), in every cell")
+    ] = 0
+    seconds: Annotated[
+        float, Meta(ge=1, le=3600, description="length of a flight; a figure of eight has its own [s]")
+    ] = 40.0
+    from_s: Annotated[float, Meta(ge=0, le=3600, description="from when on the target is to be held [s]")] = 10.0
+    scenario: Annotated[
+        tuple[Scenario, ...],
+        Meta(
+            min_length=1,
+            max_length=3,
+            description="`hold`: from the start to the target, and hold it; `eight`: three times around a figure of "
+            "eight, 0.76 m/s in the mean and 1.5 m/s at most; `blackout`: `hold` with 4 s without any position",
+        ),
+    ] = SCENARIOS
+    autopilot: Annotated[
+        tuple[AutopilotName, ...], Meta(min_length=1, max_length=2, description="whose behaviour the vehicle shows")
+    ] = AUTOPILOTS
+    rate_hz: Annotated[
+        tuple[Rate, ...],
+        Meta(min_length=1, max_length=MOST_OF_A_KIND, description="positions a second that the cameras give [1/s]"),
+    ] = (5.0, 50.0)
+    air: Annotated[
+        tuple[Air, ...],
+        Meta(
+            min_length=1,
+            max_length=3,
+            description="`calm`, or 0.7 m/s of wind with `gusts` (gust_wind_mps 3) or `strong-gusts` (gust_wind_mps 8)",
+        ),
+    ] = ("gusts",)
+    controller: Annotated[
+        tuple[TrialControllerSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="who flies")
+    ]
+    link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="links")] = (
+        LinkSpec(name="as configured"),
+    )
+
+
+# The reference page of a campaign's keys, made from the types; `make docs` writes it.
+
+
+_HEAD = """# Keys of a campaign
+
+This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
+
+A campaign is a TOML file; `docs/campaigns/` has complete ones, and [campaigns.md](campaigns.md) says how to fly and
+read them. Every `set` is a list of overrides of the flight configuration, as `--set` takes them
+([configuration.md](configuration.md)).
+"""
+_FLIGHTS = """# Keys of a campaign of flights
+
+With `world = "quadrotor"` a campaign flies the true vehicle, and its file has these keys instead.
+"""
+
+
+def campaign_page() -> str:
+    """The whole page, as Markdown."""
+    return "\n".join((_HEAD, *tables(CampaignSpec, ""), _FLIGHTS, *tables(TrialSpec, "")))
+
+
+# The cells of a campaign in the world of the quadrotor, and the tasks that fly them.
+
+
+VERSION = 1
+CHUNK = 5  # flights of a task: a minute or less
+_WHOLE = ("positions",)
+_WORDS = ("mode",)
+REAL = tuple(one.name for one in fields(TrialFlight) if one.name not in ("seed", *_WHOLE, *_WORDS))
+SCHEMA = pa.schema(
+    [
+        ("cell", pa.int32()),
+        ("run", pa.int64()),
+        ("error", pa.string()),
+        ("seed", pa.int64()),
+        *((name, pa.float64()) for name in REAL),
+        *((name, pa.int32()) for name in _WHOLE),
+        *((name, pa.string()) for name in _WORDS),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class TrialPlace:
+    """One combination of a campaign."""
+
+    index: int  # its number
+    cell: TrialCell  # what is flown
+    kind: str  # kind of who flies
+    design_id: str | None  # of the design of ours; None of the vehicle's own loop
+    usable_room: float | None  # share of the room in which ours may rest; None likewise
+    refused: str  # why nobody flies there; empty if somebody does
+
+
+@dataclass(frozen=True)
+class TrialTask:
+    """Flights `first` … `first` + `runs` - 1 of a cell."""
+
+    cell: int
+    first: int
+    runs: int
+    flown: TrialCell
+    seconds: float
+    from_s: float
+    master: int
+
+    @property
+    def name(self) -> str:
+        """Names it within its campaign; sorts as the rows do."""
+        return name_of(self.cell, self.first)
+
+    def fly(self) -> Columns:
+        """Fly; a flight that raises has what ended it in its row, and stops nothing."""
+        rows = []
+        for run in range(self.first, self.first + self.runs):
+            seed = seed_of(self.master, run)
+            try:
+                rows.append((fly(self.flown, seed, seconds=self.seconds, from_s=self.from_s), ""))
+            except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
+                rows.append((TrialFlight(seed), told_of(error)))
+        return self._columns(rows)
+
+    def lost(self, error: str) -> Columns:
+        """The rows of flights that all ended without figures."""
+        return self._columns([(TrialFlight(seed_of(self.master, self.first + i)), error) for i in range(self.runs)])
+
+    def _columns(self, rows: Sequence[tuple[TrialFlight, str]]) -> Columns:
+        columns: Columns = {
+            "cell": np.full(self.runs, self.cell, dtype=np.int32),
+            "run": np.arange(self.first, self.first + self.runs, dtype=np.int64),
+            "error": np.array([error for _, error in rows], dtype=object),
+        }
+        for name in SCHEMA.names:
+            if name not in columns:
+                values = [getattr(flight, name) for flight, _ in rows]
+                columns[name] = np.array(values, dtype=object if name in _WORDS else None)
+        return columns
+
+
+def seed_of(master: int, run: int) -> int:
+    """Seed of a flight: run i has the same in every cell."""
+    return int(np.random.SeedSequence([master, run]).generate_state(1)[0])
+
+
+def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...]:
+    """Every cell of a campaign; what cannot be designed is refused here, and libraries are made.
+
+    Args:
+        library_for: Gives the policy library of a design.
+    """
+    text = dump_config(load_config(spec.config, spec.set))
+    made: dict[Config, tuple[str | None, float | None, str]] = {}
+    axes = (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.link, spec.controller)
+    places = []
+    for index, (scenario, autopilot, rate_hz, air, link, controller) in enumerate(product(*axes)):
+        pilot = _pilot(spec, controller, autopilot, text)
+        cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, _settings(link), air)
+        found: tuple[str | None, float | None, str] = (None, None, "")
+        if pilot.own is None:
+            config = believed(cell)
+            if config not in made:
+                made[config] = _designed(config, library_for)
+            found = made[config]
+        places.append(TrialPlace(index, cell, controller.kind, *found))
+    return tuple(places)
+
+
+def _pilot(spec: TrialSpec, given: TrialControllerSpec, autopilot: AutopilotName, text: str) -> TrialPilot:
+    own = None
+    if given.kind == "own-loop":
+        own = TUNED[autopilot] if given.tuned else OwnTuning()
+    return TrialPilot(given.name, spec.config, given.set, own, given.link == "true", text)
+
+
+def _settings(link: LinkSpec) -> tuple[str, ...]:
+    return tuple(link.set)
+
+
+def _designed(knows: Config, library_for: LibraryFor) -> tuple[str | None, float | None, str]:
+    try:
+        design = design_of(knows)
+        stored = library_for(knows, design) if isinstance(design, Design) else None
+        build_controller(knows, design, None if stored is None else stored.library)
+        return design.design_id, usable_room(knows, design), ""
+    except DesignError as error:
+        return None, None, str(error)
+
+
+def trial_tasks(spec: TrialSpec, places: Sequence[TrialPlace]) -> Iterator[TrialTask]:
+    """All tasks of a campaign, in order."""
+    for place in places:
+        if not place.refused:
+            for first in range(0, spec.runs, CHUNK):
+                runs = min(CHUNK, spec.runs - first)
+                yield TrialTask(place.index, first, runs, place.cell, spec.seconds, spec.from_s, spec.master)
+
+
+def trial_document(spec: TrialSpec, places: Sequence[TrialPlace]) -> dict[str, object]:
+    """What `campaign.json` holds."""
+    return {
+        "version": VERSION,
+        "world": spec.world,
+        "name": spec.name,
+        "uavctl_version": __version__,
+        "master": spec.master,
+        "runs": spec.runs,
+        "spec": msgspec.to_builtins(spec),
+        "configuration": dump_config(load_config(spec.config, spec.set)),
+        "cells": [_told(place) for place in places],
+    }
+
+
+def _told(place: TrialPlace) -> dict[str, object]:
+    cell, own = place.cell, place.cell.pilot.own
+    return {
+        "index": place.index,
+        "controller": cell.pilot.name,
+        "kind": place.kind,
+        "scenario": cell.scenario,
+        "autopilot": cell.autopilot,
+        "rate_hz": cell.rate_hz,
+        "air": cell.air,
+        "link": cell.link_name,
+        "design_id": place.design_id,
+        "usable_room": place.usable_room,
+        "own": None if own is None else {**asdict(own), "gains": dict(own.gains)},
+        "refused": place.refused,
+    }
+
+
+# The file of a campaign in the world of the quadrotor in, its specification out; all problems at once.
+
+
+def is_trial(path: Path) -> bool:
+    """Whether a campaign's file is of flights of the quadrotor.
+
+    Raises:
+        ConfigError: It cannot be read.
+    """
+    return parse_toml(text_of(path), str(path)).get("world") == QUADROTOR
+
+
+def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
+    """The specification of a file, with another number of runs if one is given, and the file's text.
+
+    Its `config` is as `load_config` takes it.
+
+    Raises:
+        ConfigError: With all problems found, one a line: place, key, reason, what to do.
+    """
+    text = text_of(path)
+    table = parse_toml(text, str(path))
+    source = Source(str(path), key_lines(text))
+    found: list[ConfigProblem] = []
+    told = SpecProblems(source)
+    told.tell(oversized(table))
+    if told.problems:
+        raise ConfigError(told.problems)
+    spec = cast("TrialSpec | None", decode(TrialSpec, table, "", found, {}))
+    told.tell(found)
+    if spec is None:
+        raise ConfigError(told.problems)
+    name = spec.config if spec.config in presets() else str(path.parent / spec.config)
+    spec = msgspec.structs.replace(spec, config=name, runs=spec.runs if runs is None else runs)
+    told.tell(_wrong(spec))
+    base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
+    if base is not None:
+        written = dump_config(base)
+        of_controllers = [placed(f"controller[{i}].set", one.set) for i, one in enumerate(spec.controller)]
+        of_links = [placed(f"link[{i}].set", one.set) for i, one in enumerate(spec.link)]
+        for each in (*of_controllers, *of_links):
+            told.load(lambda overrides: parse(written, CONFIGURATION, overrides).config, each)
+    if told.problems:
+        raise ConfigError(told.problems)
+    return spec, text
+
+
+def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
+    for key, names in (
+        ("controller", [one.name for one in spec.controller]),
+        ("link", [one.name for one in spec.link]),
+    ):
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
+    for i, one in enumerate(spec.controller):
+        if one.kind == "own-loop" and (one.set or one.link != "true"):
+            yield ConfigProblem(
+                f"controller[{i}]", "the vehicle's own loop has no design", "leave out `set` and `link`"
+            )
+        if one.kind == "smpc" and one.tuned:
+            yield ConfigProblem(f"controller[{i}].tuned", "is of the vehicle's own loop", "leave it out")
+    for i, link in enumerate(spec.link):
+        for j, text in enumerate(link.set):
+            if not text.startswith("link."):
+                yield ConfigProblem(
+                    f"link[{i}].set[{j}]", f'"{text}" is no key of [link]', "give overrides of [link] alone"
+                )
+    if spec.from_s >= spec.seconds:
+        yield ConfigProblem("from_s", f"{spec.from_s:g} s is not within the flight", "give less than `seconds`")
+    cells = len(spec.scenario) * len(spec.autopilot) * len(spec.rate_hz) * len(spec.air)
+    cells *= len(spec.controller) * len(spec.link)
+    if cells > MOST_CELLS:
+        yield ConfigProblem(
+            "controller", f"there are {cells} cells", f"at most {MOST_CELLS} are flown; take fewer of them"
+        )
+
+
+# What the flights of a campaign in the world of the quadrotor came to.
+
+
+class ToldPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """A cell as `campaign.json` has it."""
+
+    index: int
+    controller: str
+    kind: str
+    scenario: Scenario
+    autopilot: str
+    rate_hz: float
+    air: str
+    link: str
+    refused: str
+    usable_room: float | None = None
+    design_id: str | None = None
+
+
+class ToldTrial(msgspec.Struct, frozen=True, kw_only=True):
+    """A campaign as `campaign.json` has it."""
+
+    name: str
+    world: str
+    uavctl_version: str
+    master: int
+    runs: int
+    cells: list[ToldPlace]
+
+
+class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a cell; null where one says nothing of its scenario, or is infinite."""
+
+    place: ToldPlace
+    runs: int
+    failed: int
+    median: dict[str, float | None]
+    worst: dict[str, float | None]
+    modes: dict[str, int]  # flights that ended in each
+    errors: list[str]
+    values: dict[str, list[float]]
+
+
+def told_trial(folder: Path) -> ToldTrial | None:
+    """What a folder's campaign compared; None if it is of another world, or none at all."""
+    try:
+        told = msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=ToldTrial)
+    except (OSError, msgspec.MsgspecError):
+        return None
+    return told if told.world == QUADROTOR else None
+
+
+def summarise_trial(folder: Path) -> tuple[ToldTrial, list[TrialSummary]]:
+    """The figures of every cell of a campaign.
+
+    Raises:
+        UavctlError: The folder has no results that can be read.
+    """
+    told = told_trial(folder)
+    if told is None:
+        raise UavctlError(f"{folder} holds no campaign of flights; give the folder of one")
+    try:
+        table = pq.read_table(folder / RUNS)
+        return told, [_summary(table, place) for place in told.cells]
+    except (OSError, pa.ArrowException, KeyError) as error:
+        raise UavctlError(f"{folder / RUNS}: cannot be read ({error}); go on with --resume") from error
+
+
+def _summary(table: pa.Table, place: ToldPlace) -> TrialSummary:
+    cells = table["cell"].to_numpy()
+    first, last = np.searchsorted(cells, [place.index, place.index + 1])
+    rows = table.slice(first, last - first)
+    errors = rows["error"].to_pylist()
+    good = [i for i, error in enumerate(errors) if not error]
+    columns = {name: rows[name].to_pylist() for name in (*REAL, "mode")}
+    values = {name: [float(columns[name][i]) for i in good] for name in REAL}
+    modes = Counter(columns["mode"][i] for i in good)
+    return TrialSummary(
+        place=place,
+        runs=len(errors),
+        failed=len(errors) - len(good),
+        median={name: _finite(median(found)) if found else None for name, found in values.items()},
+        worst={name: _finite(max(found)) if found else None for name, found in values.items()},
+        modes=dict(modes),
+        errors=[error for error in dict.fromkeys(errors) if error],
+        values=values,
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

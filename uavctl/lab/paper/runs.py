@@ -1,0 +1,418 @@
+"""Runs of the example, in chunks; their totals."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import reduce
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from uavctl.build.controller import build_plant, build_problem, start_state
+from uavctl.config import Config
+from uavctl.errors import UavctlError
+from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions, OneByOne
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
+from uavctl.smpc.plant import Plant
+from uavctl.smpc.sets import Polytope
+
+# Runs of the paper's example in memory: who flies, what is flown, and the runs of one chunk.
+
+
+Array = NDArray[np.float64]
+
+# The QPs' rounding; far below anything that a plan would miss its end by.
+_MISS = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What flies: a configuration, its design, and the design's policy library."""
+
+    config: Config
+    design: Design
+    library: Library
+
+
+class Watched:
+    """A decider whose plans are held against (19c): the last mean state is the target.
+
+    Attributes:
+        missed: Plans so far that end elsewhere.
+    """
+
+    def __init__(self, decider: Decider, design: Design) -> None:
+        a, b, steps = design.plant.a, design.plant.b, design.horizon
+        self._decider, self._target = decider, design.target
+        self._of_x = np.linalg.matrix_power(a, steps)
+        self._of_inputs = np.hstack([np.linalg.matrix_power(a, steps - 1 - t) @ b for t in range(steps)])
+        self.missed = 0
+
+    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
+        """See `Decider`."""
+        plans = self._decider.decide(x, late, cov)
+        end = x @ self._of_x.T + plans.inputs.reshape(len(x), -1) @ self._of_inputs.T
+        away = (np.abs(end - self._target) > _MISS).any(axis=1)
+        self.missed += int((away & plans.solved).sum())
+        return plans
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Runs that were flown together, and what the SMPC met."""
+
+    flown: Flown  # the runs
+    decisions: int  # plans asked for
+    infeasible: int  # those that were not found
+    slack_used: int  # plans that leave a state row
+    missed: int  # plans that do not end in the target
+    fallbacks: int  # steps without a plan
+    largest_gap: float  # largest certified relative gap
+
+
+class ChunkRunner:
+    """Flies chunks of one design's runs."""
+
+    def __init__(self, setup: Setup, *, many: bool) -> None:
+        """Args: what flies; whether so much is flown that tables of answers are worth their seconds."""
+        config, design = setup.config, setup.design
+        self._setup = setup
+        solver = LibrarySolver(design, setup.library, exact=config.solver.exact)
+        decider: Decider
+        if many:
+            decider = ExplicitDecider(design, setup.library, solver, design.target)
+        else:
+            decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+        self._watched = Watched(decider, design)
+        self._smpc = BatchSmpc(
+            self._watched, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
+        )
+
+    def fly(self, seed: int, first: int, runs: int, steps: int) -> Chunk:
+        """The runs `first` … `first` + `runs` - 1 of a seed, whatever else is flown."""
+        self._watched.missed = 0
+        flown = fly_runs(self._setup, self._smpc, seed, range(first, first + runs), steps)
+        tally = self._smpc.tally
+        return Chunk(
+            flown=flown,
+            decisions=int(tally.decisions.sum()),
+            infeasible=int(tally.infeasible.sum()),
+            slack_used=int(tally.slack_used.sum()),
+            missed=self._watched.missed,
+            fallbacks=int(tally.fallbacks.sum()),
+            largest_gap=float(tally.largest_gap.max(initial=0.0)),
+        )
+
+
+def fly_runs(
+    setup: Setup, controller: BatchController, seed: int, runs: range, steps: int, input_set: Polytope | None = None
+) -> Flown:
+    """Runs of a seed under any controller.
+
+    Args:
+        input_set: The actuators' limits; those of the configuration if it is not given.
+    """
+    config, problem = setup.config, build_problem(setup.config)
+    plant = problem.plant
+    chances = draw(seed, runs.start, len(runs), steps, plant.n_w)
+    scene = Scene(
+        plant=plant,
+        state_set=problem.state_set,
+        input_set=input_set or problem.input_set,
+        q_x=problem.q_x,
+        q_u=problem.q_u,
+        target=problem.target,
+        u_target=problem.u_target,
+        start=np.tile(start_state(config, plant), (len(runs), 1)),
+    )
+    disturbances = chances.normal @ np.linalg.cholesky(plant.w).T
+    return fly(scene, controller, newest(config.link, config.plant.dt_s, chances.link), disturbances)
+
+
+def planes(plant: Plant) -> Sequence[tuple[int, int]]:
+    """State indices (position, velocity) of each axis."""
+    return list(zip(plant.position_index, plant.velocity_index, strict=True))
+
+
+# What many runs come to, chunk by chunk: sums, counts and extremes, never the runs themselves.
+
+
+Counts = NDArray[np.intp]
+
+LIKELIHOOD = 0.95  # of the ellipsoid that the paper draws
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean and sum of squared deviations of a figure; sums are those of all values together (Chan et al.)."""
+
+    count: int
+    mean: float
+    squares: float
+
+    @classmethod
+    def of(cls, values: Array) -> Moments:
+        """Of values (N,)."""
+        mean = float(values.mean())
+        return cls(values.size, mean, float(((values - mean) ** 2).sum()))
+
+    def __add__(self, other: Moments) -> Moments:
+        count, apart = self.count + other.count, other.mean - self.mean
+        return Moments(
+            count,
+            self.mean + apart * other.count / count,
+            self.squares + other.squares + apart**2 * self.count * other.count / count,
+        )
+
+    @property
+    def stderr(self) -> float:
+        """Standard error of the mean; infinite for a single value."""
+        return float(np.sqrt(self.squares / (self.count - 1) / self.count)) if self.count > 1 else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """Totals of runs of T steps; *settled* is the second half of a run.
+
+    Attributes:
+        cost: Summed cost of a run.
+        settled_cost: Mean stage cost of a run's settled steps.
+        trend: Mean stage cost of a run's last quarter minus that of the quarter before.
+        runs_outside: Runs that left X.
+        runs_asking: Runs in which an input outside U was asked for.
+        failed: Runs that ended in numbers that are not finite.
+        decisions, infeasible, slack_used, missed, fallbacks: See `Chunk`.
+        outside: Runs outside X after each step (T,).
+        asking: Runs that ask for an input outside U, in each step (T,).
+        ages: Runs of each age in each step (T, T).
+        arrived: Runs by the first step in which they were in the ellipsoid (T+2,); the last entry: never.
+        ended_inside: Runs whose last state is in the ellipsoid.
+        settled_inside: Settled states in the ellipsoid.
+        settled: Number of settled states.
+        settled_sum: Their sum (n_x,).
+        settled_squares: Sum of their outer products (n_x, n_x).
+        largest_gap: Largest certified relative gap of a plan.
+        closest: Least room to each state limit (m_x,), negated so that the largest is the closest.
+    """
+
+    cost: Moments
+    settled_cost: Moments
+    trend: Moments
+    runs_outside: int
+    runs_asking: int
+    failed: int
+    decisions: int
+    infeasible: int
+    slack_used: int
+    missed: int
+    fallbacks: int
+    outside: Counts
+    asking: Counts
+    ages: Counts
+    arrived: Counts
+    ended_inside: int
+    settled_inside: int
+    settled: int
+    settled_sum: Array
+    settled_squares: Array
+    largest_gap: float
+    closest: Array
+
+    def __add__(self, other: Totals) -> Totals:
+        def joined(name: str) -> Any:
+            one, more = getattr(self, name), getattr(other, name)
+            if name in _EXTREMES:
+                return np.maximum(one, more) if isinstance(one, np.ndarray) else max(one, more)
+            return one + more
+
+        return Totals(**{field.name: joined(field.name) for field in fields(self)})
+
+
+_EXTREMES = ("largest_gap", "closest")
+
+
+def total(chunk: Chunk, design: Design) -> Totals:
+    """Totals of one chunk."""
+    flown = chunk.flown
+    (runs, steps), half = flown.age.shape, flown.age.shape[1] // 2
+    settled = flown.states[:, half:].reshape(-1, design.plant.n_x)
+    inside = in_ellipsoid(flown.states, design)
+    late = (half + steps) // 2
+    ages = np.zeros((steps, steps), dtype=np.intp)
+    np.add.at(ages, (np.broadcast_to(np.arange(steps), flown.age.shape), flown.age), 1)
+    return Totals(
+        cost=Moments.of(flown.cost.sum(axis=1)),
+        settled_cost=Moments.of(flown.cost[:, half:].mean(axis=1)),
+        trend=Moments.of(flown.cost[:, late:].mean(axis=1) - flown.cost[:, half : max(late, half + 1)].mean(axis=1)),
+        runs_outside=int(flown.state_violated.any(axis=1).sum()),
+        runs_asking=int(flown.input_violated.any(axis=1).sum()),
+        failed=int(flown.failed.sum()),
+        decisions=chunk.decisions,
+        infeasible=chunk.infeasible,
+        slack_used=chunk.slack_used,
+        missed=chunk.missed,
+        fallbacks=chunk.fallbacks,
+        outside=flown.state_violated.sum(axis=0),
+        asking=flown.input_violated.sum(axis=0),
+        ages=ages,
+        arrived=np.bincount(np.where(inside.any(axis=1), inside.argmax(axis=1), steps + 1), minlength=steps + 2),
+        ended_inside=int(inside[:, -1].sum()),
+        settled_inside=int(inside[:, half:].sum()),
+        settled=len(settled),
+        settled_sum=settled.sum(axis=0),
+        settled_squares=settled.T @ settled,
+        largest_gap=chunk.largest_gap,
+        closest=(flown.states[:, 1:] @ design.state_set.c.T - design.state_set.b).reshape(runs * steps, -1).max(axis=0),
+    )
+
+
+def together(parts: list[Totals]) -> Totals:
+    """Totals of all parts, added in their order."""
+    return reduce(Totals.__add__, parts)
+
+
+def ellipsoid_scale(design: Design) -> float:
+    """Factor of Σ in the 95 % ellipsoid of a single state: the χ² quantile with n_x degrees of freedom."""
+    return float(2.0 * gammaincinv(0.5 * design.plant.n_x, LIKELIHOOD))
+
+
+def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
+    """Which states (…, n_x) are in the 95 % ellipsoid of Σ_ξ, that is of its block of a single state."""
+    root = np.linalg.cholesky(design.terminal.sigma_x)
+    whitened = np.linalg.solve(root, (states - design.target).reshape(-1, design.plant.n_x).T)
+    distance: Array = (whitened**2).sum(axis=0).reshape(states.shape[:-1])
+    return distance <= ellipsoid_scale(design)
+
+
+# The runs of Section 5: in this process where they are few, else in chunks over worker processes.
+
+
+Advance = Callable[[int], None]
+
+CHUNK = 1000  # runs flown together; the same whoever flies them, so that workers change nothing
+HERE_UP_TO = 500  # runs that are not worth another process, nor tables
+DRAWN = 200  # runs whose trajectories are kept, for the figures
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True, eq=False)
+class Flights:
+    """What the runs of one design came to."""
+
+    totals: Totals  # over all runs
+    drawn: Array  # trajectories (at most 200, T+1, n_x) of the first runs
+
+
+@dataclass(frozen=True)
+class ChunkTask:
+    """One chunk: runs `first` … `first` + `runs` - 1 of the design `which`."""
+
+    which: int
+    seed: int
+    first: int
+    runs: int
+    steps: int
+
+
+def fly_all(setups: Sequence[Setup], runs: int, steps: int, seed: int, workers: int, advance: Advance) -> list[Flights]:
+    """Fly the same runs with each design.
+
+    Args:
+        runs: N; run i is the same whatever N is.
+        workers: Processes; they change no figure.
+        advance: Told the number of runs done since it was told last.
+
+    Raises:
+        UavctlError: A worker process ended.
+    """
+    tasks = [
+        ChunkTask(which, seed, first, min(CHUNK, runs - first), steps)
+        for which in range(len(setups))
+        for first in range(0, runs, CHUNK)
+    ]
+    results = []
+    with _flier(setups, runs, workers) as flown:
+        for task, result in zip(tasks, flown(tasks), strict=True):
+            results.append(result)
+            advance(task.runs)
+    by_design = [
+        [result for task, result in zip(tasks, results, strict=True) if task.which == which]
+        for which in range(len(setups))
+    ]
+    return [Flights(together([part.totals for part in parts]), parts[0].drawn) for parts in by_design]
+
+
+@contextmanager
+def _flier(
+    setups: Sequence[Setup], runs: int, workers: int
+) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
+    """Maps tasks to their results, in order."""
+    if runs <= HERE_UP_TO:
+        crew = RunnerOfDesign(setups, many=False)
+        yield lambda tasks: map(crew.fly, tasks)
+        return
+    with _single_threaded(), TemporaryDirectory() as folder:
+        # Not as an argument: a process that ends while it is being sent more than a pipe holds would be waited for.
+        path = Path(folder) / "setups"
+        path.write_bytes(pickle.dumps(list(setups)))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _join, (path,))
+        try:
+            yield lambda tasks: pool.map(_fly, tasks)
+        except BrokenProcessPool as error:
+            raise UavctlError("a worker process ended before its runs; take fewer --workers, or free memory") from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Processes started here calculate in one thread: as many would only wait for each other, and round differently."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+class RunnerOfDesign:
+    """One pilot a design."""
+
+    def __init__(self, setups: Sequence[Setup], *, many: bool) -> None:
+        self._designs = [setup.design for setup in setups]
+        self._pilots = [ChunkRunner(setup, many=many) for setup in setups]
+
+    def fly(self, task: ChunkTask) -> Flights:
+        """The runs of one task; those of the first one are kept for the figures."""
+        chunk = self._pilots[task.which].fly(task.seed, task.first, task.runs, task.steps)
+        kept = 0 if task.first else DRAWN
+        return Flights(total(chunk, self._designs[task.which]), chunk.flown.states[:kept].copy())
+
+
+_crew: list[RunnerOfDesign] = []  # of a worker process
+
+
+def _join(path: Path) -> None:
+    _crew.append(RunnerOfDesign(pickle.loads(path.read_bytes()), many=True))
+
+
+def _fly(task: ChunkTask) -> Flights:
+    return _crew[0].fly(task)

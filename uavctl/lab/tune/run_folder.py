@@ -1,0 +1,347 @@
+"""The folder of a tuning run: what was asked for, how far it has come, and where its files are.
+
+Every step writes its files first and its note last, so a run that was cut off goes on after the last one that is
+whole.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from logs.recording.flight import FlightData
+from logs.recording.outputs import write_whole
+from uavctl.config import Config
+from uavctl.config.load import dump_config, parse
+from uavctl.errors import UsageError
+from uavctl.lab.tune.change import PredictionErrors, TunedResult
+from uavctl.lab.tune.excitation import SETTLES_S, SafeBox
+from uavctl.records import ControlMode
+
+# Two flights of the same mission, before and after: how well the place was held, and how well plans came true.
+
+
+Array = NDArray[np.float64]
+
+PLANNED_AHEAD_S = 0.5  # so much later a plan is compared with what became of it
+LEAST_HOLD_S = 2.0
+_SAME_M = 1e-6
+
+
+class TunedFlight(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one of the two flights; None where it shows nothing of it."""
+
+    recording: str
+    judged_by: str  # "truth" where the simulator told it, else "estimate"
+    flown_s: float
+    hold_s: float  # that count
+    hold_rms_m: float | None  # distance from the last place, three axes together
+    hold_max_m: float | None
+    plan_rms_m: float | None  # distance from where the plan of PLANNED_AHEAD_S before had the vehicle
+    beyond_box_m: float | None  # furthest outside of the box; negative is the room that was left; None without a box
+    fallbacks: int
+
+
+class TuneComparison(msgspec.Struct, frozen=True, kw_only=True):
+    """Both flights, and both models on the second one, which neither was fitted to."""
+
+    before: TunedFlight
+    after: TunedFlight
+    old_errors: PredictionErrors
+    new_errors: PredictionErrors
+
+
+def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox | None) -> TunedFlight:
+    """Figures of a flight.
+
+    Args:
+        fallbacks: Entries into braking, holding or landing that nobody wanted.
+        box: Where it was to stay; None where nothing was said.
+    """
+    steps = flight.steps
+    held = holding(flight)
+    distances = np.linalg.norm((steps.state - steps.target)[:, list(flight.design.position_index)], axis=1)[held]
+    hold_s = float(np.count_nonzero(held)) * flight.design.dt_s
+    enough = hold_s >= LEAST_HOLD_S
+    planned = plan_errors_m(flight)
+    return TunedFlight(
+        recording=recording,
+        judged_by="truth" if steps.from_truth else "estimate",
+        flown_s=round(len(steps) * flight.design.dt_s, 6),
+        hold_s=round(hold_s, 6),
+        hold_rms_m=_rms(distances) if enough else None,
+        hold_max_m=float(distances.max()) if enough else None,
+        plan_rms_m=_rms(planned) if len(planned) else None,
+        beyond_box_m=None if box is None else _beyond(flight, box),
+        fallbacks=fallbacks,
+    )
+
+
+def last_place(flight: FlightData) -> tuple[NDArray[np.bool_], float]:
+    """Which steps were flown to the last place of the mission by plans (n,), and since when that was the place [s]."""
+    steps = flight.steps
+    tracked = np.array([d.mode is ControlMode.TRACK for d in steps.decisions], dtype=np.bool_)
+    if not tracked.any():
+        return tracked, math.inf
+    index = list(flight.design.position_index)
+    last = steps.target[np.flatnonzero(tracked)[-1]][index]
+    there = np.linalg.norm(steps.target[:, index] - last, axis=1) <= _SAME_M
+    moved = np.flatnonzero(tracked & ~there)
+    begin = int(moved[-1]) + 1 if len(moved) else int(np.flatnonzero(tracked)[0])
+    chosen = tracked & there & (np.arange(len(tracked)) >= begin)
+    return chosen, float(steps.t_s[begin])
+
+
+def holding(flight: FlightData) -> NDArray[np.bool_]:
+    """Steps (n,) at which the last place was held: from `SETTLES_S` after it became the place to fly to."""
+    chosen, since_s = last_place(flight)
+    return np.asarray(chosen & (flight.steps.t_s >= since_s + SETTLES_S), dtype=np.bool_)
+
+
+def plan_errors_m(flight: FlightData) -> Array:
+    """Distance between where plans had the vehicle `PLANNED_AHEAD_S` later and where it was then (n,) [m]."""
+    steps, index = flight.steps, list(flight.design.position_index)
+    ahead = max(1, round(PLANNED_AHEAD_S / flight.design.dt_s))
+    dt_ns = flight.design.dt_ns
+    known_ns = np.array([d.at_ns for d in steps.decisions], dtype=np.int64)
+    wrong = []
+    for plan in flight.flown_plans.values():
+        if ahead >= len(plan.states):
+            continue
+        place = int(np.searchsorted(known_ns, plan.base_ns + ahead * dt_ns))
+        near = [one for one in (place - 1, place) if 0 <= one < len(known_ns)]
+        if len(near) < 2:
+            continue
+        left, right = near
+        span = int(known_ns[right] - known_ns[left])
+        if span > 2 * dt_ns:
+            continue  # nobody flew by plans in between
+        share = (plan.base_ns + ahead * dt_ns - int(known_ns[left])) / span
+        was = (1.0 - share) * steps.state[left][index] + share * steps.state[right][index]
+        wrong.append(float(np.linalg.norm(was - np.array(plan.states[ahead])[index])))
+    return np.array(wrong)
+
+
+def _beyond(flight: FlightData, box: SafeBox) -> float | None:
+    """Furthest outside of the box at a step flown by plans [m]."""
+    steps = flight.steps
+    tracked = [place for place, d in enumerate(steps.decisions) if d.mode is ControlMode.TRACK]
+    if not tracked:
+        return None
+    positions = steps.state[tracked][:, list(flight.design.position_index)]
+    axes = [("north", "east", "down").index(axis) for axis in flight.design.axes]
+    lower, upper = np.array(box.lower)[axes], np.array(box.upper)[axes]
+    return float(np.maximum(lower - positions, positions - upper).max())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+STATE, SETTINGS, TUNED, PAGE, FIT_PAGE = "tune.json", "configuration.toml", "tuned.toml", "tune.html", "identified.html"
+BEFORE, AFTER = "before", "after"  # folders of the flights; later attempts have numbers
+_MOST_TOLD = 5
+
+
+class TuneAsked(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run is of; it may not change between two calls."""
+
+    box: str  # as it was understood; empty without one
+    flight: str  # the recording that is begun with; empty where one is flown
+    simulated: bool
+    take_off_m: float | None
+
+
+class TuneProgress(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a run has come."""
+
+    asked: TuneAsked
+    digest: str  # of the configuration
+    before: str = ""  # recording of the excitation, once it is whole; relative to the folder if inside
+    tuned: TunedResult | None = None
+    after: str = ""  # recording of the flight with the tuned configuration
+    comparison: TuneComparison | None = None
+
+
+class TuneFolder:
+    """A run on disk.
+
+    Attributes:
+        path: The folder.
+        progress: How far the run has come.
+    """
+
+    def __init__(self, path: Path, progress: TuneProgress) -> None:
+        self.path = path
+        self.progress = progress
+
+    @classmethod
+    def opened(cls, path: Path, config: Config, asked: TuneAsked) -> TuneFolder:
+        """Begin a run, or go on with the one that is there.
+
+        Raises:
+            UsageError: The folder holds something else, or a run of another configuration.
+        """
+        text = dump_config(config)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        if not (path / STATE).exists():
+            if path.exists() and (not path.is_dir() or any(map(_is_anothers, path.iterdir()))):
+                raise UsageError(f"--folder {path}: is no run of `uavctl tune`, and not empty; choose another folder")
+            path.mkdir(parents=True, exist_ok=True)
+            folder = cls(path, TuneProgress(asked=asked, digest=digest))
+            folder.note()
+            write_whole(path / SETTINGS, text)
+            return folder
+        progress = _read(path / STATE)
+        if progress.digest != digest:
+            told = "; ".join(_differences(path / SETTINGS, text)) or "other values"
+            raise UsageError(
+                f"--folder {path}: is a run of another configuration ({told}). Give that one to go on, or choose "
+                "another folder"
+            )
+        if progress.asked != asked:
+            told = ", ".join(_asked_otherwise(progress.asked, asked))
+            raise UsageError(
+                f"--folder {path}: is a run that was begun with {told}. Go on with the same, or choose another folder"
+            )
+        folder = cls(path, progress)
+        if not (path / SETTINGS).exists():
+            write_whole(path / SETTINGS, text)
+        if progress.comparison is None:
+            folder.note()  # a folder that takes no more is told before anything is flown
+        return folder
+
+    def note(self, **done: object) -> None:
+        """Write down that a step is done.
+
+        Raises:
+            RecordingError: It cannot be written.
+        """
+        self.progress = msgspec.structs.replace(self.progress, **done)
+        write_whole(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
+
+    def free(self, name: str) -> Path:
+        """A folder for one more flight: the first of NAME, NAME-2, NAME-3, … that is not there yet."""
+        return self._attempts(name)[1]
+
+    def newest(self, name: str) -> Path | None:
+        """The folder of the newest attempt at a flight; None before the first."""
+        return self._attempts(name)[0]
+
+    def _attempts(self, name: str) -> tuple[Path | None, Path]:
+        newest, number = None, 1
+        while (found := self.path / (name if number == 1 else f"{name}-{number}")).exists():
+            newest, number = found, number + 1
+        return newest, found
+
+    def recording(self, noted: str) -> Path:
+        """Path of a recording that the progress names."""
+        return self.path / noted  # an absolute one stays what it is
+
+    def relative(self, recording: Path) -> str:
+        """How the progress names a recording: so that the folder may be moved."""
+        try:
+            return str(recording.relative_to(self.path))
+        except ValueError:
+            return str(recording.absolute())
+
+
+@contextmanager
+def sole_run(path: Path) -> Iterator[None]:
+    """Hold the folder of a run, which is made if there is none; the kernel lets go of it when its holder ends.
+
+    Raises:
+        UsageError: Another process has it, or it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise UsageError(f"--folder {path}: no folder can be had there ({error.strerror}); choose another") from error
+    try:
+        _lock(descriptor, path)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"--folder {path}: another `uavctl tune` is at work in it; wait for it, or end it") from None
+
+
+def read_tuned(path: Path) -> Config:
+    """The tuned configuration, as it was written or as its owner has changed it since.
+
+    Raises:
+        UsageError: It was cut: what it lacks would be a preset's, and nobody has seen that fly.
+        ConfigError: It is wrong.
+    """
+    text = path.read_text(encoding="utf-8")
+    config = parse(text, str(path)).config
+    there = dict(_dotted(tomllib.loads(text), ""))
+    lacking = [key for key, _ in _dotted(tomllib.loads(dump_config(config)), "") if key not in there]
+    if lacking:
+        more = f" and {len(lacking) - 1} more keys" if len(lacking) > 1 else ""
+        raise UsageError(
+            f"{path}: is not whole, {lacking[0]}{more} are missing; put them back, or remove the file: the same "
+            "command then writes it anew"
+        )
+    return config
+
+
+def _is_anothers(path: Path) -> bool:
+    """Whether a file is none of a run that was cut off while it wrote its first one."""
+    return path.name != f"{STATE}.part"
+
+
+def _read(path: Path) -> TuneProgress:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=TuneProgress)
+    except (OSError, msgspec.DecodeError) as error:
+        raise UsageError(f"{path}: cannot be read ({error}); choose another --folder") from error
+
+
+def _differences(settings: Path, text: str) -> Iterator[str]:
+    """The first keys in which two configurations differ, with both values."""
+    try:
+        old = dict(_dotted(tomllib.loads(settings.read_text(encoding="utf-8")), ""))
+    except (OSError, tomllib.TOMLDecodeError):
+        return
+    new = dict(_dotted(tomllib.loads(text), ""))
+    keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
+    for key in keys[:_MOST_TOLD]:
+        yield f"{key} = {old.get(key)} there, {new.get(key)} here"
+    if len(keys) > _MOST_TOLD:
+        yield f"{len(keys) - _MOST_TOLD} more"
+
+
+def _dotted(table: Mapping[str, object], path: str) -> Iterator[tuple[str, object]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+def _asked_otherwise(there: TuneAsked, here: TuneAsked) -> Iterator[str]:
+    if there.box != here.box:
+        yield f"--box={there.box}" if there.box else "no --box"
+    if there.flight != here.flight:
+        yield f"--flight {there.flight}" if there.flight else "no --flight"
+    if there.simulated != here.simulated:
+        yield "--loopback" if there.simulated else "a real vehicle"
+    if there.take_off_m != here.take_off_m:
+        yield "no --arm" if there.take_off_m is None else f"--arm --takeoff {there.take_off_m:g}"

@@ -1,0 +1,113 @@
+"""Flight modes by name and by number, and how each autopilot takes off, flies setpoints and lands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+# PX4: custom_mode is reserved (16 bits), main mode (8), sub mode (8); src/modules/commander/px4_custom_mode.h
+_PX4_MAIN = {
+    1: "MANUAL",
+    2: "ALTCTL",
+    3: "POSCTL",
+    4: "AUTO",
+    5: "ACRO",
+    6: "OFFBOARD",
+    7: "STABILIZED",
+    8: "RATTITUDE",
+    9: "SIMPLE",
+    10: "TERMINATION",
+}
+_PX4_AUTO = {
+    1: "READY",
+    2: "TAKEOFF",
+    3: "LOITER",
+    4: "MISSION",
+    5: "RTL",
+    6: "LAND",
+    8: "FOLLOW_TARGET",
+    9: "PRECLAND",
+}
+_COPTER_TYPES = frozenset(
+    {
+        mavlink.MAV_TYPE_QUADROTOR,
+        mavlink.MAV_TYPE_COAXIAL,
+        mavlink.MAV_TYPE_HELICOPTER,
+        mavlink.MAV_TYPE_HEXAROTOR,
+        mavlink.MAV_TYPE_OCTOROTOR,
+        mavlink.MAV_TYPE_TRICOPTER,
+        mavlink.MAV_TYPE_DODECAROTOR,
+        mavlink.MAV_TYPE_DECAROTOR,
+    }
+)
+# ArduCopter: enum COPTER_MODE
+_COPTER = {
+    int(getattr(mavlink, name)): name.removeprefix("COPTER_MODE_")
+    for name in dir(mavlink)
+    if name.startswith("COPTER_MODE_") and name != "COPTER_MODE_ENUM_END"
+}
+
+
+@dataclass(frozen=True)
+class AutopilotProfile:
+    """How one autopilot gets into the air and out of it, by its own names of modes."""
+
+    external: str  # the mode that takes our setpoints
+    take_off: str  # the mode that take-off begins in, asked for on the ground
+    climbing: frozenset[str]  # modes that it is in during its own climb and right after
+    landing: frozenset[str]  # modes in which it lands by itself
+    failsafes: frozenset[str]  # modes that its own failsafes choose
+    returns: bool  # A failsafe that ends gives back the mode of before; else its mode stays
+    # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
+    # the place of arming
+    climbs_on_arming: bool
+    modes: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
+
+
+HABITS = {
+    # Recorded: AUTO.TAKEOFF is given on the ground, arming starts the climb to MIS_TAKEOFF_ALT, then it holds.
+    "px4": AutopilotProfile(
+        external="OFFBOARD",
+        take_off="AUTO.TAKEOFF",
+        climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
+        landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND"}),
+        failsafes=frozenset({"AUTO.LAND", "AUTO.LOITER", "AUTO.RTL"}),
+        returns=True,
+        climbs_on_arming=True,
+        modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
+    ),
+    # It climbs in GUIDED; a setpoint would end the climb.
+    "ardupilot": AutopilotProfile(
+        external="GUIDED",
+        take_off="GUIDED",
+        climbing=frozenset({"GUIDED"}),
+        landing=frozenset({"LAND"}),
+        failsafes=frozenset({"LAND", "RTL", "SMART_RTL", "BRAKE"}),
+        returns=False,
+        climbs_on_arming=False,
+        modes={"GUIDED": (4, 0)},
+    ),
+}
+
+
+def autopilot_name(autopilot: int) -> str:
+    """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
+    names = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
+    return names.get(autopilot, "unknown")
+
+
+def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
+    """A mode by the autopilot's own name, and whether it takes our setpoints.
+
+    Numbers mean something else on every autopilot, and on ArduPilot on every kind of vehicle; what is
+    not known here never counts as external.
+    """
+    if autopilot == "px4":
+        main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+        name = _PX4_MAIN.get(main, f"MODE_{main}")
+        return (f"AUTO.{_PX4_AUTO.get(sub, sub)}" if name == "AUTO" else name), name == "OFFBOARD"
+    if autopilot == "ardupilot" and vehicle_type in _COPTER_TYPES:
+        name = _COPTER.get(custom_mode, f"MODE_{custom_mode}")
+        return name, name == "GUIDED"
+    return f"MODE_{custom_mode}", False

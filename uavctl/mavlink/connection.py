@@ -1,0 +1,515 @@
+"""One connection sans IO; stream requests."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from statistics import median
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
+from uavctl.frames import Quaternion
+from uavctl.mavlink.autopilots import HABITS
+from uavctl.mavlink.clocksync import ClockSource, RoundTrips
+from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.framing import BadBytes
+from uavctl.mavlink.messages import (
+    Ack,
+    Attitude,
+    Battery,
+    GlobalOrigin,
+    Inertial,
+    Landed,
+    Message,
+    ParamValue,
+    Position,
+    Text,
+    TimeSync,
+)
+from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
+from uavctl.mavlink.relay import Relay
+from uavctl.mavlink.requests import COMMANDS, RequestKind
+from uavctl.mavlink.vehicle import SECOND_VEHICLE, Joiner, VehicleWatch
+from uavctl.records import (
+    Event,
+    InertialSample,
+    LinkStats,
+    PositionSample,
+    Setpoint,
+    Severity,
+    Vec3,
+    VehicleMotion,
+    VehicleStatus,
+)
+
+# What a real vehicle has to be asked for, or told, before it can be flown: its streams, and a place on the globe.
+
+
+SECOND_NS = 1_000_000_000
+SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
+AGAIN_NS = 2 * SECOND_NS
+TRIES = 5
+ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
+
+LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
+ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
+GPS_GLOBAL_ORIGIN = 49
+RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0}
+
+# What turns and what shows the acceleration, as each autopilot has it.
+INERTIAL_HZ = 50.0
+INERTIAL = {"px4": (ATTITUDE_QUATERNION, HIGHRES_IMU), "ardupilot": (ATTITUDE, RAW_IMU)}
+
+SOURCE_PARAMETER = "EK3_SRC1_POSXY"
+EXTERNAL = 6.0  # of the source: external positions
+
+
+class Streams:
+    """Asks for the messages that do not come by themselves, a few times.
+
+    Args:
+        inertial: ask for the vehicle's inertial data, too.
+    """
+
+    def __init__(self, *, inertial: bool = False) -> None:
+        self._inertial = inertial
+        self._feels = False  # inertial data have come since they were asked for
+        self._seen: set[int] = set()
+        self._next_ns: int | None = None
+        self._tries = 0
+        self._felt_next_ns = 0
+        self._felt_tries = 0
+
+    def saw(self, message: Message) -> None:
+        """Take a message of the vehicle."""
+        match message:
+            case Position(local_ned=True):
+                self._seen.add(LOCAL_POSITION_NED)
+            case Attitude(quaternion=False):
+                self._seen.add(ATTITUDE)
+            case Landed():
+                self._seen.add(EXTENDED_SYS_STATE)
+            case Battery():
+                self._seen.add(SYS_STATUS)
+            case Inertial():
+                self._feels = self._felt_tries > 0
+
+    def restart(self) -> None:
+        """The vehicle has started anew and may have forgotten them."""
+        self._seen.clear()
+        self._feels = False
+        self._next_ns, self._tries = None, 0
+        self._felt_next_ns, self._felt_tries = 0, 0
+
+    def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
+        """(message id, rate [1/s]) of what is to be asked for now; to be called once a vehicle is heard."""
+        wanted: dict[int, float] = {}
+        if self._next_ns is None:
+            self._next_ns = at_ns + SETTLE_NS
+        if at_ns >= self._next_ns and self._tries < TRIES:
+            self._next_ns = at_ns + AGAIN_NS
+            self._tries += 1
+            wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
+        # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
+        kinds = INERTIAL.get(autopilot, ()) if self._inertial and not self._feels else ()
+        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
+            self._felt_next_ns = at_ns + AGAIN_NS
+            self._felt_tries += 1
+            wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
+        return tuple(wanted.items())
+
+
+class Globe:
+    """When to tell an ArduPilot that flies by external positions a place on the globe: without one it does not arm.
+
+    Its source of positions is read first: with GPS a place of ours would be wrong.
+    """
+
+    def __init__(self) -> None:
+        self._external = False
+        self._known = False
+        self._next_ns = 0
+        self._tries = 0
+
+    def saw(self, message: Message) -> None:
+        """Take a message of the vehicle."""
+        match message:
+            case GlobalOrigin():
+                self._known = True
+            case ParamValue(name=name, cast=cast) if name == SOURCE_PARAMETER:
+                self._external = cast == EXTERNAL
+
+    def due(self, at_ns: int) -> tuple[bool, bool]:
+        """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
+
+        It is told from the second time on: by then an origin that is there has been answered with.
+        """
+        if self._known or at_ns < self._next_ns or self._tries >= ORIGIN_TRIES:
+            return False, False
+        self._next_ns = at_ns + SECOND_NS
+        self._tries += 1
+        return True, self._external and self._tries > 1
+
+
+# One connection's MAVLink state, without input or output of its own: bytes in, events out, and back.
+
+
+VEHICLE, MOCAP = "vehicle", "mocap"
+HEARTBEAT_NS = SECOND_NS
+# A little off one second, so that requests do not always wait behind the same step's solve.
+TIMESYNC_NS = 950_000_000
+FIRST_TIMESYNC_NS = 200_000_000
+FIRST_REQUESTS = 10  # sent faster, until the first answer
+OPEN_REQUESTS = 8  # requests whose answers are still taken
+# Requests that are answered within a time, of the vehicle's and of others' each: a flood of them makes none of answers,
+# and takes no tick its time.
+MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
+STREAM_SCHEMES = ("tcp:", "serial:")
+SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
+UNANSWERED = "timesync-flood"
+OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every flight has them
+
+Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
+
+
+class MavlinkConnection:
+    """MAVLink on one connection.
+
+    Args:
+        name: the connection's name in records.
+        roles: `vehicle` (heartbeats, status, setpoints), `mocap` (positions), or both.
+        daemon: our ids; the connection's URL tells a byte stream from datagrams.
+        source: which messages and which system count as positions.
+        estimator: standard deviation of a position, and what is absurd.
+        listen: hears every message of others that is understood, with its time of arrival; for who wants to know more
+            than the items tell.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        roles: frozenset[str],
+        daemon: DaemonConfig,
+        frame: FrameConfig,
+        clock: ClockConfig,
+        source: SourceConfig,
+        estimator: EstimatorConfig,
+        listen: Callable[[Message, int], None] | None = None,
+    ) -> None:
+        self._name, self._roles = name, roles
+        self._own = (daemon.system_id, daemon.component_id)
+        url = daemon.vehicle if VEHICLE in roles else daemon.mocap
+        self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
+        self._encoder = Encoder(*self._own)
+        self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
+        feels = estimator.inertial_std_mps2 > 0.0
+        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
+        self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
+        self._bad: Counter[str] = Counter()
+        self._untold: Counter[str] = Counter()
+        self._told_ns: int | None = None
+        self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
+        self._slow_told_ns: int | None = None
+        self._resyncs_told = 0
+        self._datagrams = self._messages = 0
+        self._heartbeat_ns: int | None = None
+        self._request_ns: int | None = None
+        self._requests = 0
+        self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
+        self._answered = False
+        self._listen = listen
+        self._askers: set[int] = set()  # systems that ask for our time
+        self._answers: list[bytes] = []  # to requests of the last datagram
+        self._answers_from_ns = 0
+        self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
+
+    @property
+    def vehicle(self) -> tuple[int, int] | None:
+        """System and component of the vehicle; None before its first heartbeat."""
+        return self._vehicle.address
+
+    @property
+    def attitude(self) -> Quaternion | None:
+        """How the body of the newest sample was turned: body axes forward, right, down to NED (w, x, y, z)."""
+        return self._intake.attitude
+
+    @property
+    def clock_source(self) -> ClockSource:
+        """Where the time of the newest sample's capture comes from."""
+        return self._intake.clock_source
+
+    @property
+    def settled(self) -> bool:
+        """Whether the newest sample is of a source that has spoken for a while."""
+        return self._intake.settled
+
+    def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
+        """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
+        return self._intake.trips(address)
+
+    def answered(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
+
+        Args:
+            address: system and component whose stamps it tells of.
+        """
+        self._intake.answer(address, sent_ns, remote_ns, received_ns)
+
+    @property
+    def vehicle_asks_time(self) -> bool:
+        """Whether the vehicle has asked for our time."""
+        return self.vehicle is not None and self.vehicle[0] in self._askers
+
+    def vehicle_up_s(self, at_ns: int) -> float | None:
+        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        return self._vehicle.up_s(at_ns)
+
+    def receive(self, data: bytes, at_ns: int) -> tuple[Item, ...]:
+        """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
+        self._answers.clear()
+        decoded = decode(data) if self._stream is None else self._stream.push(data)
+        self._datagrams += 1
+        self._messages += decoded.total
+        for reason, count in decoded.bad.items():
+            self._count(reason, count)
+        items = [item for message in decoded.messages for item in self._take(message, at_ns)]
+        items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
+        return (*items, *self._tell(at_ns))
+
+    def answers(self) -> tuple[bytes, ...]:
+        """What the last datagram has to be answered with, at once: a TIMESYNC that waits measures the wait."""
+        return tuple(self._answers)
+
+    def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
+        for reason, count in counts.items():
+            self._count(reason, count)
+        return self._tell(at_ns)
+
+    def due(self, at_ns: int) -> tuple[bytes, ...]:
+        """What is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
+        out = []
+        if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
+            self._heartbeat_ns = at_ns
+            out.append(self._encoder.heartbeat())
+        eager = not self._answered and self._requests < FIRST_REQUESTS
+        interval_ns = FIRST_TIMESYNC_NS if eager else TIMESYNC_NS
+        if self._request_ns is None or at_ns - self._request_ns >= interval_ns:
+            self._request_ns = at_ns
+            self._requests += 1
+            self._open.append(at_ns)
+            out.append(self._encoder.timesync(0, at_ns))
+        if VEHICLE in self._roles and self._vehicle.address is not None:
+            wanted = self._streams.due(at_ns, self._vehicle.autopilot)
+            out += [self.request_stream(number, rate_hz) for number, rate_hz in wanted]
+        return tuple(out)
+
+    def setpoint(self, setpoint: Setpoint) -> bytes:
+        """The setpoint, addressed to the vehicle.
+
+        Raises:
+            UnsendableError: a value is not finite, or no vehicle has been heard.
+        """
+        return self._encoder.setpoint(setpoint, *self._target())
+
+    def ask(self, ask: RequestKind, height_m: float) -> bytes:
+        """A request to the vehicle.
+
+        Args:
+            height_m: of the climb above the ground [m], for a take-off.
+
+        Raises:
+            UnsendableError: no vehicle has been heard, or it is of a kind that cannot be asked for this.
+        """
+        parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
+        match ask:
+            case RequestKind.TAKE_OFF_MODE | RequestKind.EXTERNAL_MODE:
+                parameters = self._mode(ask)
+            case RequestKind.ARM:
+                parameters = (1.0,)
+            case RequestKind.TAKE_OFF:
+                parameters = (*(0.0,) * 6, height_m)
+        return self._encoder.command(COMMANDS[ask], parameters, *self._target())
+
+    def _mode(self, ask: RequestKind) -> tuple[float, ...]:
+        """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
+        habits = HABITS.get(self._vehicle.autopilot)
+        if habits is None:
+            raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
+        name = habits.external if ask is RequestKind.EXTERNAL_MODE else habits.take_off
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, habits.modes[name]))
+
+    def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
+        """What an ArduPilot without GPS has to be told before it arms; to be called while it is to be armed.
+
+        Args:
+            place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
+        """
+        if self._vehicle.autopilot != "ardupilot":
+            return ()
+        asks, tells = self._globe.due(at_ns)
+        if not asks:
+            return ()
+        system, component = self._target()
+        out = (
+            self._encoder.request_parameter(SOURCE_PARAMETER, system, component),
+            self._encoder.request_message(GPS_GLOBAL_ORIGIN, system, component),
+        )
+        return (self._encoder.origin(place_deg_m, system), *out) if tells else out
+
+    def request_parameter(self, name: str) -> bytes:
+        """The request for one parameter, addressed to the vehicle.
+
+        Raises:
+            UnsendableError: no vehicle has been heard.
+        """
+        return self._encoder.request_parameter(name, *self._target())
+
+    def request_stream(self, message_id: int, rate_hz: float) -> bytes:
+        """The request to send a message so often, or once with rate 0, addressed to the vehicle.
+
+        Raises:
+            UnsendableError: no vehicle has been heard.
+        """
+        if rate_hz == 0.0:
+            return self._encoder.request_message(message_id, *self._target())
+        return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
+
+    def relay(
+        self, relay: Relay, at_ns: int, autopilot: str, *, refused: Sequence[PositionSample]
+    ) -> tuple[bytes, ...]:
+        """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
+
+        Args:
+            autopilot: the vehicle's kind; only PX4 moves stamps by what it has asked.
+            refused: samples that the tick did not believe.
+        """
+        if not relay.enabled or self.vehicle is None:
+            return ()
+        trips = self.trips(self.vehicle)
+        offset_ns = None if trips is None else trips.offset_ns(at_ns)
+        asks = autopilot == "px4" and self.vehicle_asks_time
+        poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
+        return tuple(self._encoder.external_position(pose) for pose in poses)
+
+    def stats(self, at_ns: int) -> LinkStats:
+        """Counters since the start."""
+        trips = self.trips() or (None if self.vehicle is None else self.trips(self.vehicle))
+        round_trips_ns = () if trips is None else trips.round_trips_ns
+        return LinkStats(
+            at_ns=at_ns,
+            link=self._name,
+            datagrams=self._datagrams,
+            messages=self._messages,
+            samples=self._intake.samples,
+            bad={str(reason): count for reason, count in self._bad.items()},
+            clock_offset_ns=self._intake.clock_offset_ns,
+            clock_source=str(self._intake.clock_source),
+            clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
+            clock_drift_ppm=None if trips is None else trips.drift_ppm,
+            clock_rejected=0 if trips is None else trips.rejected,
+        )
+
+    def _target(self) -> tuple[int, int]:
+        if self._vehicle.address is None:
+            raise UnsendableError(f"link {self._name}: no vehicle has been heard, so there is nobody to send to")
+        return self._vehicle.address
+
+    def _take(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        if (message.system, message.component) == self._own:  # our own words, sent back by a router
+            return ()
+        if self._listen is not None:
+            self._listen(message, at_ns)
+        if isinstance(message, TimeSync):
+            self._timesync(message, at_ns)
+            return ()
+        items: tuple[Item, ...] = self._follow(message, at_ns) if VEHICLE in self._roles else ()
+        if isinstance(message, Position) and MOCAP in self._roles:
+            sample = self._intake.take(message, at_ns)
+            return items if sample is None else (*items, sample)
+        return items
+
+    def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        """What the vehicle tells of itself."""
+        if isinstance(message, Text):
+            whole = self._texts.take(message, at_ns)
+            return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
+        boots, unready = self._vehicle.boots, self._vehicle.unready
+        items = self._vehicle.take(message, at_ns)
+        if self._vehicle.boots != boots:
+            self._streams.restart()
+            self._globe = Globe()
+            text = f"link {self._name}: the vehicle has started anew"
+            return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
+        if self._vehicle.unready != unready:
+            self._streams.restart()  # those that go on will have been seen by the time they would be asked for
+        if self.vehicle is not None and message.system == self.vehicle[0]:
+            self._streams.saw(message)
+            self._globe.saw(message)
+        return items
+
+    def _timesync(self, message: TimeSync, at_ns: int) -> None:
+        if message.tc1_ns == 0:
+            self._askers.add(message.system)
+            if at_ns - self._answers_from_ns >= ANSWERS_NS:
+                self._answers_from_ns = at_ns
+                self._answered_to.clear()
+            of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
+            if self._answered_to[of_vehicle] >= MAX_ANSWERS:
+                self._count(UNANSWERED)
+                return
+            self._answered_to[of_vehicle] += 1
+            self._answers.append(self._encoder.timesync(at_ns, message.ts1_ns))
+        elif message.ts1_ns in self._open:  # else it answers somebody else
+            self._answered = True
+            self._intake.answer((message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns)
+
+    def _count(self, reason: str, count: int = 1) -> None:
+        self._bad[reason] += count
+        if reason == SLOW_ANSWER:
+            self._slow += count
+        elif reason not in _USUAL:
+            self._untold[reason] += count
+
+    def _tell(self, at_ns: int) -> tuple[Event, ...]:
+        """What was dropped, as one event a second, and new clocks as they are found."""
+        events = []
+        if self._intake.resyncs > self._resyncs_told:
+            self._resyncs_told = self._intake.resyncs
+            text = f"link {self._name}: a source's clock has jumped; synchronised anew"
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
+            self._slow_told_ns = at_ns
+            events.append(self._slow_answers(at_ns))
+            self._slow = 0
+        if self._untold and (self._told_ns is None or at_ns - self._told_ns >= SECOND_NS):
+            self._told_ns = at_ns
+            events.extend(self._dropped(at_ns))
+            self._untold.clear()
+        return tuple(events)
+
+    def _slow_answers(self, at_ns: int) -> Event:
+        """Answers to TIMESYNC that a busy machine or link made too slow to measure by: no trouble while others do."""
+        known = self._intake.knows_clocks(at_ns)
+        text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
+            "stays known by the others" if known else "is not known by them any more"
+        )
+        severity = Severity.INFO if known else Severity.WARNING
+        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow)
+
+    def _dropped(self, at_ns: int) -> list[Event]:
+        events = []
+        vehicles = self._untold.pop(SECOND_VEHICLE, 0)
+        if vehicles and self._vehicle.address is not None:
+            text = f"link {self._name}: another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
+            events.append(Event(at_ns=at_ns, severity=Severity.ERROR, code=SECOND_VEHICLE, text=text, count=vehicles))
+        if self._untold:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._untold.items()))
+            text = f"link {self._name}: dropped {reasons}"
+            count = self._untold.total()
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="dropped", text=text, count=count))
+        return events

@@ -1,0 +1,303 @@
+"""The hand-over from tick to tick: walks the table of `mode.py`, makes requests of the vehicle, tells what happens."""
+
+from __future__ import annotations
+
+import msgspec
+
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover_guards import (
+    ASKING,
+    LEAVING,
+    TRANSITIONS,
+    GuardResult,
+    HandoverEvent,
+    HandoverState,
+    HandoverView,
+    Progress,
+    Sending,
+    against_engaging,
+    evaluate,
+    habits_of,
+    silent,
+)
+from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
+
+LAND_TRIES = 5
+NEWS_NS = 100_000_000  # a heartbeat is news for so long: two ticks
+MISSED_NS = 1_500_000_000  # one that was due is missing
+FOREVER_NS = 2**62
+_OVER = frozenset({HandoverState.DONE, HandoverState.FAILED})
+_ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
+_PLAIN = frozenset(HandoverState) - {
+    HandoverState.FAILSAFE,
+    HandoverState.RELEASED,
+    HandoverState.LANDING,
+    HandoverState.FAILED,
+}
+_PROMISES = {
+    Order.TAKE_OFF: "will take off",
+    Order.ENGAGE: "asks for the mode that takes setpoints",
+    Order.STAND_BY: "leaves a vehicle alone that is found armed",
+}
+HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
+
+
+class Passage(msgspec.Struct, frozen=True):
+    """A way in the table that was gone."""
+
+    before: HandoverState  # the state that was left
+    seen: HandoverEvent  # why
+    after: HandoverState  # the state that was entered
+    why: str = ""  # more about it, where something failed
+    ask: RequestKind | None = None  # what the vehicle had been asked for
+    granted: bool = False  # it had said yes to that
+
+
+class HandoverStep(msgspec.Struct, frozen=True):
+    """What a tick makes of it."""
+
+    sending: Sending  # what may be streamed
+    ask: RequestKind | None = None  # what to ask the vehicle for now, if anything
+    events: tuple[Event, ...] = ()  # what there is to tell
+    passage: Passage | None = None  # the way in the table that was gone, if one was
+
+
+class HandOver:
+    """Who flies one vehicle.
+
+    Args:
+        sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle
+            lands by the positions that it gets from here.
+
+    Attributes:
+        failure: Why a request failed; empty while none has.
+    """
+
+    def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
+        self._config = HandOverConfig() if config is None else config
+        self._now = Progress(config=self._config, request=PendingRequest(None, 0, Patience(0, 0, 0, FOREVER_NS)))
+        self._sees_it_down = sees_it_down
+        self._landed_ns: int | None = None  # since when it stands on the ground, armed
+        self._disarms = False
+        self._silent = False
+        self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
+        self.failure = ""
+
+    @property
+    def state(self) -> HandoverState:
+        """Place in the table."""
+        return self._now.state
+
+    @property
+    def ours(self) -> bool:
+        """Whether this flight was begun by an order to take off."""
+        return self._now.ordered_ns is not None
+
+    @property
+    def height_m(self) -> float:
+        """Height of the climb that was ordered [m]."""
+        return self._now.height_m
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing more will be sent, whatever comes."""
+        return self.state in _OVER and not self.carries
+
+    @property
+    def carries(self) -> bool:
+        """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
+
+        One that is not heard any more gets them for the time of a landing.
+        """
+        return self._sees_it_down and self._aloft_ns is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
+        if self.carries:
+            return True
+        return self.state in ASKING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
+
+    def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
+        """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
+        if vehicle is None or silent(at_ns, vehicle):
+            return None
+        if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._now.stands_by:
+            return vehicle
+        if self.state is HandoverState.ENGAGED:
+            past = self._now.shows_the_past(vehicle)
+            return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
+        return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
+
+    def has_left(self, vehicle: VehicleStatus) -> bool:
+        """Whether a heartbeat says that the vehicle is no longer in the external mode."""
+        return not (vehicle.external and vehicle.armed) and not self._now.shows_the_past(vehicle)
+
+    def update(self, view: HandoverView) -> HandoverStep:
+        """Decide what one tick may send, and what it asks the vehicle for."""
+        now, before = self._now, self.state
+        for message in view.heard:
+            now.request.hear(message, view.at_ns)
+        events = self._take_orders(view)
+        if now.heard_ns is None and view.vehicle is not None:
+            now.heard_ns = view.at_ns
+        self.look_up(view.at_ns, view.vehicle)
+        sight = evaluate(now, view)
+        now.boots = 0 if view.vehicle is None else view.vehicle.boots
+        now.state, sending = TRANSITIONS[before, sight.seen]
+        passage = None
+        if now.state is not before:
+            was = now.request
+            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None)
+            self._enter(before, sight, view)
+        if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
+            sending = Sending.NOTHING
+        self._see_to_disarming(view)
+        held = view.unfit if now.state in _ON_THE_GROUND else ""
+        ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
+        if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
+            ask = RequestKind.DISARM  # arming may have been granted after all
+        return HandoverStep(sending, ask, (*events, *self._tell(view, before, sight)), passage)
+
+    def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
+        """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
+        if vehicle is not None and not silent(at_ns, vehicle):
+            self._aloft_ns = at_ns if vehicle.armed and not vehicle.landed else None
+        elif self._aloft_ns is not None and at_ns - self._aloft_ns >= _ns(self._config.land_s):
+            self._aloft_ns = None
+
+    def _take_orders(self, view: HandoverView) -> list[Event]:
+        events = []
+        for command in view.commands:
+            if command.order not in _PROMISES:
+                continue
+            refused = self._against(command, view)
+            if not refused and command.order is Order.TAKE_OFF:
+                self._now.ordered_ns, self._now.height_m = view.at_ns, command.height_m or 0.0
+            elif not refused and command.order is Order.STAND_BY:
+                self._now.stands_by, self._now.flown_ns = True, command.flown_ns
+            code, severity = (ORDER_REFUSED, Severity.WARNING) if refused else (ORDER_ACCEPTED, Severity.INFO)
+            text = refused or _PROMISES[command.order]
+            events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
+        return events
+
+    def _against(self, command: Command, view: HandoverView) -> str:
+        """Why an order is refused; empty if it is taken."""
+        if command.order is Order.ENGAGE:
+            return against_engaging(self.state, view)
+        if command.order is Order.STAND_BY:
+            return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
+        if not (command.height_m or 0.0) > 0.0:
+            return f"a climb to {command.height_m} m is none"
+        early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.ours
+        return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
+
+    def _may_be_the_pilot_s(self, view: HandoverView) -> bool:
+        """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
+
+        Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
+        it is made again right after a heartbeat; landing also where none has come.
+        """
+        vehicle, ask = view.vehicle, self._now.request.ask
+        if ask not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
+            return False
+        age_ns = view.at_ns - vehicle.at_ns
+        return age_ns > NEWS_NS and not (ask is RequestKind.LAND and age_ns > MISSED_NS)
+
+    def _may_warm_up(self, view: HandoverView) -> bool:
+        """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
+        if self.state not in LEAVING or view.vehicle is None:
+            return True
+        return habits_of(view.vehicle).climbs_on_arming
+
+    def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverView) -> None:
+        now = self._now
+        now.since_ns, now.stands_by = view.at_ns, False
+        if now.state is HandoverState.FAILSAFE:
+            now.resumes, now.words = before is not HandoverState.ENGAGED, now.request.words
+        if now.state is HandoverState.CLIMBING and now.climb_ns is None:
+            now.climb_ns = view.at_ns
+        now.request = PendingRequest(self._ask(view), view.at_ns, self._patience(now.state, view.at_ns))
+        if now.state is HandoverState.ARMING:
+            now.ground_up_m = view.up_m
+        takes_back = now.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
+        if (takes_back or now.state in (HandoverState.RETURNING, HandoverState.FAILSAFE)) and view.vehicle is not None:
+            now.left_mode = view.vehicle.mode
+        if sight.granted_ns is not None:
+            now.granted_ns = sight.granted_ns
+        elif now.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
+            now.granted_ns = None
+        if before is not HandoverState.RETURNING:
+            self.failure = self.failure or sight.why
+
+    def _ask(self, view: HandoverView) -> RequestKind | None:
+        climbs = view.vehicle is not None and habits_of(view.vehicle).climbs_on_arming
+        external = view.vehicle is not None and view.vehicle.external
+        asks = {
+            HandoverState.MODE: RequestKind.TAKE_OFF_MODE,
+            HandoverState.ARMING: RequestKind.ARM,
+            HandoverState.CLIMBING: None if climbs else RequestKind.TAKE_OFF,
+            HandoverState.ENGAGING: None if external else RequestKind.EXTERNAL_MODE,
+            HandoverState.RETURNING: None if external else RequestKind.EXTERNAL_MODE,
+            HandoverState.LANDING: RequestKind.LAND,
+        }
+        return asks.get(self.state)
+
+    def _patience(self, state: HandoverState, at_ns: int) -> Patience:
+        c = self._config
+        climbed_s = 0.0 if self._now.climb_ns is None else (at_ns - self._now.climb_ns) / 1e9
+        limits_s = {
+            HandoverState.MODE: c.ground_s,
+            HandoverState.ARMING: c.ground_s,
+            HandoverState.CLIMBING: max(
+                c.climb_s - climbed_s, 0.0
+            ),  # one time for the climb, however often it is interrupted
+            HandoverState.ENGAGING: c.engage_s,
+            HandoverState.RETURNING: c.engage_s,
+            HandoverState.LANDING: c.land_s,
+            HandoverState.SETTLING: c.land_s,
+        }
+        limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
+        if state is HandoverState.LANDING:
+            # What we took off is asked as long as it has time for a landing: nobody else would.
+            tries = max(LAND_TRIES, round(c.land_s / c.answer_s)) if self.ours else LAND_TRIES
+            return Patience(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
+        # In the air there is no time for long pauses.
+        retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
+        return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
+
+    def _see_to_disarming(self, view: HandoverView) -> None:
+        """A vehicle that stands on the ground after a flight of ours and stays armed is asked to disarm."""
+        vehicle = view.vehicle
+        if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
+            self._landed_ns = None
+        elif self._landed_ns is None:
+            self._landed_ns = view.at_ns
+        elif not self._disarms and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
+            self._disarms = True
+            self._now.request = PendingRequest(
+                RequestKind.DISARM, view.at_ns, self._patience(HandoverState.SETTLING, view.at_ns)
+            )
+
+    def _tell(self, view: HandoverView, before: HandoverState, sight: GuardResult) -> list[Event]:
+        events = []
+        silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
+        if silence != self._silent:
+            self._silent = silence
+            text = "heartbeat lost: braking and holding" if silence else "heartbeat is back"
+            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
+        if self.state is not before:
+            vehicle = view.vehicle
+            mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
+            plain = self.state in _PLAIN and before is not HandoverState.FAILSAFE
+            severity = Severity.INFO if plain else Severity.WARNING
+            text = f"{before} -> {self.state}{mode}"
+            events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
+            if sight.why:
+                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.why))
+        return events
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

@@ -1,0 +1,569 @@
+"""Hand-over: states, table of transitions, guards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+
+import msgspec
+
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.autopilots import HABITS, AutopilotProfile
+from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.requests import PendingRequest
+from uavctl.records import Command, Order, VehicleStatus
+
+# The hand-over between pilot and controller, as a table of transitions.
+#
+# Without an order the controller never asks for a mode but landing: it streams neutral setpoints so that the pilot may
+# switch, flies while the vehicle is armed in its external mode, and is out once the pilot has taken over. Ordered to,
+# it asks for the mode, arms, lets the vehicle climb and asks for the external mode: `uavctl.mavlink.handover` walks
+# the table. A vehicle that a daemon before has left in the air is not taken up again without an order.
+
+
+class HandoverState(StrEnum):
+    """Who flies, or what is under way."""
+
+    WAITING = "waiting"  # no vehicle is heard
+    READY = "ready"  # heard; neutral setpoints warm the stream up
+    MODE = "asking for the mode"  # on the ground, ordered to take off
+    ARMING = "arming"
+    CLIMBING = "climbing"  # the vehicle climbs by itself
+    ENGAGING = "engaging"  # at height: the external mode is asked for
+    RETURNING = "returning"  # the same from `released`, ordered to
+    ENGAGED = "engaged"  # armed and in the external mode: setpoints
+    FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
+    RELEASED = "released"  # the pilot has taken over: nothing is sent unless ordered to
+    LANDING = "landing"  # landing was asked for: no setpoints any more, for good
+    SETTLING = "settling"  # the vehicle lands by itself
+    DONE = "done"  # disarmed after all: nothing is sent, for good
+    FAILED = "failed"  # the vehicle does not do what was asked: nothing is sent, for good
+
+
+class HandoverEvent(StrEnum):
+    """What a tick sees; of several things the first in this order."""
+
+    REBOOT = "reboot"  # the vehicle has started anew
+    LAND = "land"  # the controller, or the operator, asks for landing
+    GRANTED = "granted"  # what was asked for is there
+    REFUSED = "refused"  # what was asked for will not come
+    SILENCE = "silence"  # no heartbeat, or the last one is too old
+    TAKE_OFF = "take-off"  # ordered, and nothing speaks against it
+    ENGAGE = "engage"  # ordered, and the vehicle is in the air
+    LEFT = "left"  # found armed, and a daemon before this one ended while it had it
+    DISARMED = "disarmed"
+    FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
+    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's, or on the pilot's flight a failsafe's
+    EXTERNAL = "external"  # armed, in the external mode
+    PENDING = "pending"  # what was asked for is not there yet
+
+
+class Sending(Enum):
+    """What a tick may stream to the vehicle."""
+
+    NOTHING = "nothing"
+    NEUTRAL = "neutral"
+    SETPOINTS = "setpoints"
+
+
+Target = tuple[HandoverState, Sending]
+_W, _R, _M, _A, _C = (
+    HandoverState.WAITING,
+    HandoverState.READY,
+    HandoverState.MODE,
+    HandoverState.ARMING,
+    HandoverState.CLIMBING,
+)
+_G, _B, _E, _X, _L = (
+    HandoverState.ENGAGING,
+    HandoverState.RETURNING,
+    HandoverState.ENGAGED,
+    HandoverState.RELEASED,
+    HandoverState.LANDING,
+)
+_S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
+_NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+
+# What is not here changes nothing, and nothing is sent.
+_CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
+    _W: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe, and so take over
+        HandoverEvent.DISARMED: (_R, _NEUTRAL),
+        HandoverEvent.OTHER: (_R, _NEUTRAL),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _R: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.SILENCE: (_W, _NOTHING),
+        HandoverEvent.TAKE_OFF: (_M, _NEUTRAL),
+        HandoverEvent.ENGAGE: (_B, _NEUTRAL),
+        HandoverEvent.DISARMED: (_R, _NEUTRAL),
+        HandoverEvent.OTHER: (_R, _NEUTRAL),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _M: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_D, _NOTHING),  # it stands on the ground, disarmed
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_A, _NEUTRAL),
+        HandoverEvent.PENDING: (_M, _NEUTRAL),
+    },
+    _A: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_C, _NEUTRAL),
+        HandoverEvent.PENDING: (_A, _NEUTRAL),
+    },
+    _C: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.DISARMED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_G, _NEUTRAL),
+        HandoverEvent.PENDING: (_C, _NEUTRAL),
+    },
+    _G: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.DISARMED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_E, _FLY),
+        HandoverEvent.PENDING: (_G, _NEUTRAL),
+    },
+    _B: {
+        HandoverEvent.REBOOT: (_X, _NOTHING),
+        HandoverEvent.LAND: (_X, _NOTHING),  # the pilot flies still
+        HandoverEvent.REFUSED: (_X, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_E, _FLY),
+        HandoverEvent.PENDING: (_B, _NEUTRAL),
+    },
+    _E: {
+        HandoverEvent.REBOOT: (_X, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.SILENCE: (
+            _E,
+            _FLY,
+        ),  # the controller brakes and holds, for a while: the vehicle may hear us still
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _V: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.GRANTED: (_C, _NEUTRAL),  # it has ended by itself, and the climb goes on
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.ENGAGE: (_G, _NEUTRAL),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+    },
+    _X: {HandoverEvent.ENGAGE: (_B, _NEUTRAL), HandoverEvent.DISARMED: (_D, _NOTHING)},
+    _L: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_S, _NOTHING),
+    },
+    _S: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_L, _NOTHING),  # it only seemed to land for us: its climb goes on
+        HandoverEvent.OTHER: (_X, _NOTHING),
+    },
+    _D: {},
+    _F: {},
+}
+# Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
+LEAVES_NONE = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
+TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
+    (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
+}
+
+
+def page() -> str:
+    """The page of the documentation that shows the table."""
+    return f"""# Who flies: the hand-over
+
+Written from the table in `uavctl/mavlink/handover_guards.py` (`make docs`).
+A word on an arrow is what a tick sees; of several
+things the first in this list counts:
+{", ".join(f"`{seen}`" for seen in HandoverEvent)}.
+What is not drawn changes nothing. Setpoints are sent in `ENGAGED` only; neutral ones (zero acceleration) where PX4
+wants a stream before it gives OFFBOARD: in `READY`, on the way up (not to ArduPilot, whose climb they would end), and
+in `RETURNING`.
+
+```mermaid
+{drawing()}```
+
+* `take-off` is `--arm --takeoff HEIGHT`; `engage` is `uavctl ctl engage`. Nothing else leads towards arming or back
+  from the pilot. `land` comes from the controller, or from the operator on the way up.
+* `left`: the daemon before this one ended while it had the vehicle, and nobody had asked it to (it was killed, or
+  failed); and the vehicle, which has not started anew since, is armed when it is heard first. Nothing is sent, as
+  setpoints would end PX4's failsafe; `uavctl ctl engage` takes it up again. Whoever ends so leaves word in the file
+  of its lock ([operation.md](operation.md#how-it-ends)).
+* `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
+  (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
+* `failsafe`: the vehicle itself says that a failsafe acts (system status CRITICAL, or "failsafe" in a text), and is in
+  a mode that failsafes choose ({_listed()}).
+  Any other mode is the pilot's, and so are these without such a word. On a flight that began with `--arm` it is waited
+  for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
+  has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
+  `ctl engage` comes first. A flight that the pilot began is released.
+* PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
+  (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
+* What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
+  still says otherwise 0.3 s later is the pilot's word.
+* A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
+  have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
+  external mode, at the end of a climb, waits for none: a pilot who switches in that second has to switch again.
+* While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
+"""
+
+
+def _listed() -> str:
+    """The modes that failsafes choose, by autopilot."""
+    return "; ".join(f"{name}: {', '.join(sorted(habits.failsafes))}" for name, habits in HABITS.items())
+
+
+def drawing() -> str:
+    """The table as a Mermaid state diagram: every way from one state to another, by what is seen."""
+    lines = ["stateDiagram-v2", "    [*] --> WAITING"]
+    for before in HandoverState:
+        ways: dict[HandoverState, list[str]] = {}
+        for seen in HandoverEvent:
+            after = TRANSITIONS[before, seen][0]
+            if after is not before:
+                ways.setdefault(after, []).append(seen.value)
+        lines += [f"    {before.name} --> {after.name}: {', '.join(seen)}" for after, seen in ways.items()]
+    return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"
+
+
+# What a tick sees of the vehicle, in the words of the table of `mode.py`. Pure: all that it goes by is an argument.
+
+
+HEARTBEAT_TIMEOUT_NS = 3_000_000_000
+# A heartbeat may have been under way when arming or the external mode was granted: PX4 shows it up to a second later.
+GRACE_NS = 300_000_000
+LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
+SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
+LOW = 0.3  # share of the take-off height below which a climb that has ended was none
+LEAVING = frozenset({HandoverState.MODE, HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
+_UNDER_WAY = LEAVING | {
+    HandoverState.RETURNING,
+    HandoverState.FAILSAFE,
+}  # here the operator's end of the flight asks for landing, too
+ASKING = _UNDER_WAY | {HandoverState.LANDING}
+CLOCK_NS = 5_000_000_000  # in which a vehicle that is found armed tells how long ago it started
+# A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
+SLOWEST, LATEST_S = 0.8, 1.0
+_ANOTHER = "another vehicle is heard on this link: nothing is armed; give each its own link"
+_ARMED = (
+    "the vehicle is armed already; it begins on the ground, disarmed. Land and disarm it, or start without --arm "
+    "--takeoff to fly it from where it is"
+)
+_OR_ENGAGE = ", and ask for that with `uavctl ctl engage`"
+_DISARMED = "the vehicle has disarmed itself"
+_LEFT = "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
+
+
+class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
+    """What the hand-over knows in a tick."""
+
+    at_ns: int  # time of the tick
+    vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
+    ready: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
+    up_s: float | None = None  # how long ago it started [s]; None if it does not tell
+    land: bool = False  # the controller asks for landing
+    stop: bool = False  # the operator asks for the end
+    unfit: str = ""  # why nothing may be armed now; empty if it may
+    up_m: float | None = None  # height of the estimate in local NED [m]; None without one
+    up_mps: float = 0.0  # how fast it climbs [m/s]
+    heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
+    commands: tuple[Command, ...] = ()  # the operator's orders
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """How far the hand-over has come."""
+
+    config: HandOverConfig  # times and bounds
+    request: PendingRequest  # what is asked for, or waited for
+    state: HandoverState = HandoverState.WAITING  # place in the table
+    since_ns: int = 0  # when it was entered [ns]
+    ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
+    height_m: float = 0.0  # height of the climb that was ordered [m]
+    ground_up_m: float | None = None  # height of the estimate before it was armed [m]
+    left_mode: str = ""  # the mode that is to be left for the external one, after a release; or that a failsafe chose
+    climb_ns: int | None = None  # when the climb began first [ns]; None before
+    resumes: bool = False  # the failsafe that acts ended the climb, not the flight
+    words: str = ""  # what the vehicle said before its failsafe acted
+    granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
+    boots: int = 0  # times that the vehicle had started anew by the last tick
+    stands_by: bool = False  # A vehicle that is found armed is left alone
+    flown_ns: int | None = None  # when the flight that it is left from began [ns]; None if that is not known
+    heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
+
+    def shows_the_past(self, vehicle: VehicleStatus) -> bool:
+        """Whether the last heartbeat may be from before arming or the external mode was granted."""
+        return self.granted_ns is not None and vehicle.at_ns <= self.granted_ns + GRACE_NS
+
+
+class GuardResult(msgspec.Struct, frozen=True):
+    """What is seen, and why, where that has to be told."""
+
+    seen: HandoverEvent  # in the words of the table
+    why: str = ""  # why something failed
+    granted_ns: int | None = None  # when it was granted, if a heartbeat does not show it yet [ns]
+
+
+def silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
+    """Whether there is no heartbeat, or the last one is too old."""
+    return vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS
+
+
+def habits_of(vehicle: VehicleStatus) -> AutopilotProfile:
+    """The autopilot's habits; those of PX4 for one that is not known, which is never asked for a mode."""
+    return HABITS.get(vehicle.autopilot, HABITS["px4"])
+
+
+def ordered(view: HandoverView, order: Order) -> bool:
+    """Whether this tick brings an order."""
+    return any(command.order is order for command in view.commands)
+
+
+def fails(vehicle: VehicleStatus) -> bool:
+    """Whether a failsafe of its own has chosen its mode: it says that one acts, in a mode that they choose."""
+    return vehicle.failsafe and vehicle.mode in habits_of(vehicle).failsafes
+
+
+def against_engaging(state: HandoverState, view: HandoverView) -> str:
+    """Why the external mode must not be asked for again; empty if it may."""
+    vehicle = view.vehicle
+    if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.FAILSAFE):
+        return f"there is nothing to engage; now: {state}"
+    if vehicle is None or silent(view.at_ns, vehicle) or vehicle.autopilot not in HABITS:
+        return "no vehicle is heard that could be flown"
+    if not vehicle.armed or vehicle.landed:
+        return "the vehicle is not in the air"
+    return view.unfit
+
+
+def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
+    """Why an order of where to fly would come to nothing; empty if it is we who fly."""
+    if state is HandoverState.ENGAGED:
+        return ""
+    if state is HandoverState.WAITING or vehicle is None:
+        return "no vehicle is heard"
+    mode = vehicle.mode
+    if state is HandoverState.READY:
+        return f"it is not we who fly: the vehicle is in mode {mode}, and the pilot has not switched"
+    if state in LEAVING:
+        return f"the vehicle is on its way up ({state}); order it once it is flown"
+    if state in (HandoverState.FAILSAFE, HandoverState.RELEASED, HandoverState.RETURNING):
+        whose = "a failsafe of its own" if state is HandoverState.FAILSAFE else "the pilot"
+        return f"{whose} has the vehicle, in mode {mode}; `uavctl ctl engage` asks for it back"
+    return f"the vehicle has been handed over ({state})"
+
+
+def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
+    """What a tick sees; of several things the first in the order of `Seen`."""
+    vehicle, state = view.vehicle, progress.state
+    if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
+        return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
+    if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
+        return GuardResult(HandoverEvent.LAND)
+    if state is HandoverState.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
+        return GuardResult(
+            HandoverEvent.LAND
+        )  # the controller has ended without a landing, and nobody else has what we took off
+    there = GuardResult(HandoverEvent.SILENCE)
+    if vehicle is not None and not silent(view.at_ns, vehicle):
+        there = _LOOKS.get(state, _around)(progress, view, vehicle)
+    taken = (
+        state is HandoverState.FAILSAFE and there.seen is HandoverEvent.OTHER
+    )  # time is up, but the pilot has it: nothing is asked
+    if there.seen is HandoverEvent.GRANTED or taken:
+        return there
+    why = _given_up(progress, view)
+    return GuardResult(HandoverEvent.REFUSED, why) if why else there
+
+
+def _given_up(progress: Progress, view: HandoverView) -> str:
+    state, vehicle = progress.state, view.vehicle
+    if state in (HandoverState.WAITING, HandoverState.READY):
+        return _never_ready(progress, view)
+    if state in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
+        return _ANOTHER
+    if state is HandoverState.FAILSAFE:
+        return _failsafe_stays(progress, view)
+    waits = state in ASKING or state is HandoverState.SETTLING
+    return progress.request.given_up(view.at_ns) if waits else ""
+
+
+def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
+    """Why the vehicle's failsafe is not waited for any longer; empty while it is."""
+    vehicle, config = view.vehicle, progress.config
+    lands = vehicle is not None and vehicle.mode in habits_of(vehicle).landing
+    begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
+    if progress.resumes and not lands and progress.climb_ns is not None:
+        begun_ns = progress.climb_ns
+    if view.at_ns - begun_ns < round(limit_s * 1e9):
+        return ""
+    acts = vehicle is None or fails(vehicle)
+    became = "has not ended" if acts else "has ended, and nobody has taken the flight up again,"
+    return f"the vehicle's own failsafe ({progress.left_mode}) {became} in {limit_s:g} s{progress.words}"
+
+
+def _never_ready(progress: Progress, view: HandoverView) -> str:
+    """Why an ordered take-off will not begin; empty if it may, or none was ordered."""
+    vehicle, limit_s = view.vehicle, progress.config.ground_s
+    if progress.ordered_ns is None:
+        return ""
+    if vehicle is not None and vehicle.autopilot not in HABITS:
+        return f"take-off: how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
+    if vehicle is not None and not vehicle.alone:
+        return _ANOTHER
+    if vehicle is not None and vehicle.armed:
+        return f"take-off: {_ARMED}{_OR_ENGAGE if progress.stands_by else ''}"
+    if view.at_ns - progress.ordered_ns < round(limit_s * 1e9):
+        return ""
+    reason = "no vehicle is heard" if vehicle is None else view.unfit or "the vehicle is silent"
+    return f"take-off: {reason} (waited {limit_s:g} s)"
+
+
+def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    """Before, between and after flights."""
+    ready = progress.state is HandoverState.READY and not (view.unfit or view.stop)
+    if ready and progress.ordered_ns is not None and not vehicle.armed and vehicle.alone:
+        return (
+            GuardResult(HandoverEvent.TAKE_OFF) if vehicle.autopilot in HABITS else GuardResult(HandoverEvent.DISARMED)
+        )
+    if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
+        return GuardResult(HandoverEvent.ENGAGE)
+    if progress.state is HandoverState.ENGAGED and progress.shows_the_past(vehicle):
+        return GuardResult(HandoverEvent.EXTERNAL)
+    if not vehicle.armed:
+        return GuardResult(HandoverEvent.DISARMED)
+    if progress.stands_by and not _has_started_since(progress, view):
+        heard_ns = view.at_ns if progress.heard_ns is None else progress.heard_ns
+        tells_not_yet = view.up_s is None and view.at_ns - heard_ns < CLOCK_NS
+        return GuardResult(HandoverEvent.SILENCE) if tells_not_yet else GuardResult(HandoverEvent.LEFT, _LEFT)
+    if vehicle.external:
+        return GuardResult(HandoverEvent.EXTERNAL)
+    ours = progress.state is HandoverState.ENGAGED and progress.ordered_ns is not None
+    return GuardResult(HandoverEvent.FAILSAFE if ours and fails(vehicle) else HandoverEvent.OTHER)
+
+
+def _has_started_since(progress: Progress, view: HandoverView) -> bool:
+    """Whether the vehicle has started after the flight that a daemon before left: it is on another one."""
+    if progress.flown_ns is None or view.up_s is None:
+        return False
+    return view.up_s / SLOWEST + LATEST_S < (view.at_ns - progress.flown_ns) / 1e9
+
+
+def _for_mode(_progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    if vehicle.armed:
+        return GuardResult(HandoverEvent.OTHER)
+    there = vehicle.alone and vehicle.mode == habits_of(vehicle).take_off
+    return GuardResult(HandoverEvent.GRANTED if there else HandoverEvent.PENDING)
+
+
+def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    habits, granted_ns = habits_of(vehicle), progress.request.granted_ns
+    if vehicle.mode not in habits.climbing:
+        return GuardResult(HandoverEvent.FAILSAFE if vehicle.armed and fails(vehicle) else HandoverEvent.OTHER)
+    if habits.climbs_on_arming and granted_ns is not None:  # it climbs already
+        return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
+    return GuardResult(HandoverEvent.GRANTED if vehicle.armed else HandoverEvent.PENDING)
+
+
+def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    if not (vehicle.armed or progress.shows_the_past(vehicle)):
+        return GuardResult(HandoverEvent.DISARMED, _DISARMED)
+    habits = habits_of(vehicle)
+    if vehicle.mode not in habits.climbing:
+        return GuardResult(HandoverEvent.FAILSAFE if fails(vehicle) else HandoverEvent.OTHER)
+    share = _climbed(progress, view, LOOK_AHEAD_S if habits.climbs_on_arming else 0.0)
+    ended = habits.climbs_on_arming and vehicle.mode != habits.take_off  # below the height: as high as it goes
+    return GuardResult(
+        HandoverEvent.GRANTED if share >= (LOW if ended else progress.config.reached) else HandoverEvent.PENDING
+    )
+
+
+def _climbed(progress: Progress, view: HandoverView, ahead_s: float) -> float:
+    """Share of the height that will have been reached in a moment, by fresh positions."""
+    if view.up_m is None or progress.ground_up_m is None or view.unfit:
+        return 0.0
+    return (view.up_m + ahead_s * view.up_mps - progress.ground_up_m) / progress.height_m
+
+
+def _for_external(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    if not (vehicle.armed or progress.shows_the_past(vehicle)):
+        return GuardResult(HandoverEvent.DISARMED, _DISARMED)
+    granted_ns = progress.request.granted_ns
+    if vehicle.external or granted_ns is not None:
+        return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
+    engaging = progress.state is HandoverState.ENGAGING
+    if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in habits_of(vehicle).climbing):
+        return GuardResult(HandoverEvent.PENDING)
+    return GuardResult(HandoverEvent.FAILSAFE if engaging and fails(vehicle) else HandoverEvent.OTHER)
+
+
+def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    """On a flight that we began; that the pilot may take over is no different from any other time."""
+    if not vehicle.armed:
+        return GuardResult(
+            HandoverEvent.DISARMED, f"the vehicle's own failsafe ({progress.left_mode}) has landed it{progress.words}"
+        )
+    if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
+        return GuardResult(HandoverEvent.ENGAGE)
+    habits = habits_of(vehicle)
+    if progress.resumes and vehicle.mode in habits.climbing:
+        return GuardResult(HandoverEvent.GRANTED)
+    stays = not habits.returns and vehicle.mode == progress.left_mode
+    # The external mode is not taken up again unasked: nobody knows whose doing it is.
+    return GuardResult(HandoverEvent.PENDING if vehicle.external or fails(vehicle) or stays else HandoverEvent.OTHER)
+
+
+def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    news = vehicle.at_ns > progress.since_ns
+    if not vehicle.armed:
+        return GuardResult(HandoverEvent.DISARMED if news else HandoverEvent.PENDING)
+    habits, asking = habits_of(vehicle), progress.state is HandoverState.LANDING
+    ours = progress.ordered_ns is not None
+    if vehicle.mode in habits.landing:
+        # A failsafe lands only until it ends: what we took off is to land whatever comes.
+        for_us = not (ours and fails(vehicle)) or progress.request.granted_ns is not None
+        return GuardResult(HandoverEvent.GRANTED if asking and for_us else HandoverEvent.PENDING)
+    if ours and not asking and habits.climbs_on_arming and vehicle.mode == habits.take_off:
+        return GuardResult(
+            HandoverEvent.FAILSAFE if vehicle.at_ns > progress.since_ns + SHOWN_NS else HandoverEvent.PENDING
+        )
+    # Asked for in the middle of a climb, any mode of the climb may still be shown.
+    passing = vehicle.external or vehicle.mode in habits.climbing or (ours and fails(vehicle))
+    return GuardResult(HandoverEvent.PENDING if passing or not news else HandoverEvent.OTHER)
+
+
+_LOOKS: dict[HandoverState, Callable[[Progress, HandoverView, VehicleStatus], GuardResult]] = {
+    HandoverState.MODE: _for_mode,
+    HandoverState.ARMING: _for_arming,
+    HandoverState.CLIMBING: _at_climb,
+    HandoverState.ENGAGING: _for_external,
+    HandoverState.RETURNING: _for_external,
+    HandoverState.FAILSAFE: _at_failsafe,
+    HandoverState.LANDING: _at_landing,
+    HandoverState.SETTLING: _at_landing,
+}

@@ -1,0 +1,232 @@
+"""Position messages to samples: source filter, checks, frame, clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Generic, TypeVar, get_args
+
+from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
+from uavctl.config.types import EstimatorConfig
+from uavctl.frames import Convention, Frame, Quaternion
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, StampRefusal
+from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.messages import Position
+from uavctl.records import PositionSample, Vec3
+
+MAX_SOURCES = 32
+SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
+SETTLED = 20  # samples after which a source is no newcomer any more
+# Samples of all newcomers together, while no settled source speaks, and while one does: each costs the estimator its
+# time, and nobody knows yet whose it is.
+NEWCOMERS_PER_S, NEWCOMERS_BESIDE_PER_S = 100, 10
+NEWCOMERS_BURST = 50
+SPEAKS_NS = 1_000_000_000
+
+WRONG_SYSTEM = "system-id"
+NEW_SOURCE = "new-source"  # more samples of sources that nobody has heard before than are looked at
+MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
+ABSURD = "absurd"
+SLOW_ANSWER = "timesync"
+
+Address = tuple[int, int]
+
+
+Key = TypeVar("Key")
+Kept = TypeVar("Kept")
+
+
+class SourceTable(Generic[Key, Kept]):
+    """What is kept of each source. There is always room for another one: who has said least gives its place.
+
+    So nobody is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
+
+    Args:
+        bad: told when a source loses its place that is not silent.
+    """
+
+    def __init__(self, most: int, bad: Callable[[], None]) -> None:
+        self._most, self._bad = most, bad
+        self._entries: dict[Key, tuple[Kept, int, int]] = {}  # what is kept, times that it spoke, when last
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, key: Key) -> Kept | None:
+        """What is kept of a source; None of one that is not there."""
+        found = self._entries.get(key)
+        return None if found is None else found[0]
+
+    def times(self, key: Key) -> int:
+        """How often a source has spoken; 0 of one that is not there."""
+        found = self._entries.get(key)
+        return 0 if found is None else found[1]
+
+    def values(self) -> Iterator[Kept]:
+        """What is kept of all of them."""
+        return (kept for kept, _, _ in self._entries.values())
+
+    def hear(self, key: Key, at_ns: int, make: Callable[[], Kept]) -> Kept:
+        """What is kept of a source that speaks now; of a new one it is made."""
+        found = self._entries.get(key)
+        if found is None and len(self._entries) >= self._most:
+            self._make_room(at_ns)
+        kept, times = (make(), 0) if found is None else found[:2]
+        self._entries[key] = kept, times + 1, at_ns
+        return kept
+
+    def _make_room(self, at_ns: int) -> None:
+        def weight(key: Key) -> tuple[int, int]:
+            _, times, last_ns = self._entries[key]
+            return (times if at_ns - last_ns <= SILENCE_NS else 0), last_ns
+
+        least = min(self._entries, key=weight)
+        if weight(least)[0]:
+            self._bad()
+        del self._entries[least]
+
+
+class PositionDecoder:
+    """Makes samples of the position messages of one connection.
+
+    Args:
+        clock: window, latency and tolerance of the sources' clocks.
+        source: which messages and which system count.
+        estimator: standard deviation of a sample, and what is absurd.
+        bad: counter that refusals are added to.
+    """
+
+    def __init__(
+        self,
+        frame: FrameConfig,
+        clock: ClockConfig,
+        source: SourceConfig,
+        estimator: EstimatorConfig,
+        bad: Callable[[str], None],
+    ) -> None:
+        configured = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
+        # A message that declares its axes is believed; the vehicle's own estimate needs no conversion.
+        self._frames: dict[Convention | None, Frame] = {None: configured}
+        for axes in get_args(Convention):
+            self._frames[axes] = replace(configured, convention=axes)
+        self._clock, self._source, self._estimator, self._bad = clock, source, estimator, bad
+        self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._round_trips: SourceTable[Address, RoundTrips] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._newcomers_left, self._newcomers_ns = float(NEWCOMERS_BURST), 0
+        self._settled_ns: int | None = None  # when a settled source was heard last
+        self.settled = False  # whether the newest sample is of one
+        self._latest: ClockSync | None = None
+        self._latest_address: Address | None = None
+        self.samples = 0
+        self.resyncs = 0  # times that a source turned out to have a new clock
+        self.attitude: Quaternion | None = None  # of the newest sample: body axes forward, right, down to NED
+
+    @property
+    def clock_offset_ns(self) -> int | None:
+        """(our time − the source's time) of the newest sample's source."""
+        return None if self._latest is None else self._latest.offset_ns
+
+    @property
+    def clock_source(self) -> ClockSource:
+        """Where that offset comes from."""
+        return ClockSource.NONE if self._latest is None else self._latest.source
+
+    def trips(self, address: Address | None = None) -> RoundTrips | None:
+        """Round trips to a peer that answers; without an address, to the newest sample's source."""
+        wanted = self._latest_address if address is None else address
+        return None if wanted is None else self._round_trips.get(wanted)
+
+    def knows_clocks(self, at_ns: int) -> bool:
+        """Whether every peer that answers has given an answer lately by which its clock is known."""
+        return all(trips.offset_ns(at_ns) is not None for trips in self._round_trips.values())
+
+    def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Take an answer to a TIMESYNC request."""
+        trips = self._round_trips.hear(address, received_ns, lambda: RoundTrips(_ns(self._clock.window_s)))
+        if not trips.answer(sent_ns, remote_ns, received_ns):
+            self._bad(SLOW_ANSWER)
+
+    def take(self, message: Position, received_ns: int) -> PositionSample | None:
+        """Make a sample of a message, or count why not; None also for messages that are not asked for."""
+        if message.name not in self._source.messages:
+            return None
+        if self._source.system_id not in (0, message.system):
+            self._bad(WRONG_SYSTEM)
+            return None
+        frame = self._frames[message.convention]
+        position_m, velocity_mps = message.position_m, message.velocity_mps
+        if not message.local_ned:
+            position_m = frame.to_ned(position_m)
+            velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
+        if self._absurd(position_m, velocity_mps):
+            self._bad(ABSURD)  # the controller refuses it too, and looks at how long a source says nothing else
+        if not self._has_room(message, received_ns):
+            self._bad(NEW_SOURCE)
+            return None
+        captured = self._captured(message, received_ns)
+        if isinstance(captured, str):
+            self._bad(captured)
+            return None
+        self.samples += 1
+        self.attitude = message.attitude and frame.attitude_to_ned(message.attitude, euler=message.euler)
+        return PositionSample(
+            captured_ns=captured,
+            received_ns=received_ns,
+            position_m=position_m,
+            velocity_mps=velocity_mps,
+            std_m=self._estimator.position_std_m,
+            source=f"{message.name} {message.system}/{message.component}",
+            seq=self.samples,
+        )
+
+    def _absurd(self, position_m: Vec3, velocity_mps: Vec3 | None) -> bool:
+        far = max(map(abs, position_m)) > self._estimator.max_position_m
+        return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
+
+    def _has_room(self, message: Position, received_ns: int) -> bool:
+        """Whether one more sample is looked at; of sources that are settled each is."""
+        self.settled = self._clocks.times(_key(message)) >= SETTLED
+        if self.settled:
+            self._settled_ns = received_ns
+            return True
+        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SPEAKS_NS
+        per_s = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_PER_S
+        earned = (received_ns - self._newcomers_ns) * 1e-9 * per_s
+        burst = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_BURST
+        self._newcomers_left, self._newcomers_ns = min(burst, self._newcomers_left + earned), received_ns
+        if self._newcomers_left < 1.0:
+            return False
+        self._newcomers_left -= 1.0
+        return True
+
+    def _new_clock(self) -> ClockSync:
+        clock = self._clock
+        return ClockSync(_ns(clock.window_s), _ns(clock.latency_s), _ns(clock.future_tolerance_s))
+
+    def _lost_place(self) -> None:
+        self._bad(MANY_SOURCES)
+
+    def _captured(self, message: Position, received_ns: int) -> int | StampRefusal:
+        address = (message.system, message.component)
+        clock = self._clocks.hear(_key(message), received_ns, self._new_clock)
+        stamp_ns: int | None = None
+        if message.boot_ms and message.stamp_us is not None:
+            stamp_ns = clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
+        elif message.stamp_us is not None:
+            stamp_ns = message.stamp_us * 1000
+        trips, resyncs = self._round_trips.get(address), clock.resyncs
+        captured = clock.captured_ns(stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns))
+        self.resyncs += clock.resyncs - resyncs
+        if not isinstance(captured, str):
+            self._latest, self._latest_address = clock, address
+        return captured
+
+
+def _key(message: Position) -> tuple[Address, bool]:
+    """Whose clock stamps it, and which of its clocks."""
+    return (message.system, message.component), message.boot_ms
+
+
+def _ns(seconds: float) -> int:
+    return math.floor(seconds * 1e9 + 0.5)

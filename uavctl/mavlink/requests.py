@@ -1,0 +1,138 @@
+"""One request to the vehicle: when to make it again, what came back, when to give up. Pure: time is an argument."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.mavlink.messages import Ack, Text
+
+SECOND_NS = 1_000_000_000
+SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
+_FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
+_MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal
+
+
+class RequestKind(StrEnum):
+    """What the vehicle is asked for; the value is how a person would say it."""
+
+    TAKE_OFF_MODE = "the mode to take off in"
+    ARM = "arming"
+    TAKE_OFF = "take-off"
+    EXTERNAL_MODE = "the mode that takes setpoints"
+    LAND = "landing"
+    DISARM = "disarming"
+
+
+COMMANDS = {
+    RequestKind.TAKE_OFF_MODE: int(mavlink.MAV_CMD_DO_SET_MODE),
+    RequestKind.ARM: int(mavlink.MAV_CMD_COMPONENT_ARM_DISARM),
+    RequestKind.TAKE_OFF: int(mavlink.MAV_CMD_NAV_TAKEOFF),
+    RequestKind.EXTERNAL_MODE: int(mavlink.MAV_CMD_DO_SET_MODE),
+    RequestKind.LAND: int(mavlink.MAV_CMD_NAV_LAND),
+    RequestKind.DISARM: int(mavlink.MAV_CMD_COMPONENT_ARM_DISARM),
+}
+
+
+@dataclass(frozen=True)
+class Patience:
+    """Bounds of a request."""
+
+    answer_ns: int  # without an effect it is made again after this time [ns]
+    retry_ns: int  # refused for now, it is made again after this time [ns]
+    tries: int  # times that it is made at most
+    limit_ns: int  # after this time it has failed [ns]
+
+
+class PendingRequest:
+    """A request from its first time to its effect, or its end.
+
+    Args:
+        ask: What is asked for; None for a wait in which nothing is said.
+    """
+
+    def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
+        self._ask = ask
+        self._patience = patience
+        self._begun_ns = at_ns
+        self._next_ns = at_ns
+        self._tries = 0
+        self._result: int | None = None
+        self._texts: list[str] = []
+        self._held = ""
+        self._waits = False  # for the time after a refusal
+        self.asked_ns: int | None = None  # when it was made last
+        self.granted_ns: int | None = None  # when it was accepted last
+
+    @property
+    def ask(self) -> RequestKind | None:
+        """What is asked for; None for a wait in which nothing is said."""
+        return self._ask
+
+    def hear(self, message: Ack | Text, at_ns: int) -> None:
+        """Take what the vehicle says."""
+        if isinstance(message, Text):
+            if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
+                self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
+        elif self._ask is not None and self._tries and message.command == COMMANDS[self._ask]:
+            again, self._result = self._result == message.result, message.result
+            if message.result == mavlink.MAV_RESULT_ACCEPTED:
+                self.granted_ns = at_ns
+                self._next_ns = at_ns + SHOWN_NS
+            elif message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+                self._next_ns = max(self._next_ns, at_ns + self._patience.retry_ns)
+            elif not (again and self._waits):  # said twice, it is not waited for twice
+                self._waits = True
+                self._next_ns = at_ns + self._patience.retry_ns
+
+    def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
+        """What to send now, if anything; `held` says why it must not be sent yet.
+
+        `blind`: nothing is made again now, as it is not known what the vehicle does meanwhile.
+        """
+        self._held = held
+        if blind and self._tries:
+            return None
+        if self._ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
+            return None
+        if self._ask is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
+            return None
+        self._tries += 1
+        self._waits, self.asked_ns = False, at_ns
+        self._next_ns = at_ns + self._patience.answer_ns
+        return self._ask
+
+    def given_up(self, at_ns: int) -> str:
+        """Why nothing more is to be expected; empty while there is hope."""
+        over = at_ns - self._begun_ns >= self._patience.limit_ns
+        out_of_tries = self._ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
+        if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
+            return ""
+        return f"{self._what()}{self._why()}{self.words} ({self._effort(at_ns)})"
+
+    def _what(self) -> str:
+        return "" if self._ask is None else f"{self._ask.value}: "
+
+    def _why(self) -> str:
+        if self._ask is None:
+            return "it took too long"
+        if self._held and self._result is None:
+            return f"not asked for, because {self._held}"
+        if self._result is None:
+            return "the vehicle did not answer"
+        name = mavlink.enums["MAV_RESULT"].get(self._result)
+        result = str(self._result) if name is None else str(name.name).removeprefix("MAV_RESULT_")
+        if self._result == mavlink.MAV_RESULT_ACCEPTED:
+            return f"the vehicle answered {result}, but does not do it"
+        return f"the vehicle answered {result}"
+
+    @property
+    def words(self) -> str:
+        """What the vehicle has said meanwhile, to be added to a reason."""
+        return "".join(f', "{text}"' for text in self._texts)
+
+    def _effort(self, at_ns: int) -> str:
+        seconds = f"{(at_ns - self._begun_ns) / SECOND_NS:.1f} s"
+        return seconds if self._ask is None else f"asked {self._tries} times in {seconds}"

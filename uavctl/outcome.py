@@ -1,0 +1,324 @@
+"""How a flight ended, told once: console, `ctl status`, health, summary, page, JSON and exit code take it from here.
+
+The control loop notes what happens along the way; whoever ends it adds why. Pure: nothing here decides anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from msgspec.structs import replace
+
+from uavctl.flight.decision import MISSION_OVER
+from uavctl.mavlink.handover import Passage
+from uavctl.mavlink.handover_guards import HandoverEvent, HandoverState, fails, silent
+from uavctl.mavlink.requests import RequestKind
+from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
+
+SECOND_NS = 1_000_000_000
+
+
+class Cause(StrEnum):
+    """Why a flight ended; the value is a phrase for a table."""
+
+    MISSION = "landed at the end of the mission"
+    ORDERED = "landed as ordered"
+    OPERATOR = "ended by the operator"
+    TIME = "ended as its time was over"
+    IN_FLIGHT = "still flying"  # a simulated flight that was to end in the air, or a recording that says no more
+    PILOT = "the pilot has taken over"
+    PILOT_LANDED = "landed by the pilot"
+    NOT_FLOWN = "nothing was flown"
+    NO_VEHICLE = "no vehicle was heard"
+    NO_POSITIONS = "no positions came"
+    NOT_ALONE = "another vehicle was heard"
+    NOT_BEGUN = "the take-off was not begun"
+    NO_MODE = "the mode to take off in was refused"
+    NOT_ARMED = "arming was refused"
+    NO_TAKE_OFF = "the take-off was refused"
+    NO_CLIMB = "the climb took too long"
+    NOT_GRANTED = "the mode that takes setpoints was refused"
+    NOT_ENGAGED = "ended before the controller was in charge"
+    NOT_REACHED = "the place was not reached"
+    LEFT = "left alone, as the daemon before had left it in flight"
+    FALLBACK = "landed by the fallback"
+    FALLBACK_STOPPED = "let go by the fallback"
+    LET_GO = "let go by the envelope"
+    FAILSAFE = "a failsafe of the vehicle's own took over"
+    FAILSAFE_LANDED = "landed by a failsafe of the vehicle's own"
+    RESTARTED = "the vehicle has started anew"
+    SILENT = "the vehicle fell silent"
+    DISARMED = "the vehicle disarmed in flight"
+    LANDING_FAILED = "landing has failed"
+    CUT_OFF = "ended before the vehicle was down"
+    CONNECTION = "the vehicle's connection was closed by the other side"
+    CONTROL = "the controller has failed"
+    SIGNALLED = "ended at once by a second signal"
+    WAITING = "waiting"  # by an older recording, which does not say for what
+
+
+# What somebody wanted: the operator, the mission, or the pilot.
+WANTED = frozenset(
+    {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT, Cause.PILOT, Cause.PILOT_LANDED}
+)
+_BEFORE = "before the controller was in charge"
+_REFUSED = {
+    HandoverState.MODE: Cause.NO_MODE,
+    HandoverState.ARMING: Cause.NOT_ARMED,
+    HandoverState.ENGAGING: Cause.NOT_GRANTED,
+    HandoverState.FAILSAFE: Cause.FAILSAFE,
+    HandoverState.LANDING: Cause.LANDING_FAILED,
+    HandoverState.SETTLING: Cause.LANDING_FAILED,
+}
+_FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
+_FALLING = frozenset({ControlMode.BRAKE, ControlMode.HOLD})
+
+
+def lacking(ending: Ending, records: int, why: str) -> Ending:
+    """The ending of a flight whose recording lacks records, which makes it none that went as ordered."""
+    if not records:
+        return ending
+    some = "1 record" if records == 1 else f"{records} records"
+    text = f"{ending.sentence.removesuffix('.')}; the recording lacks {some}{f' ({why})' if why else ''}."
+    return replace(ending, as_ordered=False, exit_code=ending.exit_code or 1, sentence=text)
+
+
+def make_ending(cause: Cause, what: str, *, as_ordered: bool | None = None, exit_code: int | None = None) -> Ending:
+    """An ending in one sentence; by its cause it is as ordered or not, if nothing else is said."""
+    good = cause in WANTED if as_ordered is None else as_ordered
+    code = (0 if good else 1) if exit_code is None else exit_code
+    return Ending(cause=cause.value, as_ordered=good, sentence=f"{what[:1].upper()}{what[1:]}.", exit_code=code)
+
+
+@dataclass
+class FlightCourse:
+    """What happened along the way, as far as it bears upon the end."""
+
+    takes_off: bool = False  # the flight begins on the ground, by our order
+    in_flight: bool = False  # it is to end in the air, as simulated flights do
+    goal: str = ""  # the place that was to be reached, in words; empty if none was
+    arrived: bool = False  # it has been reached
+    let_go: str = ""  # why the envelope let the vehicle go; empty while it did not
+    flown: bool = False  # the controller has been in charge at a Δt boundary
+    engaged: bool = False  # the vehicle has been flown by our setpoints
+    over: bool = False  # nothing more will be sent
+    died: str = ""  # what failed in the controller; empty while nothing did
+    _state: HandoverState = HandoverState.WAITING
+    _found: Cause | None = None  # what ended it first, if anything did
+    _why: str = ""
+    _failed: str = ""  # why the landing failed
+    _asked: Cause | None = None  # what the controller ends in by itself: an order to land, or the mission
+    _asked_ns: int | None = None
+    _stop: Cause | None = None  # the end that was asked for from outside
+    _closed: str = ""
+    _signal: int = 0
+    _failsafes: int = 0  # that have ended by themselves
+    _airborne: bool = False  # it has been armed
+    _vehicle: VehicleStatus | None = None
+    _positions: bool = False  # there has been an estimate
+    _fell: str = ""  # why the fallback took over last
+    _mode: ControlMode = ControlMode.WAIT
+    _now_ns: int = 0
+
+    def stop(self, cause: Cause) -> None:
+        """The end is asked for from outside: OPERATOR or TIME; the first one counts."""
+        self._stop = self._stop or cause
+
+    def close(self, text: str) -> None:
+        """The vehicle's connection is closed."""
+        self._closed = text
+
+    def kill(self, number: int) -> None:
+        """A second signal ends it at once."""
+        self._signal = number
+
+    def see(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
+        """The vehicle at a tick."""
+        self._now_ns, self._vehicle = at_ns, vehicle
+        self._airborne = self._airborne or (vehicle is not None and vehicle.armed)
+
+    def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
+        """What the controller decided in a tick."""
+        self._positions = self._positions or estimated
+        before, self._mode = self._mode, decision.mode
+        if decision.mode is ControlMode.TRACK:
+            self._asked, self._fell = None, ""
+        if any(one.code == ORDER_ACCEPTED and one.text == Order.LAND.value for one in events):
+            self._asked = Cause.ORDERED
+        if decision.reason == MISSION_OVER:
+            self._asked = Cause.MISSION
+        self.flown = self.flown or (decision.boundary and decision.mode in _FLOWN and self._stop is None)
+        if decision.mode in _FALLING and before not in _FALLING:
+            self._fell = decision.reason
+        ends = decision.mode in (ControlMode.LAND, ControlMode.STOPPED) and before in _FLOWN
+        if ends and self._stop is None and not (self.let_go or self.died):
+            lost = silent(decision.at_ns, self._vehicle)
+            landed = Cause.FALLBACK if decision.mode is ControlMode.LAND else Cause.FALLBACK_STOPPED
+            self._find(self._asked or (Cause.SILENT if lost else landed), "" if self._asked else self._fell)
+
+    def turn(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+        """The hand-over goes from one state to another."""
+        self._state = one.after
+        if one.after is HandoverState.ENGAGED or (
+            one.before is HandoverState.FAILSAFE and one.after is HandoverState.CLIMBING
+        ):
+            self._failsafes += self._found is Cause.FAILSAFE
+            self._found, self._why = None, ""
+        self.engaged = self.engaged or one.after is HandoverState.ENGAGED
+        if one.seen is HandoverEvent.REBOOT:
+            self._find(Cause.RESTARTED, "")
+        elif one.seen is HandoverEvent.REFUSED:
+            self._refuse(one, vehicle)
+        elif one.seen is HandoverEvent.LEFT:
+            self._find(Cause.LEFT, "")
+        elif one.after is HandoverState.FAILSAFE:
+            self._find(Cause.FAILSAFE, _mode(vehicle))
+        elif one.seen is HandoverEvent.DISARMED:
+            self._disarm(one)
+        elif one.after is HandoverState.RELEASED and one.before is not HandoverState.RETURNING:
+            own = one.before is HandoverState.ENGAGED and vehicle is not None and fails(vehicle)
+            if self._found is Cause.FAILSAFE and not own:
+                self._found = None
+            self._find(Cause.FAILSAFE if own else Cause.PILOT, _mode(vehicle) if own else "")
+        elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
+            self._asked = Cause.ORDERED
+
+    def ending(self, *, over: bool | None = None) -> Ending:
+        """How it ended, or would if it ended now; `over`: nothing more was to be sent, if that is known better."""
+        cause, why = self._told(self.over if over is None else over)
+        where = "" if cause is Cause.IN_FLIGHT else self._where()
+        what = f"{cause.value}{f': {why}' if why else ''}"
+        missed = self.goal if cause in WANTED and not self.arrived else ""
+        if cause is Cause.NOT_REACHED:
+            what = f"{self.goal} was not reached"
+        elif missed:
+            what += f"; {missed} was not reached"
+        early = cause in WANTED and ((self.takes_off and not self.engaged) or not self.flown)
+        if self._failed and cause is not Cause.LANDING_FAILED:
+            what += f"; landing has failed: {self._failed}"
+        if self._failsafes and cause is not Cause.FAILSAFE:
+            what += "; a failsafe of the vehicle's own had acted and ended"
+        text = f"{what}{f', {_BEFORE}' if early else ''}{f'; {where}' if where else ''}"
+        good = cause in WANTED and not (early or missed or self._failed)
+        return make_ending(cause, text, as_ordered=good, exit_code=128 + self._signal if self._signal else None)
+
+    @property
+    def told(self) -> str:
+        """The sentence of an end that has come, or is under way; empty while it flies, or has yet to."""
+        done = self.over or self._found or self._stop or self.let_go or self.died or self._closed or self._signal
+        return self.ending(over=True).sentence if done else ""
+
+    def _find(self, cause: Cause, why: str) -> None:
+        """The first one counts."""
+        if self._found is None:
+            self._found, self._why = cause, why
+
+    def _refuse(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+        cause = _REFUSED.get(one.before, Cause.NOT_BEGUN)
+        if one.before in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
+            cause = Cause.NOT_ALONE
+        elif one.before in (HandoverState.WAITING, HandoverState.READY):
+            cause = self._against_beginning(vehicle)
+        elif one.before is HandoverState.CLIMBING:
+            cause = Cause.NO_TAKE_OFF if one.ask is RequestKind.TAKE_OFF and not one.granted else Cause.NO_CLIMB
+        elif one.before is HandoverState.RETURNING:
+            return  # the pilot has it still
+        if cause is Cause.LANDING_FAILED:
+            if silent(self._now_ns, vehicle):
+                self._find(Cause.SILENT, "")
+            self._failed = _reason(one)
+        elif cause is Cause.FAILSAFE:
+            self._found, self._why = cause, _reason(one)
+        else:
+            self._find(cause, "" if cause is Cause.NO_VEHICLE else _reason(one))
+
+    def _against_beginning(self, vehicle: VehicleStatus | None) -> Cause:
+        if vehicle is None:
+            return Cause.NO_VEHICLE
+        if not vehicle.alone:
+            return Cause.NOT_ALONE
+        if vehicle.armed or self._positions or silent(self._now_ns, vehicle):
+            return Cause.NOT_BEGUN
+        return Cause.NO_POSITIONS
+
+    def _disarm(self, one: Passage) -> None:
+        if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
+            self._find(Cause.DISARMED, "")
+        elif one.before is HandoverState.RELEASED and self._found is Cause.PILOT:
+            self._found, self._why = Cause.PILOT_LANDED, ""
+        elif one.before in (HandoverState.FAILSAFE, HandoverState.RELEASED) and self._found is Cause.FAILSAFE:
+            self._found = Cause.FAILSAFE_LANDED
+
+    def _told(self, over: bool) -> tuple[Cause, str]:
+        """The cause that counts most, and more about it."""
+        if self._signal:
+            return Cause.SIGNALLED, ""
+        if self._closed:
+            return Cause.CONNECTION, self._closed
+        if self.died:
+            return Cause.CONTROL, self.died
+        if self.let_go:
+            return Cause.LET_GO, self.let_go
+        if self._found is None and self._state is HandoverState.ENGAGED and silent(self._now_ns, self._vehicle):
+            return Cause.SILENT, ""
+        wanted = self._found is None or self._found in WANTED
+        if self._failed and (wanted or self._found is Cause.FALLBACK):
+            return Cause.LANDING_FAILED, self._failed
+        if self._found is not None and (not wanted or self._found in (Cause.PILOT, Cause.PILOT_LANDED)):
+            return self._found, self._why
+        return self._wished(over)
+
+    def _wished(self, over: bool) -> tuple[Cause, str]:
+        """The cause of an end that nothing has brought about but somebody's will, if there was one."""
+        asked = self._found or self._stop or self._asked
+        if self.takes_off and not self.engaged:
+            return Cause.NOT_ENGAGED, "" if asked is None else asked.value
+        if not self.engaged and not self.flown:
+            return self._nothing_flown()
+        if self.goal and not self.arrived:
+            return Cause.NOT_REACHED, ""
+        if self.in_flight and self._found is None:
+            falls = self._mode in _FALLING and self._asked is None
+            return Cause.IN_FLIGHT, f"the fallback, {self._mode.value}: {self._fell}" if falls else ""
+        if not over:
+            return Cause.CUT_OFF, "" if asked is None else asked.value
+        return (Cause.OPERATOR if asked is None else asked), self._why
+
+    def _nothing_flown(self) -> tuple[Cause, str]:
+        if self._vehicle is None:
+            return Cause.NO_VEHICLE, ""
+        if not self._positions:
+            return Cause.NO_POSITIONS, ""
+        return Cause.NOT_FLOWN, "the pilot has not switched to the mode that takes setpoints"
+
+    def _where(self) -> str:
+        """Where the vehicle is, as far as it has told."""
+        vehicle = self._vehicle
+        if vehicle is None:
+            return ""
+        mode = f"in mode {vehicle.mode}"
+        if not vehicle.armed:
+            down = "it is disarmed" if self._found is Cause.DISARMED else "it has landed and disarmed"
+            return down if self._airborne else "it was not armed"
+        heard = ""
+        if silent(self._now_ns, vehicle):
+            heard = f", not heard for {(self._now_ns - vehicle.at_ns) / SECOND_NS:.0f} s"
+        if vehicle.landed:
+            return f"it stands on the ground, armed, {mode}{heard}"
+        return f"it is in the air, {mode}{heard}"
+
+
+def _reason(one: Passage) -> str:
+    """Why something was refused, without what the cause says already."""
+    asked = "" if one.ask is None else f"{one.ask.value}: "
+    text = one.why
+    for said in (asked, "take-off: ", "another vehicle is heard on this link: ", "the vehicle's own failsafe "):
+        text = text.removeprefix(said)
+    if one.ask is None and text.startswith("("):  # the failsafe's mode
+        text = text.replace("(", "", 1).replace(")", "", 1)
+    return text.replace("it took too long (", "not done in ").removesuffix(")") if "too long" in text else text
+
+
+def _mode(vehicle: VehicleStatus | None) -> str:
+    return "unknown" if vehicle is None else vehicle.mode

@@ -1,1 +1,0 @@
-"""Section 5 of the paper, reproduced: its runs, its two figures, and each of its claims beside what was measured."""

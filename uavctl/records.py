@@ -1,0 +1,401 @@
+"""Records that cross module borders, and the protocols that join the modules.
+
+SI units; positions in local NED; times are integer nanoseconds on our monotonic clock.
+Every record is frozen and made of plain numbers, so that it can be compared bit for bit,
+written to a recording and read back without loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+from functools import cache
+from typing import Protocol
+
+import msgspec
+
+Vec3 = tuple[float, float, float]
+Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all records."""
+
+
+class SolveStatus(StrEnum):
+    """How a solve ended; only OPTIMAL may fly."""
+
+    OPTIMAL = "optimal"
+    INFEASIBLE = "infeasible"
+    INACCURATE = "inaccurate"
+    ITERATION_LIMIT = "iteration_limit"
+    LATE = "late"
+    FAILED = "failed"
+
+
+class ControlMode(StrEnum):
+    """What the controller is doing in a tick."""
+
+    WAIT = "wait"  # no estimate yet, or nobody to fly
+    TRACK = "track"  # a plan is flown: fresh, or played out
+    BRAKE = "brake"  # fallback: take the predicted velocity to zero
+    HOLD = "hold"  # fallback: zero acceleration
+    LAND = "land"  # fallback: the vehicle's own landing is asked for
+    STOPPED = "stopped"  # handed over; nothing is sent
+
+
+class SetpointSource(StrEnum):
+    """Where a setpoint comes from."""
+
+    PLAN = "plan"
+    BRAKE = "brake"
+    HOLD = "hold"
+
+
+class PositionSample(Record, frozen=True, kw_only=True):
+    """One external position, after frame and clock conversion."""
+
+    captured_ns: int
+    received_ns: int
+    position_m: Vec3
+    velocity_mps: Vec3 | None = None
+    std_m: float
+    source: str
+    seq: int
+
+
+class InertialSample(Record, frozen=True, kw_only=True):
+    """Acceleration that the vehicle's inertial sensors show, turned into local NED by its own attitude."""
+
+    at_ns: int  # time of arrival
+    accel_mps2: Vec3  # gravity is in it: zero at rest
+
+
+class Estimate(Record, frozen=True, kw_only=True):
+    """State estimate at `at_ns`; `captured_ns` is the capture time of the newest sample in it."""
+
+    at_ns: int
+    captured_ns: int
+    mean: Vector  # (n_x,)
+    cov: Matrix  # (n_x, n_x)
+    bias: Vector = ()  # (n_u,), what acts beside the input, in its units; empty where none is estimated
+
+    @property
+    def age_s(self) -> float:
+        """Age of the newest sample [s]."""
+        return (self.at_ns - self.captured_ns) * 1e-9
+
+
+class GaveWay(Record, frozen=True, kw_only=True):
+    """A constraint that a plan could not keep, and by how much."""
+
+    # "state": a tightened row; "terminal": a row of the terminal set; "equilibrium": x̄_N = x_s; "slew": how far the
+    # first setpoint may be from the one sent last
+    constraint: str
+    stage: int  # t of the plan; that of the reference for "terminal"
+    index: int  # row of the state set; state for "equilibrium"; axis for "slew"
+    amount: float  # in the row's, or the state's, unit; m/s² for "slew"
+
+
+class Plan(Record, frozen=True, kw_only=True):
+    """An answer of the predictive controller, from `base_ns` on (one row a step Δt)."""
+
+    seq: int  # number of the step that asked for it
+    base_ns: int
+    captured_ns: int
+    status: SolveStatus
+    method: str
+    inputs: Matrix  # (H, n_u), in the plant's input units
+    states: Matrix  # (H+1, n_x), predicted mean
+    backoff_x: Matrix  # (H+1, rows of the state set)
+    backoff_u: Matrix  # (H, rows of the input set)
+    reference: Vector  # (n_x,), the equilibrium that the plan ends in
+    slack: float  # sum of all state-constraint slacks: what gave way
+    offset: float  # l1 distance of the reference from the target
+    terminal_miss: float  # l1 violation of the terminal equality (0 unless nothing else was left)
+    cost: float
+    cost_lower: float
+    gap: float
+    iterations: int
+    design_id: str
+    gave_way: tuple[GaveWay, ...] = ()
+    bias: Vector = ()  # (n_u,), what `states` count on beside `inputs`, in their units
+
+
+class Setpoint(Record, frozen=True, kw_only=True):
+    """What is sent to the vehicle, after the last gate."""
+
+    at_ns: int
+    accel_mps2: Vec3
+    yaw_rad: float | None = None
+    source: SetpointSource
+    limited: tuple[str, ...] = ()  # what the last gate changed, by name
+
+
+class Decision(Record, frozen=True, kw_only=True):
+    """Everything that a tick knew and chose."""
+
+    tick: int
+    at_ns: int
+    step: int  # number of the Δt interval
+    boundary: bool  # a Δt boundary: age, plan and index are decided anew
+    mode: ControlMode
+    age_steps: int | None  # None before the first sample
+    news: bool  # a sample newer than the plan's was there
+    plan_seq: int | None
+    plan_index: int | None
+    solve: SolveStatus | None  # ending of this tick's solve, if there was one
+    input: Vector | None  # (n_u,), in the plant's input units, after the last gate
+    fresh: int  # fresh samples in a row since the last fallback
+    missed_ticks: int
+    accepted: int  # samples taken in this tick
+    rejected: int  # samples refused in this tick (invalid, duplicate, too old)
+    reason: str
+    target: Vector | None = None  # (n_x,), where the mission wants the vehicle in this step; None before it began
+    unexplained_mps2: float | None = None  # acceleration that positions show beside what was sent; None if not watched
+    apart_mps: float | None = None  # velocity of the positions minus the vehicle's own, its size; None if not known
+    waypoint: int | None = None  # number of the waypoint flown to, from 0; None before, on a trajectory, and on orders
+
+
+class VehicleStatus(Record, frozen=True, kw_only=True):
+    """The vehicle as its heartbeats and status messages tell."""
+
+    at_ns: int
+    autopilot: str  # "px4", "ardupilot" or "unknown"
+    armed: bool
+    mode: str  # the autopilot's own name: "OFFBOARD", "GUIDED", "LAND" ...
+    external: bool  # in the mode that takes our setpoints
+    landed: bool | None = None
+    battery_v: float | None = None
+    boots: int = 0  # times that it was seen to start anew
+    own_climb: bool = False  # it climbs, or lands, by itself, whatever it is sent
+    alone: bool = True  # no other vehicle has been heard lately
+    failsafe: bool = False  # it says that a failsafe of its own acts
+
+
+class VehicleMotion(Record, frozen=True, kw_only=True):
+    """How the vehicle itself says that it moves: the newest of each, with its time of arrival."""
+
+    velocity_mps: Vec3 | None = None  # local NED, by its own estimate
+    velocity_ns: int | None = None
+    attitude_rad: Vec3 | None = None  # roll, pitch, yaw: body axes forward, right, down in NED
+    attitude_ns: int | None = None
+
+
+class Severity(StrEnum):
+    """How bad an event is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Event(Record, frozen=True, kw_only=True):
+    """Something worth telling a person; `count` events of one kind are told once a second."""
+
+    at_ns: int
+    severity: Severity
+    code: str
+    text: str
+    count: int = 1
+
+
+class Order(StrEnum):
+    """What the operator may ask of a flight while it goes on."""
+
+    GOTO = "goto"  # fly to a place and stay there
+    HOLD = "hold"  # stay where the vehicle comes to rest
+    RESUME = "resume"  # go on with the configured mission where it was left
+    LAND = "land"  # brake and hand over to the vehicle's own landing
+    ENGAGE = "engage"  # ask for the external mode again, after the pilot or the vehicle has left it
+    TAKE_OFF = "take-off"  # ask for the mode, arm, climb and fly; from the ground only
+    STAND_BY = "stand by"  # leave a vehicle that is found armed alone until ENGAGE: a daemon before this one left it
+
+
+ORDER_ACCEPTED = "order-accepted"  # codes of the events that answer orders, one each, in their order
+ORDER_REFUSED = "order-refused"
+
+
+class Command(Record, frozen=True, kw_only=True):
+    """One order of the operator; a place comes with GOTO only, a height with TAKE_OFF, a time with STAND_BY."""
+
+    order: Order
+    position_m: Vec3 | None = None  # local NED
+    height_m: float | None = None  # of the climb, above the ground
+    flown_ns: int | None = None  # when the daemon before this one took the vehicle over
+
+
+class StepInput(Record, frozen=True, kw_only=True):
+    """All that one control tick may know; recorded, and enough to replay the tick."""
+
+    tick: int
+    at_ns: int  # the tick's place on the grid, not the moment it ran
+    samples: tuple[PositionSample, ...] = ()
+    vehicle: VehicleStatus | None = None
+    motion: VehicleMotion | None = None
+    inertial: tuple[InertialSample, ...] = ()  # since the tick before
+    missed_ticks: int = 0
+    stop: bool = False  # the operator asks for the hand-over
+    commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came
+
+
+class Timing(Record, frozen=True, kw_only=True):
+    """What the shell measured; never an input of the core, never compared in a replay."""
+
+    tick: int
+    at_ns: int
+    lateness_ns: int  # tick deadline -> start of the tick
+    step_ns: int  # time in the core
+    send_ns: int  # tick deadline -> datagrams handed to the socket
+    capture_to_send_ns: int | None = None
+
+
+class Datagram(Record, frozen=True, kw_only=True):
+    """Raw bytes as they crossed a connection; `link` is the connection's name."""
+
+    at_ns: int
+    link: str
+    outgoing: bool
+    data: bytes
+
+
+@cache
+def raw_topic(link: str, *, outgoing: bool) -> str:
+    """Topic of a connection's raw bytes in one direction."""
+    return f"/raw/{link}/{'out' if outgoing else 'in'}"
+
+
+class Refused(Record, frozen=True, kw_only=True):
+    """What a connection dropped before anything looked into it, since this was last told."""
+
+    at_ns: int
+    link: str
+    counts: dict[str, int]  # reason -> count
+
+
+class Checked(Record, frozen=True, kw_only=True):
+    """One item of the check before arming; nothing that the loop decides, so a replay passes it over."""
+
+    at_ns: int
+    name: str
+    state: str  # good, note, undetermined or bad
+    value: str
+    want: str
+    hint: str
+
+
+class Ending(Record, frozen=True, kw_only=True):
+    """How the flight ended: the last word of the daemon, before its recording is closed."""
+
+    cause: str  # one of a few phrases (`uavctl.outcome.Cause`)
+    as_ordered: bool  # by the operator, the mission or the pilot
+    sentence: str  # for a person, with where the vehicle was then
+    exit_code: int  # of the program
+    relay: str = ""  # what became of the positions that were passed on to the vehicle; empty where none were
+
+
+class RelayStats(Record, frozen=True, kw_only=True):
+    """Counters, since the start, of the positions that are passed on to the vehicle's own estimator."""
+
+    at_ns: int
+    sent: int
+    kept: dict[str, int]  # that were not passed on, by reason
+    last_ns: int | None  # when the last one went
+    alone: bool  # nothing else is sent: control has ended, or failed
+
+
+class LinkStats(Record, frozen=True, kw_only=True):
+    """Counters of one connection since the start."""
+
+    at_ns: int
+    link: str
+    datagrams: int
+    messages: int
+    samples: int
+    bad: dict[str, int]  # reason -> count
+    clock_offset_ns: int | None
+    clock_source: str  # "timesync", "minimum" or "none"
+    # TIMESYNC with the source of positions; with the vehicle on a link that carries none
+    clock_rtt_ns: int | None = None  # median of the last minute's round trips
+    clock_drift_ppm: float | None = None  # what our clock gains on the peer's
+    clock_rejected: int = 0  # answers that came too late, or deviated
+
+
+class Truth(Record, frozen=True, kw_only=True):
+    """The simulator's own state (only in simulated flights)."""
+
+    at_ns: int
+    position_m: Vec3
+    velocity_mps: Vec3
+    state: Vector  # (n_x,) of the linear plant
+    input: Vector  # (n_u,) applied
+    sent: int  # positions sent so far
+    lost: int  # of which the channel lost
+    mode: str
+    faults: tuple[str, ...] = ()  # what is amiss
+
+
+class Header(Record, frozen=True, kw_only=True):
+    """First message of a recording: what is needed to decide alike."""
+
+    started_ns: int
+    started_utc: str
+    seed: int
+    command: str
+    config_toml: str
+    design_id: str
+    design: dict[str, object]
+    versions: dict[str, str]
+    cpu: str
+    library_id: str | None = None  # hash of the policy library; None if none was flown with
+
+
+class LinkEstimate(Record, frozen=True, kw_only=True):
+    """What is believed of the link that carries the positions, at a Δt boundary."""
+
+    at_ns: int
+    arrived: float  # steps with news, the older the less they count
+    lost: float  # steps without
+    arrival_mean: float  # of the posterior of p
+    arrival_lower: float  # p is above this with probability `credible`
+    credible: float
+    burst_statistic: float  # about N(0, 1) if losses are independent, large if they come in bursts
+    bursts: bool
+    promised: float  # what the design counts on for p
+    below_promise: bool  # p is below `promised` with probability `credible` at least
+
+
+class PolicyLibrary(Record, frozen=True, kw_only=True):
+    """The policy library that is decided with; second record of a recording, for a replay that decides alike."""
+
+    library_id: str
+    design_id: str
+    data: bytes  # as `uavctl.build.library.encode` writes it
+
+
+class Sink(Protocol):
+    """Takes records; never blocks, never raises into the control loop."""
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        """Record one value under a topic."""
+        ...
+
+
+class Outgoing(Record, frozen=True, kw_only=True):
+    """Bytes for a connection."""
+
+    link: str
+    data: bytes
+
+
+class Flyer(Protocol):
+    """What flies: bytes in, bytes out, time as an argument. The simulator is given one."""
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+        """Take one datagram that arrived at `at_ns`; gives what is to be sent at once."""
+        ...
+
+    def tick(self, tick: int, at_ns: int) -> Iterable[Outgoing]:
+        """Run the control tick of the grid time `at_ns`; gives the bytes to send, to be taken to the last one."""
+        ...

@@ -1,0 +1,1 @@
+"""MPC with risk conditioned on the age of information: what flies by default."""

@@ -1,0 +1,456 @@
+"""The exact decision problem, component by component, in Clarabel.
+
+Problem (19) with its terminal condition reduced, state constraints softened by exact penalties, and an artificial
+reference: the plan ends in the equilibrium nearest to the target that can be reached. Where no equilibrium is
+within
+reach of N steps, a second program lets the terminal equality give way, and the answer says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.errors import DesignError
+from uavctl.records import GaveWay, SolveStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite, relative_gap
+from uavctl.smpc.hahn_stursberg.cones import BREAKDOWN, Expression, ProgramBuilder, Solution
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, assembled
+from uavctl.smpc.hahn_stursberg.horizon import (
+    Affine,
+    Component,
+    Horizon,
+    TerminalBound,
+    decompose,
+    horizon_of,
+    terminal_bound,
+)
+from uavctl.smpc.hahn_stursberg.program import Program, terminal_backoff_x
+from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed
+from uavctl.smpc.plant import digest
+
+# From the answers of independent components to the answer for the whole plant.
+
+
+Array = NDArray[np.float64]
+
+# A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
+INPUT_TOLERANCE = 1e-6
+
+# What still counts as a constraint kept (each in its own unit, or summed over a plan).
+KEPT = 1e-6
+
+# The worst of several components' endings is the plan's: the later in this list, the worse.
+_ORDER = (
+    SolveStatus.OPTIMAL,
+    SolveStatus.INACCURATE,
+    SolveStatus.ITERATION_LIMIT,
+    SolveStatus.INFEASIBLE,
+    SolveStatus.FAILED,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PartAnswer:
+    """A component's share of an answer, in its own coordinates and rows; the fields are those of `Answer`."""
+
+    status: SolveStatus
+    iterations: int
+    inputs: Array
+    backoff_x: Array
+    backoff_u: Array
+    reference: Array
+    slack: float
+    offset: float
+    terminal_miss: float
+    cost: float
+    cost_lower: float
+
+    @classmethod
+    def failed(cls, status: SolveStatus, iterations: int = 0) -> PartAnswer:
+        """A share without a plan."""
+        empty = np.zeros((0, 0))
+        return cls(status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf)
+
+
+def assemble(
+    design: Design,
+    seq: int,
+    method: str,
+    x: Array,
+    parts: Sequence[tuple[Component, PartAnswer]],
+    outlook: Preview = NOMINAL,
+) -> Answer:
+    """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
+    status = max((part.status for _, part in parts), key=_ORDER.index)
+    iterations = sum(part.iterations for _, part in parts)
+    if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
+        return Answer.failed(seq, status, method, iterations)
+    inputs = np.zeros((design.horizon, design.plant.n_u))
+    backoff_x = np.zeros((design.horizon + 1, design.state_set.b.size))
+    backoff_u = np.zeros((design.horizon, design.input_set.b.size))
+    reference = np.zeros(design.plant.n_x)
+    for where, part in parts:
+        inputs[:, where.inputs] = part.inputs
+        backoff_x[:, where.rows_x] = part.backoff_x
+        backoff_u[:, where.rows_u] = part.backoff_u
+        reference[where.states] = part.reference
+    cost, cost_lower = sum(part.cost for _, part in parts), sum(part.cost_lower for _, part in parts)
+    answer = Answer(
+        seq=seq,
+        status=status,
+        method=method,
+        inputs=inputs,
+        states=_predict(design, x, inputs),
+        backoff_x=backoff_x,
+        backoff_u=backoff_u,
+        reference=reference,
+        slack=sum(part.slack for _, part in parts),
+        offset=sum(part.offset for _, part in parts),
+        terminal_miss=sum(part.terminal_miss for _, part in parts),
+        cost=cost,
+        cost_lower=cost_lower,
+        gap=relative_gap(cost, cost_lower),
+        iterations=iterations,
+    )
+    return told(design, answer, [component for component, _ in parts], outlook)
+
+
+def told(design: Design, answer: Answer, components: Sequence[Component], outlook: Preview) -> Answer:
+    """The answer with the names of what gave way, if anything did."""
+    if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
+        return answer
+    return replace(answer, gave_way=gave_way(design, answer, components, outlook))
+
+
+def gave_way(design: Design, answer: Answer, components: Sequence[Component], outlook: Preview) -> tuple[GaveWay, ...]:
+    """Constraints that an answer does not keep: tightened state rows, terminal rows, the terminal equality."""
+    limits = outlook.limits
+    if limits is None:
+        limits = np.tile(design.state_set.b, (design.horizon + 1, 1))
+    free = design.horizon - design.terminal.tau
+    given: list[GaveWay] = []
+
+    def add(constraint: str, stage: int, excess: Array) -> None:
+        for i in np.flatnonzero(excess > KEPT):
+            given.append(GaveWay(constraint=constraint, stage=stage, index=int(i), amount=float(excess[i])))
+
+    excess = answer.states @ design.state_set.c.T + answer.backoff_x - limits
+    for t in range(1, design.horizon + 1):
+        add("state", t, excess[t])
+    backoff = np.zeros(design.state_set.b.size)
+    for part in components:
+        backoff[part.rows_x] = terminal_backoff_x(design, part)
+    placed = design.state_set.c @ answer.reference
+    add("terminal", free, placed + backoff - limits[free:].min(axis=0))
+    add("equilibrium", free, np.abs(answer.states[free] - answer.reference))
+    return tuple(given)
+
+
+def inside(inputs: Array, c: Array, b: Array) -> tuple[Array, bool]:
+    """Cut inputs (H, n_u) back to c u <= b: a row of one entry exactly, others along the row.
+
+    Returns:
+        The inputs, and whether they were within INPUT_TOLERANCE of the limits before.
+    """
+    cut = inputs.copy()
+    for row, side in zip(c, b, strict=True):
+        (used,) = np.nonzero(row)
+        excess = np.maximum(cut @ row - side, 0.0)
+        cut -= np.outer(excess, row / (row @ row))
+        if used.size == 1:
+            limit = side / row[used[0]]
+            clip = np.minimum if row[used[0]] > 0 else np.maximum
+            cut[:, used[0]] = clip(cut[:, used[0]], limit)
+    return cut, bool(np.max(np.abs(cut - inputs), initial=0.0) <= INPUT_TOLERANCE)
+
+
+def _predict(design: Design, x: Array, inputs: Array) -> Array:
+    states = [x]
+    for u in inputs:
+        states.append(design.plant.a @ states[-1] + design.plant.b @ u)
+    return np.array(states)
+
+
+METHOD = "exact"
+
+# The solver ends when the gap is small beside its largest numbers; where prices dwarf the cost, that proves nothing.
+_PROVEN = 1e-4
+
+# What each ending of the solver means for a flight; a test holds the table complete.
+_STATUS = {
+    "Solved": SolveStatus.OPTIMAL,
+    "AlmostSolved": SolveStatus.INACCURATE,
+    "InsufficientProgress": SolveStatus.INACCURATE,
+    "PrimalInfeasible": SolveStatus.INFEASIBLE,
+    "AlmostPrimalInfeasible": SolveStatus.INFEASIBLE,
+    "MaxIterations": SolveStatus.ITERATION_LIMIT,
+    "MaxTime": SolveStatus.FAILED,
+    "DualInfeasible": SolveStatus.FAILED,
+    "AlmostDualInfeasible": SolveStatus.FAILED,
+    "NumericalError": SolveStatus.FAILED,
+    "CallbackTerminated": SolveStatus.FAILED,
+    "Unsolved": SolveStatus.FAILED,
+    BREAKDOWN: SolveStatus.FAILED,
+}
+
+
+class ConicSolver:
+    """Solves the decision problem of a design; built once, then only right sides change.
+
+    The same question gives the same bits whatever was asked before. Not for concurrent use.
+    """
+
+    def __init__(self, design: Design) -> None:
+        """Build the programs of every component.
+
+        Raises:
+            DesignError: The design cannot be decomposed, or its schedule does not fit its terminal law.
+        """
+        self._design = design
+        self._parts = tuple(PartSolver(design, component) for component in decompose(design))
+        self._late: dict[int, ConicSolver] = {}
+
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+        """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
+
+        Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
+        """
+        if not finite(x, target, outlook) or outlook.late > len(self._design.late):
+            return Answer.failed(seq, SolveStatus.FAILED, METHOD)
+        if outlook.late:
+            return self._of_late(outlook.late).solve(seq, x, target, replace(outlook, late=0))
+        parts = [(part.component, part.solve(x, target, outlook)) for part in self._parts]
+        return assemble(self._design, seq, METHOD, x, parts, outlook)
+
+    def _of_late(self, late: int) -> ConicSolver:
+        """The solver of the design for positions `late` steps old; built when it is first asked for."""
+        if late not in self._late:
+            self._late[late] = ConicSolver(self._design.late[late - 1])
+        return self._late[late]
+
+
+class PartSolver:
+    """The two programs of one component, and how their solutions are read."""
+
+    def __init__(self, design: Design, component: Component) -> None:
+        self.component = component
+        self._design = design
+        self._horizon = horizon_of(design, component)
+        self._exact = Program(design, self._horizon, soft_terminal=False)
+        self._missing = Program(design, self._horizon, soft_terminal=True)
+        self._unseen = np.einsum("ij,jk,ik->i", component.c_x, component.estimate_cov, component.c_x)
+        self._noise_x = [self._horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)]
+        self._noise_u = [self._horizon.input_noise(t, component.c_u) for t in range(design.horizon)]
+
+    def solve(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> PartAnswer:
+        """Solve for the whole plant's state, target and outlook."""
+        x, target = x[self.component.states], target[self.component.states]
+        program = self._exact
+        solution = program.conic.solve(program.parameters(x, target, outlook))
+        status, iterations = _STATUS[solution.status], solution.iterations
+        if status not in (SolveStatus.OPTIMAL, SolveStatus.ITERATION_LIMIT):
+            program = self._missing
+            solution = program.conic.solve(program.parameters(x, target, outlook))
+            status = _STATUS[solution.status]
+            iterations += solution.iterations
+        if not (np.all(np.isfinite(solution.variables)) and np.isfinite(solution.cost)):
+            status = SolveStatus.FAILED
+        return self._read(program, solution, status, iterations, x, target)
+
+    def _read(
+        self, program: Program, solution: Solution, status: SolveStatus, iterations: int, x: Array, target: Array
+    ) -> PartAnswer:
+        part, horizon, layout, values = self.component, self._horizon, program.layout, solution.variables
+        here = part.coordinates @ x
+        y = here + values[layout.y]
+        wanted = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
+        wanted[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ here
+        inputs, kept = inside(wanted, part.c_u, part.b_u)
+        unproven = relative_gap(solution.cost, solution.cost_lower) > _PROVEN
+        if (unproven or not kept) and status is SolveStatus.OPTIMAL:
+            status = SolveStatus.INACCURATE
+        theta = values[layout.theta]
+        return PartAnswer(
+            status=status,
+            iterations=iterations,
+            inputs=inputs,
+            backoff_x=_backoff(self._noise_x, theta, self._design.kappa_x, self._unseen, horizon.width),
+            backoff_u=_backoff(self._noise_u, theta, self._design.kappa_u, np.zeros(part.b_u.size), horizon.width),
+            reference=part.x_eq @ y,
+            slack=_total(values[layout.slack]),
+            offset=float(np.sum(np.abs(y - part.coordinates @ target))),
+            terminal_miss=_total(values[layout.miss]) + _total(values[layout.outside]),
+            cost=solution.cost,
+            cost_lower=solution.cost_lower,
+        )
+
+
+def _total(values: Array) -> float:
+    return float(np.sum(np.maximum(values, 0.0)))
+
+
+def _backoff(noise: list[Affine], theta: Array, kappa: Array, unseen: Array, width: int) -> Array:
+    """κ_t (‖·‖² + unseen)^½ of every row and stage (stages, rows)."""
+    squares = [np.sum(stage.at(theta).reshape(unseen.size, width) ** 2, axis=1) for stage in noise]
+    backoff: Array = kappa[:, None] * np.sqrt(np.array(squares) + unseen)
+    return backoff
+
+
+# Offline questions about a design: can its schedule meet the terminal condition, and at what cost is a state left?
+
+
+# Below this margin the terminal condition has no usable interior as it stands, and is reduced once more.
+LEAST_MARGIN = 1e-6
+
+
+def check_schedule(design: Design) -> float:
+    """Margin s* of the terminal condition: max s with I - L_z⁻¹ Cov(z) L_z⁻ᵀ ⪰ s I over all gains of the schedule.
+
+    Where that leaves no interior (s* <= 1e-6), constant directions are taken out and s* is that of the reduced
+    condition, which is the one that the solver sees.
+
+    Returns:
+        s*, the least of all components.
+
+    Raises:
+        DesignError: s* < 0: the schedule feeds back later than the terminal law does.
+    """
+    return min(_component_margin(horizon_of(design, component)) for component in decompose(design))
+
+
+def _component_margin(horizon: Horizon) -> float:
+    margin = _margin(terminal_bound(horizon, move_constants=False))
+    if margin <= LEAST_MARGIN:
+        margin = _margin(terminal_bound(horizon))
+    if margin <= LEAST_MARGIN:
+        raise DesignError(
+            "schedule.delays",
+            f"the schedule is slower than the terminal law (s* = {margin:.2g}): no feedback keeps the terminal "
+            "covariance within its bound",
+            f"use at most tau + 1 = {horizon.tau + 1} from stage {horizon.tau + 1} on",
+        )
+    return margin
+
+
+def _margin(bound: TerminalBound) -> float:
+    """Max s with (1 - s) I ⪰ Y Yᵀ and `fixed` = 0; -inf where no gain meets the equalities."""
+    if bound.least < -LEAST_MARGIN:
+        return bound.least
+    n_theta = bound.y.matrix.shape[1]
+    if not n_theta:
+        largest = np.linalg.norm(bound.y.offset.reshape(bound.rows, bound.columns), 2) if bound.y.offset.size else 0.0
+        return float(1.0 - largest**2)
+    builder = ProgramBuilder(n_theta + 1, 0)
+    builder.quadratic(slice(n_theta, n_theta + 1), np.zeros((1, 1)), -np.ones(1))
+    triangle = _expression(bound.triangle())
+    size = bound.rows + bound.columns
+    diagonal = np.cumsum(np.arange(1, size + 1)) - 1
+    triangle.var[diagonal[: bound.rows], n_theta] = -1.0
+    builder.semidefinite(triangle, size)
+    if bound.fixed.offset.size:
+        builder.zero(_expression(bound.fixed))
+    solution = builder.build(max_iterations=200).solve(np.zeros(0))
+    return -solution.cost if solution.status in ("Solved", "AlmostSolved") else -np.inf
+
+
+def _expression(affine: Affine) -> Expression:
+    """The map of θ as one of (θ, s)."""
+    size = affine.offset.size
+    return Expression(
+        np.hstack([affine.matrix.toarray(), np.zeros((size, 1))]), np.zeros((size, 0)), affine.offset.astype(np.float64)
+    )
+
+
+@lru_cache(maxsize=1)
+def _solver(design: Design) -> ConicSolver | None:
+    """The last design's solver, None where its schedule will not do.
+
+    A search asks for the cost of many states of one design in a row; margin and programs are the design's alone.
+    """
+    try:
+        check_schedule(design)
+    except DesignError:
+        return None
+    return ConicSolver(design)
+
+
+def optimal_cost(design: Design, x: Array) -> float | None:
+    """Optimal cost (19a) from a state (n_x,) to the design's target, None where (19) is infeasible."""
+    solver = _solver(design)
+    if solver is None:
+        return None
+    answer = solver.solve(0, x, design.target)
+    if answer.status is not SolveStatus.OPTIMAL:
+        return None
+    return None if max(answer.slack, answer.offset, answer.terminal_miss) > KEPT else answer.cost
+
+
+# Plans that are based on late positions (re-basing).
+#
+# A position that is newer than the plan's base but j steps old gives x̂(k|k-j), the prediction under the inputs that
+# were flown. Planning from there is solving at the time of capture with those j inputs held fixed: the means start at
+# x̂(k|k-j), the disturbances w(k-j) … w(k-1) are not known yet but will be, and the sunk stages are nobody's to
+# choose. What feedback may be counted on is conditional on what is known: nothing newer than k-j has come until k.
+
+
+@dataclass(frozen=True, eq=False)
+class LateDemand(ScheduleDemand):
+    """What a schedule has to meet that is based on a position `late` steps old; stages count from now."""
+
+    late: int = 0
+
+    def alpha(self, t: int, delay: int) -> float:
+        """P(w(k+t-d) is known at stage t | a(k) = late); 1 where that is not a disturbance since the base."""
+        newest = t - delay + self.late
+        return 1.0 if newest < 0 else self.link.available(t + self.late, newest, self.late)
+
+    def usable(self, delays: Sequence[int]) -> Array:
+        """See `Demand`."""
+        if self.joint:
+            sunk = range(1, self.late + 1)  # longer than the time since the base: no feedback
+            return self.link.jointly((*sunk, *(delays)), self.late)[self.late :]
+        return super().usable(delays)
+
+
+def with_late(design: Design, spec: DesignSpec, steps: int) -> Design:
+    """The design, with those for positions 1 … `steps` steps old.
+
+    Raises:
+        DesignError: There is none for one of these ages.
+    """
+    if not steps:
+        return design
+    late = tuple(make_late(design, spec, j) for j in range(1, steps + 1))
+    whole = replace(design, late=late, design_id="")
+    return replace(whole, design_id=digest(whole))
+
+
+def make_late(design: Design, spec: DesignSpec, late: int) -> Design:
+    """The design for positions that are `late` steps old, with `late` = 0 the design itself.
+
+    It has the delays of the design. A stage t < d_t, which feeds back nothing there, does so here too: news of the
+    disturbances before now could reach it, but too seldom to count on.
+
+    Args:
+        design: For positions that are not late.
+        late: Age of the position, j [steps].
+
+    Raises:
+        DesignError: The link leaves too little to count on, a terminal limit does not hold, or the terminal condition
+            cannot be met; the message names the age.
+    """
+    if not late:
+        return design
+    demand = LateDemand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint, late)
+    delays = tuple(d if t >= d else t + late + 1 for t, d in enumerate(design.schedule.delays))
+    try:
+        made = assembled(spec, fixed(demand, delays), design.terminal, late)
+        check_schedule(made)
+    except DesignError as error:
+        raise DesignError(error.key, f"for positions of age {late}: {error.reason}", error.hint) from error
+    return made

@@ -1,0 +1,485 @@
+"""Stacked prediction of one component: means, disturbance feedback, covariance cost.
+
+x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ
+and
+rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the
+entries
+of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
+
+Disturbances that the state does not show apart, as under an E or a W without full column rank, are not fed back
+apart
+either: M_{t,r} = Θ_{t,r} T with T w the part of w that E w determines, in units of its standard deviation. Feedback
+of
+the rest would only add variance. Where nothing is redundant T = I, and θ are entries of M.
+
+A plan that is based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean
+starts at the prediction x̂(k) under the inputs that were flown, and what acted on it meanwhile is not known yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import block_diag, qr
+from scipy.sparse.csgraph import connected_components
+
+from uavctl.errors import DesignError
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.schedule import Schedule
+from uavctl.smpc.sets import RANK_TOLERANCE, equilibrated, equilibria
+
+# Decomposition of the decision problem into independent parts.
+#
+# Nodes are states, inputs and disturbances; an edge is a non-zero entry by which A, B, E, W, Q_x, Q_u, K or one row
+# of a constraint couples two of them. The connected components are problems of their own with the same optimum:
+# gains across components only add cost and covariance. The χ² quantiles stay those of the whole plant.
+
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One independent part of a design: where it sits in the whole, and its own matrices."""
+
+    states: Index  # indices of its states in the plant's
+    inputs: Index  # indices of its inputs
+    disturbances: Index  # indices of its disturbances
+    coordinates: Array  # (n_y, n_x): y of the equilibrium that a state belongs to, its positions where they can be held
+    rows_x: Index  # indices of its rows in the state set
+    rows_u: Index  # indices of its rows in the input set
+    a: Array  # A (n_x, n_x); b: B (n_x, n_u); e: E (n_x, n_w); w: W (n_w, n_w)
+    b: Array
+    e: Array
+    w: Array
+    q_x: Array  # state weight (n_x, n_x)
+    q_u: Array  # input weight (n_u, n_u)
+    c_x: Array  # rows of the state set (m_x, n_x)
+    b_x: Array  # right sides (m_x,)
+    c_u: Array  # rows of the input set (m_u, n_u)
+    b_u: Array  # right sides (m_u,)
+    k: Array  # terminal gain K_τ (n_u, n_x)
+    sigma_x: Array  # stationary covariance of a state under the terminal law (n_x, n_x)
+    estimate_cov: Array  # covariance of the estimate's error in every stage (n_x, n_x)
+    sigma_xi: Array  # the same of ξ = (x_{H-τ} … x_H)
+    sigma_z: Array  # the same of z = (x_{H-τ}, u_{H-τ} … u_{H-1})
+    p_xi: Array  # terminal weight of ξ
+    held: Index  # indices of the states whose values y is (n_y,)
+    x_eq: Array  # equilibrium states (n_x, n_y): x_s = x_eq y
+    u_eq: Array  # equilibrium inputs (n_u, n_y)
+
+
+def decompose(design: Design) -> tuple[Component, ...]:
+    """Connected components of a design, in the order of their first state.
+
+    Raises:
+        DesignError: A state is connected to no input.
+    """
+    plant = design.plant
+    n_x, n_u, n_w = plant.n_x, plant.n_u, plant.n_w
+    size = n_x + n_u + n_w
+    x, u, w = np.arange(n_x), n_x + np.arange(n_u), n_x + n_u + np.arange(n_w)
+    edges = np.zeros((size, size), dtype=bool)
+    for rows, columns, matrix in (
+        (x, x, plant.a),
+        (x, u, plant.b),
+        (x, w, plant.e),
+        (w, w, plant.w),
+        (x, x, design.q_x),
+        (x, x, design.estimate_cov),
+        (u, u, design.q_u),
+        (u, x, design.terminal.k),
+        (x, x, _shared_row(design.state_set.c)),
+        (u, u, _shared_row(design.input_set.c)),
+    ):
+        edges[np.ix_(rows, columns)] |= matrix != 0
+    _, label = connected_components(sparse.csr_array(edges), directed=False)
+    labels = dict.fromkeys(int(label[i]) for i in x)
+    return tuple(
+        _component(design, np.flatnonzero(label[x] == i), np.flatnonzero(label[u] == i), np.flatnonzero(label[w] == i))
+        for i in labels
+    )
+
+
+def whole(design: Design) -> Component:
+    """The design as one component, whatever it decomposes into."""
+    plant = design.plant
+    return _component(design, np.arange(plant.n_x), np.arange(plant.n_u), np.arange(plant.n_w))
+
+
+def _shared_row(c: Array) -> Array:
+    """Non-zero where two variables appear in one row of a constraint."""
+    used = (c != 0).astype(np.float64)
+    shared: Array = used.T @ used
+    return shared
+
+
+def _component(design: Design, states: Index, inputs: Index, disturbances: Index) -> Component:
+    plant, terminal = design.plant, design.terminal
+    if not len(inputs):
+        raise DesignError("plant.b", f"states {states.tolist()} are reached by no input", "give each state an input")
+    rows_x = _finite_rows(design.state_set.c[:, states], design.state_set.b)
+    rows_u = _finite_rows(design.input_set.c[:, inputs], design.input_set.b)
+    stack = np.concatenate([i * plant.n_x + states for i in range(terminal.tau + 1)])
+    z = np.concatenate([states, *(plant.n_x + i * plant.n_u + inputs for i in range(terminal.tau))])
+    a, b = plant.a[np.ix_(states, states)], plant.b[np.ix_(states, inputs)]
+    q_x, q_u = design.q_x[np.ix_(states, states)], design.q_u[np.ix_(inputs, inputs)]
+    rest = equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
+    return Component(
+        states=states,
+        inputs=inputs,
+        disturbances=disturbances,
+        coordinates=rest.coordinates,
+        rows_x=rows_x,
+        rows_u=rows_u,
+        a=a,
+        b=b,
+        e=plant.e[np.ix_(states, disturbances)],
+        w=plant.w[np.ix_(disturbances, disturbances)],
+        q_x=q_x,
+        q_u=q_u,
+        c_x=design.state_set.c[np.ix_(rows_x, states)],
+        b_x=design.state_set.b[rows_x],
+        c_u=design.input_set.c[np.ix_(rows_u, inputs)],
+        b_u=design.input_set.b[rows_u],
+        k=terminal.k[np.ix_(inputs, states)],
+        sigma_x=terminal.sigma_x[np.ix_(states, states)],
+        estimate_cov=design.estimate_cov[np.ix_(states, states)],
+        sigma_xi=terminal.sigma_xi[np.ix_(stack, stack)],
+        sigma_z=terminal.sigma_z[np.ix_(z, z)],
+        p_xi=terminal.p_xi[np.ix_(stack, stack)],
+        held=rest.held,
+        x_eq=rest.x_eq,
+        u_eq=rest.u_eq,
+    )
+
+
+def _finite_rows(c: Array, b: Array) -> Index:
+    return np.flatnonzero(np.any(c != 0, axis=1) & np.isfinite(b))
+
+
+@dataclass(frozen=True, eq=False)
+class Affine:
+    """offset + matrix θ, a vector (m,) affine in θ."""
+
+    offset: Array
+    matrix: sparse.csr_array
+
+    def at(self, theta: Array) -> Array:
+        """Value (m,) at θ."""
+        value: Array = self.offset + self.matrix @ theta
+        return value
+
+
+class Horizon:
+    """Prediction of one component over H steps.
+
+    Attributes:
+        component: The component.
+        steps: H.
+        tau: Delay τ of the terminal law.
+        free: N = H - τ, the number of stages with a free mean input.
+        past: Disturbances before k that are not known at k [steps].
+        gains: (t, r, input, row of `feedback`) of each entry of θ.
+        feedback: T (n_f, n_w): M_{t,r} = Θ_{t,r} T. The identity where no disturbance is redundant.
+        drive: Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank.
+        input_stages: Stages whose input limits are not implied by the terminal condition: N, but H where B has not full
+            column rank, because (19c) then says nothing about what the state does not feel.
+        phi: Φ_t (H+1, n_x, n_x).
+        gamma: Γ_t (H+1, n_x, N n_u).
+        gamma_eq: Γ^eq_t (H+1, n_x, n_y).
+        p: Hessian (n_θ, n_θ) of the covariance cost ½ θᵀPθ + qᵀθ + c_0.
+        q: Its linear term (n_θ,).
+        c_0: Its constant: open-loop disturbances, terminal weight included.
+    """
+
+    def __init__(self, component: Component, steps: int, tau: int, schedule: Schedule, past: int = 0) -> None:
+        """Predict `component` over `steps` steps from a position that is `past` steps old.
+
+        Raises:
+            DesignError: The schedule feeds back a disturbance r >= N, for which the reduced terminal condition does
+                not hold.
+        """
+        self.component = component
+        self.steps = steps
+        self.tau = tau
+        self.free = steps - tau
+        self.past = past
+        n_u = component.b.shape[1]
+        self._spread, self.feedback, self._root_w = _shown(component.e, component.w)
+        self._n_w = self._spread.shape[1]
+        fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # nothing to feed back otherwise
+        self.drive = _felt(component.b)
+        self.input_stages = self.free if len(self.drive) == n_u else steps
+        self.gains = tuple(
+            (t, r, i, j)
+            for t in range(steps)
+            for r in _fed_back(t, int(schedule.delays[t]), self.free, past)
+            for i in range(n_u)
+            for j in fed_back
+        )
+        powers = [np.eye(component.a.shape[0])]
+        for _ in range(steps + past):
+            powers.append(component.a @ powers[-1])
+        self.phi = np.array(powers[: steps + 1])
+        self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
+        self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i S
+        self.gamma, self.gamma_eq = self._means()
+        self.p, self.q, self.c_0 = self._covariance_cost()
+
+    @property
+    def width(self) -> int:
+        """Number of disturbance entries ω over the horizon, (past + H) n_w where none is redundant."""
+        return (self.past + self.steps) * int(self._n_w)
+
+    @property
+    def sigma_z(self) -> Array:
+        """Σ_z of z = (x_N, u_N … u_{H-1}), of the inputs what the state feels."""
+        n_x = self.component.a.shape[0]
+        select = block_diag(np.eye(n_x), *[self.drive] * self.tau)
+        sigma: Array = select @ self.component.sigma_z @ select.T
+        return sigma
+
+    @property
+    def n_theta(self) -> int:
+        """Number of gains."""
+        return len(self.gains)
+
+    def state_noise(self, t: int, c: Array) -> Affine:
+        """c x_t without its mean, c (m, n_x), as coefficients of ω: (m · width,), row by row."""
+        m = c.shape[0]
+        offset = np.zeros((m, self.past + self.steps, self._n_w))
+        for r in range(-self.past, t):
+            offset[:, self.past + r] = c @ self._open[t - 1 - r]
+        effect = {s: c @ self._response[t - 1 - s] for s in range(t)}
+        return self._affine(offset, effect)
+
+    def input_noise(self, t: int, c: Array) -> Affine:
+        """c u_t without its mean, c (m, n_u), as coefficients of ω: (m · width,), row by row."""
+        return self._affine(np.zeros((c.shape[0], self.past + self.steps, self._n_w)), {t: c})
+
+    def terminal_noise(self) -> Affine:
+        """z of `sigma_z` as coefficients of the past + N older disturbances, row by row."""
+        parts = [self.state_noise(self.free, np.eye(self.component.a.shape[0]))]
+        parts += [self.input_noise(t, self.drive) for t in range(self.free, self.steps)]
+        stacked = _stack(parts)
+        columns = np.tile(np.arange(self.width), stacked.offset.size // max(1, self.width))
+        # No gain acts on the newer ones, nor do they reach z.
+        old = np.flatnonzero(columns < (self.past + self.free) * self._n_w)
+        return Affine(stacked.offset[old], stacked.matrix[old])
+
+    def _affine(self, offset: Array, effect: dict[int, Array]) -> Affine:
+        """Add the gains: `effect[s]` (m, n_u) is what u_s does to the rows."""
+        m, width = offset.shape[0], self.width
+        rows: list[int] = []
+        columns: list[int] = []
+        values: list[float] = []
+        for k, (s, r, i, j) in enumerate(self.gains):
+            if s not in effect:
+                continue
+            for row in range(m):
+                for k_w in np.flatnonzero(self._root_w[j]):
+                    rows.append(row * width + (self.past + r) * self._n_w + int(k_w))
+                    columns.append(k)
+                    values.append(float(effect[s][row, i] * self._root_w[j, k_w]))
+        matrix = sparse.csr_array((values, (rows, columns)), shape=(m * width, self.n_theta))
+        matrix.eliminate_zeros()
+        return Affine(offset.ravel(), matrix)
+
+    def _means(self) -> tuple[Array, Array]:
+        n_x, n_u = self.component.b.shape
+        gamma = np.zeros((self.steps + 1, n_x, self.free * n_u))
+        gamma_eq = np.zeros((self.steps + 1, n_x, self.component.u_eq.shape[1]))
+        for t in range(self.steps):
+            gamma[t + 1] = self.component.a @ gamma[t]
+            gamma_eq[t + 1] = self.component.a @ gamma_eq[t]
+            if t < self.free:
+                gamma[t + 1, :, t * n_u : (t + 1) * n_u] += self.component.b
+            else:
+                gamma_eq[t + 1] += self.component.b @ self.component.u_eq
+        return gamma, gamma_eq
+
+    def _covariance_cost(self) -> tuple[Array, Array, float]:
+        """E of the stage costs (3) and of the terminal cost in (18), means taken off."""
+        part = self.component
+        state, control, terminal = _root(part.q_x), _root(part.q_u), _root(part.p_xi)
+        terms = [self.state_noise(t, state) for t in range(self.steps)]
+        terms += [self.input_noise(t, control) for t in range(self.steps)]
+        n_x = part.a.shape[0]
+        stacked = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
+        weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(self.width), format="csr")
+        xi = _stack(stacked)
+        terms.append(Affine(np.asarray(weight @ xi.offset), sparse.csr_array(weight @ xi.matrix)))
+        everything = _stack(terms)
+        gram = (everything.matrix.T @ everything.matrix).toarray()
+        linear = everything.matrix.T @ everything.offset
+        return 2.0 * gram, 2.0 * linear, float(everything.offset @ everything.offset)
+
+
+def _fed_back(t: int, delay: int, free: int, past: int) -> range:
+    """Disturbances r that M_{t,r} feeds back."""
+    if t >= free and t - delay >= free:
+        raise DesignError(
+            "schedule.delays",
+            f"delay {delay} in stage {t} feeds back a disturbance that the terminal law does not know yet",
+            f"use at least {t - free + 1} there",
+        )
+    return range(-past, max(-past, min(t - delay + 1, free)))
+
+
+def _shown(e: Array, w: Array) -> tuple[Array, Array, Array]:
+    """(S, T, R): E w = S ω for ω ~ N(0, I), what is fed back is T w, and T w = R ω.
+
+    T = I, S = E R and R Rᵀ = W unless some of the disturbances cannot be told apart from the state.
+    """
+    root = _cholesky(w)
+    spread = e @ root
+    size = np.linalg.norm(spread, axis=1)
+    size = np.where(size > 0.0, size, 1.0)
+    left, singular, _ = np.linalg.svd(spread / size[:, None], full_matrices=False)
+    rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
+    if rank == np.count_nonzero(np.diagonal(w)):
+        return spread, np.eye(len(w)), root
+    left, singular = left[:, :rank], singular[:rank]
+    inverse = (left / singular).T / size
+    told: Array = inverse @ e
+    told[np.abs(told) < RANK_TOLERANCE * (np.abs(inverse) @ np.abs(e))] = 0.0
+    return size[:, None] * left * singular, told, np.eye(rank)
+
+
+def _felt(b: Array) -> Array:
+    """Rows of B, as many as its rank, that tell what of an input the state feels: the identity if that is all of it."""
+    unit_x, unit_u = equilibrated(b)
+    scaled = b * np.outer(unit_x, unit_u)
+    _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
+    rank = int(np.sum(np.abs(np.diagonal(triangle)) > RANK_TOLERANCE))
+    return np.eye(b.shape[1]) if rank == b.shape[1] else b[np.sort(order[:rank])]
+
+
+def _cholesky(w: Array) -> Array:
+    """Lower triangular L with L Lᵀ = W, positive semi-definite; other units of w scale its rows only."""
+    lower = np.zeros_like(w)
+    for j in range(len(w)):
+        rest = w[j:, j] - lower[j:, :j] @ lower[j, :j]
+        if rest[0] > RANK_TOLERANCE * w[j, j]:
+            lower[j:, j] = rest / np.sqrt(rest[0])
+    return lower
+
+
+def _root(matrix: Array) -> Array:
+    """Symmetric root of a positive semi-definite matrix; diagonal stays diagonal."""
+    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
+        return np.diag(np.sqrt(np.diagonal(matrix)))
+    values, vectors = np.linalg.eigh(matrix)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root
+
+
+def _stack(parts: list[Affine]) -> Affine:
+    return Affine(
+        np.concatenate([part.offset for part in parts]),
+        sparse.csr_array(sparse.vstack([part.matrix for part in parts])),
+    )
+
+
+def horizon_of(design: Design, component: Component) -> Horizon:
+    """The prediction of a design's component."""
+    return Horizon(component, design.horizon, design.terminal.tau, design.schedule, design.past)
+
+
+# The terminal condition Σ_ξ - Ξ_H ⪰ 0 of (19c) without its empty interior.
+#
+# The last τ disturbances reach both sides alike, so (19c) is Cov(z) ⪯ Σ_z for z = (x_N, u_N … u_{H-1}) and the N older
+# disturbances. Columns of z that no gain acts on are constant and move to the right side, R = Σ_z - Z_c Z_cᵀ. On the
+# range of R, whitened, what is left is ‖Y(θ)‖₂ <= 1; off that range z must not move: linear equalities.
+
+
+# A deviation whose variance RANK_TOLERANCE calls empty.
+_EMPTY = float(np.sqrt(RANK_TOLERANCE))
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalBound:
+    """I - Y Yᵀ ⪰ 0 with Y (rows, columns), row by row affine in θ, and `fixed` = 0, linearly independent.
+
+    `least` is the least eigenvalue of R, scaled to unit variances; below zero, no θ meets (19c).
+    """
+
+    y: Affine
+    rows: int
+    columns: int
+    fixed: Affine
+    least: float
+
+    def triangle(self) -> Affine:
+        """Upper triangle of [[I, Y], [Yᵀ, I]], column by column."""
+        size = self.rows + self.columns
+        place = np.full((size, size), -1)
+        place[: self.rows, self.rows :] = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
+        index = np.concatenate([place[: j + 1, j] for j in range(size)])
+        diagonal = np.concatenate([np.arange(j + 1) == j for j in range(size)])
+        picked = np.flatnonzero(index >= 0)
+        select = sparse.csr_array(
+            (np.ones(picked.size), (picked, index[picked])), shape=(index.size, self.y.offset.size)
+        )
+        return Affine(diagonal + select @ self.y.offset, sparse.csr_array(select @ self.y.matrix))
+
+
+def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> TerminalBound:
+    """Reduce (19c) of one component.
+
+    Args:
+        move_constants: Move constant columns to the right side; without, R = Σ_z as it stands.
+    """
+    sigma = horizon.sigma_z
+    z = horizon.terminal_noise()
+    n_z = sigma.shape[0]
+    n_columns = z.offset.size // n_z
+    column = np.tile(np.arange(n_columns), n_z)
+    acted = np.zeros(n_columns, dtype=bool)
+    acted[column[np.diff(z.matrix.indptr) > 0]] = True
+    kept = acted if move_constants else np.ones(n_columns, dtype=bool)
+    constant = z.offset.reshape(n_z, n_columns)[:, ~kept]
+    scale = np.sqrt(np.diagonal(sigma))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh((sigma - constant @ constant.T) / np.outer(scale, scale))
+    inside = values > RANK_TOLERANCE
+    whiten = (vectors[:, inside] / np.sqrt(values[inside])).T / scale
+    outside = vectors[:, ~inside].T / scale
+    select = np.flatnonzero(kept[column])
+    rest = Affine(z.offset[select], z.matrix[select])
+    return TerminalBound(
+        y=_times(whiten, rest, int(kept.sum())),
+        rows=whiten.shape[0],
+        columns=int(kept.sum()),
+        fixed=_independent(_times(outside, rest, int(kept.sum())), _effect(rest, np.repeat(scale, kept.sum()))),
+        least=float(values[0]),
+    )
+
+
+def _times(matrix: Array, z: Affine, columns: int) -> Affine:
+    """matrix · Z for Z stored row by row."""
+    wide = sparse.kron(sparse.csr_array(matrix), sparse.eye_array(columns), format="csr")
+    return Affine(np.asarray(wide @ z.offset), sparse.csr_array(wide @ z.matrix))
+
+
+def _effect(z: Affine, std: Array) -> Array:
+    """Largest effect of each gain on an entry of z, in standard deviations; 1 for gains without any."""
+    largest = np.abs(z.matrix.toarray() / std[:, None]).max(axis=0, initial=0.0)
+    return np.where(largest > 0.0, largest, 1.0)
+
+
+def _independent(rows: Affine, effect: Array) -> Affine:
+    """Linearly independent equations with the same solutions; what no gain moves is left out unless it is not 0."""
+    left, singular, right = np.linalg.svd(rows.matrix.toarray() / effect)
+    rank = int(np.sum(singular > _EMPTY))
+    along, beside = left[:, :rank].T @ rows.offset, left[:, rank:].T @ rows.offset
+    contradiction = beside[np.abs(beside) > _EMPTY]
+    return Affine(
+        np.concatenate([along / singular[:rank], contradiction]),
+        sparse.csr_array(np.vstack([right[:rank] * effect, np.zeros((contradiction.size, effect.size))])),
+    )

@@ -1,0 +1,294 @@
+"""The mean half of one component's decision problem, as a QP with constant matrices.
+
+The mean inputs v_0 … v_{N-1} and the reference y meet x̄_N = x_eq y in the coordinates w = (v, y) = Z q + W p, so q
+is
+free. Every row reads lower <= A q + R p <= upper, less a back-off on both sides where disturbances reach it; p
+holds
+what a question brings: the state, the target, the present position. State rows are soft, and so is y = y_target,
+whose
+l1 price is the offset weight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.answer import NOMINAL, Preview
+from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon
+from uavctl.smpc.hahn_stursberg.program import factor, terminal_backoff_u, terminal_backoff_x
+from uavctl.smpc.qp import OPEN, pairs_of
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# A reference that N steps cannot reach from every state leaves rows of the terminal equality without an input.
+_RANK = 1e-9
+
+
+class RowKind(IntEnum):
+    """What a row limits."""
+
+    INPUT = 0
+    STATE = 1
+    REFERENCE = 2  # a terminal row around x_s
+    REST = 3  # a terminal row around u_s
+    OFFSET = 4  # y = y_target
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One direction c of a limit in one stage, both sides."""
+
+    kind: RowKind  # what it limits
+    t: int  # stage; of a reference row, N
+    c: Array  # direction: of the state, the input, or y
+    upper: int  # row of the set that limits +c, -1 for none
+    lower: int  # row of the set that limits -c, -1 for none
+    backoff: float  # its constant back-off, if no gain moves it
+    # Noise of c that gains move, κ and the unseen variance; None if the back-off is constant
+    noise: Affine | None = None
+    kappa: float = 0.0  # κ of the stage
+    unseen: float = 0.0  # variance that no feedback sees
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """One question in the numbers of the QPs."""
+
+    f: Array  # linear term of the cost (n_q,)
+    constant: float  # its constant
+    offset: Array  # what p adds to every row, R p (m,)
+    upper: Array  # right sides (m,), without back-offs, OPEN where there is none
+    lower: Array  # left sides (m,) alike
+    p: Array  # parameters (n_p,)
+
+
+class MeanProblem:
+    """Cost and rows of one component's mean; everything constant is computed once.
+
+    Attributes:
+        horizon: The component's prediction.
+        rows: What each row is, in order: inputs, states, reference, offset.
+        links: Rows whose back-off the gains move.
+        h: Hessian (n_q, n_q): cost ½ qᵀHq + fᵀq + c.
+        a: A (m, n_q).
+        r: R (m, n_p).
+        upper: Right sides without back-offs (m,), inf where open.
+        lower: Left sides without back-offs (m,), -inf where open.
+        backoff: Constant back-offs (m,), 0 for links.
+        price: Linear price of leaving a row (m,), inf for hard rows.
+        curve: Its quadratic part (m,): price s + curve s².
+        linear: (n_q, n_p): f = linear p, without a path.
+        residual_q: Root of the cost, the part of q.
+        residual_p: The part of p.
+        z: Z (n_w, n_q).
+        w: W (n_w, n_p).
+        reachable: Whether every state can be brought to some equilibrium in N steps.
+    """
+
+    def __init__(self, design: Design, horizon: Horizon) -> None:
+        self.design, self.horizon = design, horizon
+        part = horizon.component
+        n_x, n_y = part.x_eq.shape
+        self._n_u = part.b.shape[1]
+        self.n_v = horizon.gamma.shape[2]
+        self.n_y, self.n_p = n_y, n_x + 2 * n_y
+        self._x = np.eye(self.n_p)[:n_x]
+        self._to_target = np.eye(self.n_p)[n_x : n_x + n_y]
+        self._here = np.eye(self.n_p)[n_x + n_y :]
+        self.z, self.w, self.reachable = self._coordinates()
+        self.residual_q, self.residual_p = self._residuals()
+        self.h = 2.0 * self.residual_q.T @ self.residual_q
+        self.linear = 2.0 * self.residual_q.T @ self.residual_p
+        self.rows = (*self._input_rows(), *self._state_rows(), *self._reference_rows(), *self._offset_rows())
+        self.links = np.array([i for i, row in enumerate(self.rows) if row.noise is not None], dtype=np.intp)
+        kinds = np.array([row.kind for row in self.rows])
+        self._moving = np.flatnonzero(np.isin(kinds, (RowKind.STATE, RowKind.REFERENCE)))
+        maps = [self._map(row) for row in self.rows]
+        self.a = np.array([w @ self.z for w, _ in maps])
+        self.r = np.array([w @ self.w + p for w, p in maps])
+        self.upper, self.lower = self._sides()
+        self.backoff = np.array([row.backoff for row in self.rows])
+        soft = np.isin(kinds, (RowKind.STATE, RowKind.OFFSET))
+        prices = np.where(kinds == RowKind.STATE, design.slack_linear, design.offset_weight)
+        self.price = np.where(soft, prices, np.inf)
+        self.curve = np.where(kinds == RowKind.STATE, design.slack_quadratic, 0.0)
+
+    def parameters(self, x: Array, target: Array) -> Array:
+        """p (n_p,) of a state (n_x,) and a target (n_x,) of this component."""
+        part = self.horizon.component
+        here, there = part.coordinates @ x, part.coordinates @ target
+        return np.concatenate([x - part.x_eq @ here, there - here, here])
+
+    def cost(self, p: Array, outlook: Preview) -> tuple[Array, float]:
+        """Linear term f (n_q,) and constant c of the cost."""
+        residual = self.residual(p, outlook)
+        return 2.0 * self.residual_q.T @ residual, float(residual @ residual)
+
+    def residual(self, p: Array, outlook: Preview) -> Array:
+        """The cost's residuals at q = 0 (n_r,)."""
+        if outlook.path is None:
+            return np.asarray(self.residual_p @ p)
+        part, free = self.horizon.component, self.horizon.free
+        path = (outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs])
+        roots = (factor(part.q_x), factor(part.q_u))
+        wanted = np.concatenate([(values @ root.T).ravel() for values, root in zip(path, roots, strict=True)])
+        residual: Array = self.residual_p @ p - wanted
+        return residual
+
+    def sides(self, outlook: Preview) -> tuple[Array, Array]:
+        """Upper and lower limits (m,) of every row, without back-offs."""
+        if outlook.limits is None:
+            return self.upper, self.lower
+        part, free = self.horizon.component, self.horizon.free
+        limits = outlook.limits[:, part.rows_x]
+        last = limits[free:].min(axis=0)
+        upper, lower = self.upper.copy(), self.lower.copy()
+        for i in self._moving:
+            row = self.rows[i]
+            b = limits[row.t] if row.kind is RowKind.STATE else last
+            upper[i] = b[row.upper] if row.upper >= 0 else np.inf
+            lower[i] = -b[row.lower] if row.lower >= 0 else -np.inf
+        return upper, lower
+
+    def question(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
+        """A question in numbers: state (n_x,) and target (n_x,) of this component, outlook of the whole plant."""
+        return self.question_of(self.parameters(x, target), outlook)
+
+    def question_of(self, p: Array, outlook: Preview) -> Question:
+        """The same for parameters p (n_p,)."""
+        f, constant = self.cost(p, outlook)
+        upper, lower = self.sides(outlook)
+        return Question(f, constant, self.r @ p, np.minimum(upper, OPEN), np.maximum(lower, -OPEN), p)
+
+    def inputs(self, w: Array, here: Array) -> Array:
+        """Absolute mean inputs (H, n_u) of w = (v, y)."""
+        part, horizon = self.horizon.component, self.horizon
+        inputs = np.empty((horizon.steps, self._n_u))
+        inputs[: horizon.free] = w[: self.n_v].reshape(horizon.free, self._n_u) + part.u_eq @ here
+        inputs[horizon.free :] = part.u_eq @ (w[self.n_v :] + here)
+        return inputs
+
+    def _coordinates(self) -> tuple[Array, Array, bool]:
+        """Z, W of w = Z q + W p, with x̄_N = x_eq y for every q."""
+        horizon, part = self.horizon, self.horizon.component
+        free = horizon.free
+        matrix = np.hstack([horizon.gamma[free], horizon.gamma_eq[free] - part.x_eq])
+        scale = np.abs(matrix).max(axis=1, keepdims=True)
+        left, singular, right = np.linalg.svd(matrix / scale)
+        rank = int(np.sum(singular > _RANK * singular[0]))
+        inverse = (right[:rank].T / singular[:rank]) @ left[:, :rank].T / scale.T
+        return right[rank:].T, -inverse @ horizon.phi[free] @ self._x, rank == matrix.shape[0]
+
+    def _mean(self, t: int) -> tuple[Array, Array]:
+        """x̄_t relative to the present equilibrium, as (coefficients of w, of p)."""
+        horizon = self.horizon
+        return np.hstack([horizon.gamma[t], horizon.gamma_eq[t]]), horizon.phi[t] @ self._x
+
+    def _input(self, t: int) -> Array:
+        """v_t relative to the present equilibrium, as coefficients of w."""
+        return np.eye(self.n_v + self.n_y)[t * self._n_u : (t + 1) * self._n_u]
+
+    def _residuals(self) -> tuple[Array, Array]:
+        """Square roots of the cost: all state residuals, then all input residuals; of q, and of p."""
+        part = self.horizon.component
+        y = np.eye(self.n_v + self.n_y)[self.n_v :]
+        of_w, of_p = [], []
+        root_x, root_u = factor(part.q_x), factor(part.q_u)
+        for t in range(self.horizon.free):
+            w, p = self._mean(t)
+            of_w.append(root_x @ (w - part.x_eq @ y))
+            of_p.append(root_x @ p)
+        for t in range(self.horizon.free):
+            of_w.append(root_u @ (self._input(t) - part.u_eq @ y))
+            of_p.append(np.zeros((self._n_u, self.n_p)))
+        stacked = np.vstack(of_w)
+        return stacked @ self.z, np.vstack(of_p) + stacked @ self.w
+
+    def _input_rows(self) -> list[Row]:
+        part, horizon = self.horizon.component, self.horizon
+        return [
+            _row(RowKind.INPUT, t, c, sides, horizon.input_noise(t, c[None]), float(self.design.kappa_u[t]), 0.0)
+            for t in range(horizon.input_stages)
+            for c, sides in _directions(part.c_u)
+        ]
+
+    def _state_rows(self) -> list[Row]:
+        part, horizon = self.horizon.component, self.horizon
+        return [
+            _row(
+                RowKind.STATE,
+                t,
+                c,
+                sides,
+                horizon.state_noise(t, c[None]),
+                float(self.design.kappa_x[t]),
+                float(c @ part.estimate_cov @ c),
+            )
+            for t in range(1, horizon.free)
+            for c, sides in _directions(part.c_x)
+        ]
+
+    def _reference_rows(self) -> list[Row]:
+        part, free = self.horizon.component, self.horizon.free
+        rows = []
+        for kind, c_all, eq, backoff in (
+            (RowKind.REFERENCE, part.c_x, part.x_eq, terminal_backoff_x(self.design, part)),
+            (RowKind.REST, part.c_u, part.u_eq, terminal_backoff_u(self.design, part)),
+        ):
+            for c, (upper, lower) in _directions(c_all):
+                if np.any(c @ eq != 0):
+                    rows.append(Row(kind, free, c, upper, lower, float(backoff[max(upper, lower)])))
+        return rows
+
+    def _offset_rows(self) -> list[Row]:
+        return [Row(RowKind.OFFSET, self.horizon.free, c, -1, -1, 0.0) for c in np.eye(self.n_y)]
+
+    def _map(self, row: Row) -> tuple[Array, Array]:
+        """A row's value as coefficients of w and p."""
+        part = self.horizon.component
+        y = np.eye(self.n_v + self.n_y)[self.n_v :]
+        if row.kind is RowKind.OFFSET:
+            return row.c @ y, -row.c @ self._to_target
+        if row.kind is RowKind.INPUT:
+            w = self._input(row.t) if row.t < self.horizon.free else part.u_eq @ y
+            return row.c @ w, row.c @ part.u_eq @ self._here
+        if row.kind is RowKind.STATE:
+            w, p = self._mean(row.t)
+            return row.c @ w, row.c @ p + row.c @ part.x_eq @ self._here
+        eq = part.x_eq if row.kind is RowKind.REFERENCE else part.u_eq
+        return row.c @ eq @ y, row.c @ eq @ self._here
+
+    def _sides(self) -> tuple[Array, Array]:
+        part = self.horizon.component
+        upper, lower = np.full(len(self.rows), np.inf), np.full(len(self.rows), -np.inf)
+        for i, row in enumerate(self.rows):
+            if row.kind is RowKind.OFFSET:
+                upper[i] = lower[i] = 0.0
+                continue
+            b = part.b_x if row.kind in (RowKind.STATE, RowKind.REFERENCE) else part.b_u
+            if row.upper >= 0:
+                upper[i] = b[row.upper]
+            if row.lower >= 0:
+                lower[i] = -b[row.lower]
+        return upper, lower
+
+
+def _directions(c: Array) -> list[tuple[Array, tuple[int, int]]]:
+    """Directions of a set's rows, each with the rows that limit +c and -c (-1 for none)."""
+    found = []
+    for pair in pairs_of(c):
+        rows = dict(pair.sides)
+        found.append((np.array(pair.c), (rows.get(1.0, -1), rows.get(-1.0, -1))))
+    return found
+
+
+def _row(kind: RowKind, t: int, c: Array, sides: tuple[int, int], noise: Affine, kappa: float, unseen: float) -> Row:
+    if noise.matrix.nnz:
+        return Row(kind, t, c, *sides, 0.0, noise, kappa, unseen)
+    return Row(kind, t, c, *sides, kappa * float(np.sqrt(noise.offset @ noise.offset + unseen)))

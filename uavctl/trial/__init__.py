@@ -1,1 +1,0 @@
-"""Flights of the true vehicle in lockstep, judged on the truth: ours, and the vehicle's own position loop beside it."""

@@ -1,1 +1,0 @@
-"""Tuning by flying: excite inside a box, identify, change what the flight tells, fly again, compare."""

@@ -1,1 +1,0 @@
-"""A recorded flight flown by another controller, schedule or link: what would have been."""
