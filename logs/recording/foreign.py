@@ -1,9 +1,7 @@
 """MCAP files of other programs: MAVLink out of whatever channels hold it.
 
-There is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a stream
-of
-frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped first.
-The
+There is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a stream of
+frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped first. The
 file is read from its front to its end, so it needs neither chunks nor a summary.
 """
 

@@ -1,9 +1,7 @@
 """A recording's bounded queue: what is taken from it, what is made beside it for viewers, and what is noted.
 
-A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing,
-records
-wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and
-recording
+A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
+wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and recording
 rests. Views take most of the time and are not needed to decide alike, so they may come later than their records.
 """
 
@@ -419,7 +417,7 @@ BACKLOG_SHARE = 8
 
 
 class _Base:
-    """A journal and how it is begun; arguments and errors are those of `Journal`."""
+    """A journal and how it is begun; arguments and errors are those of `WriteQueue`."""
 
     def __init__(
         self,

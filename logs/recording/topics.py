@@ -1,8 +1,8 @@
 """The topics of a recording: one row each.
 
-Raw MAVLink bytes have one topic a connection and direction; everything else is one record type,
-written as JSON with its JSON Schema. Beside these stand the topics made for viewers, as protobuf
-(`logs.recording.derived_topics`); nothing is decided, replayed or reported from them.
+Raw MAVLink bytes have one topic a connection and direction; everything else is one record type, written as JSON with
+its JSON Schema. Beside these stand the topics made for viewers, as protobuf (`logs.recording.derived_topics`);
+nothing is decided, replayed or reported from them.
 """
 
 from __future__ import annotations

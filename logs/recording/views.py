@@ -1,7 +1,6 @@
 """3D scenes of a flight in Foxglove's messages. All of it is local NED; viewers turn it (topic /view/frames).
 
-The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each
-depth.
+The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each depth.
 Those of which there is one a stage are filled in (`Many`).
 """
 

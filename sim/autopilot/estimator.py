@@ -1,8 +1,7 @@
 """The vehicle's own estimate of where it is: from GPS, or from external positions by each autopilot's own rules.
 
 With GPS the estimate is the truth. With external positions it carries an error: accelerometers with a constant bias
-drift, samples pull the estimate back, and when they stop the error grows unseen. Bias, silence and flags are those
-of
+drift, samples pull the estimate back, and when they stop the error grows unseen. Bias, silence and flags are those of
 the recorded loss of the cameras (ArduCopter: nothing is said for 7.2 s while the vehicle drifts half a metre).
 """
 

@@ -1,10 +1,8 @@
 """Inertial sensors, and the attitude that an autopilot estimates from them, with the errors of both.
 
 A bias of the accelerometer across gravity cannot be told from a tilt, so the estimate tilts by it: at hover the
-specific force that is told, turned by the attitude that is told, is nearly right although both err. Dead reckoning
-goes
-wrong by what remains: a small tilt that wanders within seconds, biases that the estimate knows and the message
-keeps,
+specific force that is told, turned by the attitude that is told, is nearly right although both err. Dead reckoning goes
+wrong by what remains: a small tilt that wanders within seconds, biases that the estimate knows and the message keeps,
 and noise. All figures and their sources are in docs/vehicle.md.
 """
 

@@ -1,7 +1,6 @@
 """Parameters of the simulated autopilots: the ones that change what they do, and some that only tell.
 
-The rest of the real ones' thousand parameters are not there: a vehicle that took a parameter and did not heed it
-would
+The rest of the real ones' thousand parameters are not there: a vehicle that took a parameter and did not heed it would
 tell a client something untrue. For the same reason a value that is not simulated is refused.
 """
 

@@ -1,7 +1,6 @@
 """Outer loops of the cascade: what is asked of the vehicle, the reference that it follows, the acceleration it wants.
 
-A reference (position, velocity, acceleration) moves within limits towards what is asked; a proportional position
-loop
+A reference (position, velocity, acceleration) moves within limits towards what is asked; a proportional position loop
 and a proportional-integral velocity loop hold the vehicle on it. What distinguishes the autopilots is what an
 acceleration setpoint does: ArduPilot moves the reference with it, so zero keeps the velocity and rejects wind; PX4
 flies it open loop, so wind, drag and the error of its hover thrust show.

@@ -1,7 +1,6 @@
 """Policy libraries in a cache.
 
-A library takes seconds to make and belongs to one design. It is kept under the design's hash and that of the code
-that
+A library takes seconds to make and belongs to one design. It is kept under the design's hash and that of the code that
 made it.
 """
 

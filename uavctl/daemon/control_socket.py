@@ -1,7 +1,6 @@
 """The operator's orders while flying: a Unix socket that the daemon looks at after each tick and never waits for.
 
-An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder
-0700,
+An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder 0700,
 socket 0600) and again by the kernel's word on who is at the other end.
 """
 

@@ -1,9 +1,7 @@
 """One daemon a vehicle: a lock on what the connection's URL means.
 
-The lock is the kernel's (flock); it goes when its holder dies, however that happens. It is one among the processes
-of
-one user: its files are where no other user can touch them, so that none can hold the vehicle, or rewrite the word
-that
+The lock is the kernel's (flock); it goes when its holder dies, however that happens. It is one among the processes of
+one user: its files are where no other user can touch them, so that none can hold the vehicle, or rewrite the word that
 it was left in flight. They are in each of the user's runtime folders, since not every process of the user finds the
 same one. Two URLs that mean the same (a name and its address, a serial port and a link to it) are one vehicle. That
 two different connections lead to the same vehicle cannot be seen before they are opened.

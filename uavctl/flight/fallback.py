@@ -11,10 +11,10 @@ A state machine of four modes, each with a time limit:
     STOP      LAND once its zero has been sent, if configured; else STOPPED
     LAND      LAND once its zero has been sent
 
-Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.envelope`), else by the predicted
-one. By its own velocity it brakes again if it drifts while it holds; the time to hold runs on meanwhile. HOLD begins
-only when the setpoint has come down to what is held: it never accelerates. Where the vehicle's own inertial data carry
-the estimate on, HOLD brings it back to where it began to hold, gently.
+Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.envelope`), else by the
+predicted one. By its own velocity it brakes again if it drifts while it holds; the time to hold runs on meanwhile.
+HOLD begins only when the setpoint has come down to what is held: it never accelerates. Where the vehicle's own
+inertial data carry the estimate on, HOLD brings it back to where it began to hold, gently.
 
 The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at Δt boundaries
 (`uavctl.flight.decision`).

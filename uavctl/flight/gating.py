@@ -455,7 +455,7 @@ def _fresh_in_row(
 
 
 class _Believed(msgspec.Struct, frozen=True, eq=False):
-    """What came of samples that were looked at one after another; the fields are those of `Intake`."""
+    """What came of samples that were looked at one after another; the fields are those of `MeasurementUpdate`."""
 
     history: FilterHistory
     trust: SourceHealth

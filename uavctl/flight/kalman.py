@@ -1,16 +1,14 @@
 """Kalman filter in continuous time over a piecewise constant disturbance: the Gaussian part, without a memory.
 
-Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W); it is redrawn at each
-boundary. So the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w:
-mean 0, covariance W, uncorrelated with x. With u piecewise constant this is exact at any instant.
+Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W); it is redrawn at each boundary. So
+the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w: mean 0, covariance W,
+uncorrelated with x. With u piecewise constant this is exact at any instant.
 
 Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.estimate`). While others fly
-the
-vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
+the vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
 
 Where the vehicle's inertial data are used, x is (x, d, b): they show the acceleration of each axis plus b, which
-comes
-and goes slowly: a bias of the sensors, and an attitude that is not quite level.
+comes and goes slowly: a bias of the sensors, and an attitude that is not quite level.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The link as it shows in flight: did a step's news come in time? Pure; one observation each Δt boundary.
 
-An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the
-boundary
+An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the boundary
 is there at the boundary. All counts are forgotten exponentially, so the estimate follows a link that drifts.
 """
 

@@ -1,7 +1,6 @@
 """Where to fly to, step by step: waypoints, a trajectory, limits that change in time. Pure.
 
-Time counts from the first decision with a vehicle that takes setpoints, and runs on from there. That decision is at
-a
+Time counts from the first decision with a vehicle that takes setpoints, and runs on from there. That decision is at a
 Δt boundary, and so is every other: a trajectory is met at its own samples only.
 """
 

@@ -1,7 +1,6 @@
 """One control tick: samples in; estimate, plan, decision and setpoint out. Pure: time is an argument.
 
-    samples -> estimator -> envelope -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last
-gate
+    samples -> estimator -> envelope -> (at a Δt boundary) re-plan on news, play out on silence -> fallback -> last gate
 
 Tick n is at n * tick on the grid, step k = n // (Δt / tick). What a boundary decides is held until the next.
 """

@@ -1,8 +1,8 @@
 """The process that listens to cameras for one daemon.
 
 Started as `python -m uavctl.io.camera_host FD SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of the
-pipe is gone, however the daemon died. The pipe is a pair of sockets that keep
-the bounds of messages; what a message is, its first byte says (MAVLink has its own).
+pipe is gone, however the daemon died. The pipe is a pair of sockets that keep the bounds of messages; what a message
+is, its first byte says (MAVLink has its own).
 """
 
 from __future__ import annotations

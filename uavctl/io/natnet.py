@@ -4,12 +4,9 @@ The package `natnet` reads descriptions and frames, whose layout changes with th
 here, not by the package's client, because that client sends a keep-alive for every datagram it gets, prints, loses
 what its threads raise, and asks for the descriptions in a way that Motive 3.1 is reported to leave unanswered.
 
-Layout of the messages: NatNetTypes.h of the public SDK (message numbers, `sSender_Server`); of the echo, which the
-SDK
-uses to find the server's clock, open clients that fly with it. Only the server's first 283 bytes and the echo are
-read
-here. A request for descriptions carries the mask of wanted kinds (bit 1: rigid bodies) for Motive 3, and every
-other
+Layout of the messages: NatNetTypes.h of the public SDK (message numbers, `sSender_Server`); of the echo, which the SDK
+uses to find the server's clock, open clients that fly with it. Only the server's first 283 bytes and the echo are read
+here. A request for descriptions carries the mask of wanted kinds (bit 1: rigid bodies) for Motive 3, and every other
 time none, for older servers.
 """
 

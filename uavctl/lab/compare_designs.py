@@ -1,9 +1,7 @@
 """Designs beside one another: what another terminal gain is worth, and what a risk allocation costs.
 
-Optimal costs are compared from the same states. One set is seeded and uniform in the box of the state limits: it
-tells
-from what share of the box the target can be reached with all constraints kept. The other is the same states, each
-drawn
+Optimal costs are compared from the same states. One set is seeded and uniform in the box of the state limits: it tells
+from what share of the box the target can be reached with all constraints kept. The other is the same states, each drawn
 a random part of the way to the target: mean costs are over those from which every design compared can do so. Closed
 loops are not flown here.
 """

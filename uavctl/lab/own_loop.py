@@ -1,8 +1,7 @@
 """The opponent: the vehicle's own position loop, fed the positions that a controller of ours gets on the same flight.
 
 The cameras' datagrams go through the project's own intake (frames, clocks) and relay, and on to the vehicle as
-VISION_POSITION_ESTIMATE; its estimator uses nothing else. It is sent SET_POSITION_TARGET_LOCAL_NED at every tick,
-in
+VISION_POSITION_ESTIMATE; its estimator uses nothing else. It is sent SET_POSITION_TARGET_LOCAL_NED at every tick, in
 its external mode: a place and a heading, or along a motion place, velocity and acceleration. No other setpoint.
 """
 

@@ -1,7 +1,6 @@
 """MAVLink bytes to typed messages.
 
-Message definitions: https://mavlink.io/en/messages/common.html. Decoding never raises: what cannot be used is
-counted
+Message definitions: https://mavlink.io/en/messages/common.html. Decoding never raises: what cannot be used is counted
 by reason.
 """
 

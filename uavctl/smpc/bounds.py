@@ -1,10 +1,8 @@
 """What no controller can beat: the expected quadratic cost when positions are lost or late, and nothing is limited.
 
 The state is known exactly at its capture, and neither losses nor delays depend on the inputs: certainty equivalence
-holds (Schenato et al. 2007, Foundations of control and estimation over lossy networks, TCP-like case). The best
-input
-is the LQR's of the mean of the state, and the cost is that of the known state plus what the error of the mean
-costs:
+holds (Schenato et al. 2007, Foundations of control and estimation over lossy networks, TCP-like case). The best input
+is the LQR's of the mean of the state, and the cost is that of the known state plus what the error of the mean costs:
 x_0'P_0 x_0 + Σ_t tr(P_{t+1} N) + Σ_t tr(M_t S_t), with N = E W E', M_t = K_t'(R + B'P_{t+1} B)K_t and the error's
 covariance S_t = Σ_i P(a(t) > i) A^i N A'^i. Limits, of inputs or states, only add to it.
 """

@@ -5,8 +5,7 @@ A position does not show the whole state. With e = x - x̂ after a position, e ~
     x̂(k+1) = A x̂(k) + B u(k) + ν(k),   Cov ν = A P Aᵀ + E W Eᵀ - P = L S Lᵀ
 
 with the filter's gain L and the covariance S of its innovation. So x̂ obeys a plant of the same form with as many
-disturbances as there are measurements, each known when the position that shows it comes; x adds e, which no
-feedback
+disturbances as there are measurements, each known when the position that shows it comes; x adds e, which no feedback
 ever sees, in every stage alike. Propagated open loop the two are what P is: A^t P A^tᵀ + Σ A^i E W Eᵀ A^iᵀ.
 """
 

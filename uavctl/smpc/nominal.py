@@ -1,10 +1,8 @@
 """Constrained MPC without disturbances, for many states at once.
 
 With u_t = K x_t + c_t, K the regulator's gain and its Riccati solution as the terminal cost, the cost is
-x'Px + Σ_t c_t'(R + B'PB)c_t: where the regulator's own plan keeps every row, c = 0 is the optimum, and no program
-has
-to be solved. Elsewhere c is the shortest vector that keeps the rows; state rows give way at the price of their
-slack.
+x'Px + Σ_t c_t'(R + B'PB)c_t: where the regulator's own plan keeps every row, c = 0 is the optimum, and no program has
+to be solved. Elsewhere c is the shortest vector that keeps the rows; state rows give way at the price of their slack.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Intervals of rates, means and differences, from runs.
 
-The runs of a cell are independent, the steps of a run are not. So the exact interval (Clopper and Pearson) is that
-of a
-share of runs; figures of steps are means over runs, with the bootstrap over runs. All cells share their draws, so
-two
+The runs of a cell are independent, the steps of a run are not. So the exact interval (Clopper and Pearson) is that of a
+share of runs; figures of steps are means over runs, with the bootstrap over runs. All cells share their draws, so two
 controllers are compared by the differences of run against run, which have far less variance than either cost.
 """
 

@@ -1,9 +1,7 @@
 """Who flies tasks: processes of this machine, or the workers of a Dask cluster; the same futures either way.
 
-Every worker computes with one BLAS thread. With more, the last bits of a product depend on their number, and then
-the
-results would; the libraries read it from the environment before numpy is imported, so a campaign with one worker
-flies
+Every worker computes with one BLAS thread. With more, the last bits of a product depend on their number, and then the
+results would; the libraries read it from the environment before numpy is imported, so a campaign with one worker flies
 in a process of its own too.
 """
 
@@ -55,7 +53,7 @@ class Processes:
         self._pool = _pool(workers)
 
     def submit(self, task: Work) -> Future[Columns]:
-        """See `Crew`."""
+        """See `Workers`."""
         try:
             return self._pool.submit(task.fly)
         except BrokenProcessPool as error:  # it broke under another task
@@ -64,11 +62,11 @@ class Processes:
             return ended
 
     def broken(self, error: BaseException) -> bool:
-        """See `Crew`."""
+        """See `Workers`."""
         return isinstance(error, BrokenProcessPool)
 
     def renew(self) -> None:
-        """See `Crew`."""
+        """See `Workers`."""
         self.close()
         self._pool = _pool(self.size)
 
@@ -102,11 +100,11 @@ class Cluster:
         self._pool = pool
 
     def submit(self, task: Work) -> Future[Columns]:
-        """See `Crew`."""
+        """See `Workers`."""
         return self._pool.submit(task.fly)
 
     def broken(self, error: BaseException) -> bool:
-        """See `Crew`."""
+        """See `Workers`."""
         from distributed.scheduler import KilledWorker  # an extra, and slow to import
 
         return isinstance(error, KilledWorker)

@@ -1,8 +1,7 @@
 """One run of a campaign again: as a flight through the flight controller, MAVLink and the simulated autopilot.
 
 The controller's configuration is that of the cell's design: it believes in the cell's link and plant. What really
-flies (plant, start, disturbances, losses) is given to the simulator apart, as a script, so a replay of the
-recording
+flies (plant, start, disturbances, losses) is given to the simulator apart, as a script, so a replay of the recording
 needs the configuration alone. Baselines have no flight controller, so there is nothing to fly again.
 """
 

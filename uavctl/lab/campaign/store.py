@@ -1,7 +1,6 @@
 """A campaign's folder: what it is, its finished tasks as parts, and in the end one table of all runs.
 
-A task is there whole or not at all, so a campaign that was killed goes on where it was; the table's bytes depend on
-the
+A task is there whole or not at all, so a campaign that was killed goes on where it was; the table's bytes depend on the
 runs alone.
 """
 

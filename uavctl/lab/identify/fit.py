@@ -1,13 +1,10 @@
 """The dead time of a plant by its likelihood, and what a plant predicts of the half of a flight it was not fitted to.
 
-The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants
-apart
-and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves,
-blocks
+The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
+and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
 in turn so that each has something of every manoeuvre, on the motion of the next 0.25 to 2 s; the figure is the
 geometric mean of the rms errors over these times and the axes, in which each counts alike. For the fit as for the
-judgement the filter goes through the whole flight, and only the innovations in a half, or the motions, count: where
-it
+judgement the filter goes through the whole flight, and only the innovations in a half, or the motions, count: where it
 began anew in each block, they would tell how it finds the state and little of the plant.
 """
 

@@ -1,10 +1,8 @@
 """How likely a recorded axis is under one of the plants: the innovations of a Kalman filter.
 
-The motion is linear, so the filter steps from position to position, however many inputs lie between: what they do
-is
+The motion is linear, so the filter steps from position to position, however many inputs lie between: what they do is
 summed beforehand. So are its gains, which come of the times alone. All times are counted in instants of half a
-millisecond, so few different lengths occur, and each is a product of powers of one instant's motion. Several
-parameter
+millisecond, so few different lengths occur, and each is a product of powers of one instant's motion. Several parameter
 vectors, of several axes, go through at once: the gradients of three axes cost one pass.
 """
 

@@ -1,14 +1,12 @@
 """The least settled cost that anything can have within the input limits: dynamic programming on what is known.
 
 For one axis. With the newest state known exactly and a steps old, the state is N(m, C_a) with C_a the sum of
-A^i E W E' A^i' over i < a, whatever was done. With y = A m + B u, news comes with p and makes m ~ N(y, C_{a+1}), a
-= 0;
+A^i E W E' A^i' over i < a, whatever was done. With y = A m + B u, news comes with p and makes m ~ N(y, C_{a+1}), a = 0;
 else m = y, and a grows by 1:
 
     V_a(m) + λ = m'Q m + tr(Q C_a) + min_u { u'R u + p E V_0(y + n) + q V_{a+1}(y) },   n ~ N(0, C_{a+1})
 
-State limits are left out: λ is a lower bound for what keeps them too. V_a is m'P m, with the P of LQG, plus a
-remainder
+State limits are left out: λ is a lower bound for what keeps them too. V_a is m'P m, with the P of LQG, plus a remainder
 on a grid, cubic in between; with the limits open, the remainder is 0 and λ the LQG bound.
 """
 

@@ -1,8 +1,7 @@
 """What of a configuration a flight changes: what it tells well, and nothing else.
 
 Dead time, lag, drag and gain are taken over where the flight tells them. Noise, loss and delay are raised where the
-flight was worse than believed, and never lowered: a calm minute says nothing of the next day's air or radio. Inputs
-may
+flight was worse than believed, and never lowered: a calm minute says nothing of the next day's air or radio. Inputs may
 be quicker, down to the weight of the presets that know their autopilot, where the model predicts well.
 """
 

@@ -1,7 +1,6 @@
 """What is flown to learn how the vehicle answers: waypoints inside a box, each axis by itself and then all together.
 
-The controller of the configuration flies them, so its own limits of speed and acceleration hold. The box is a fence
-to
+The controller of the configuration flies them, so its own limits of speed and acceleration hold. The box is a fence to
 it, and the waypoints stay as far inside as a plan has to that rests there, and a reserve for what it cannot plan.
 """
 

@@ -1,7 +1,6 @@
 """The folder of a tuning run: what was asked for, how far it has come, and where its files are.
 
-Every step writes its files first and its note last, so a run that was cut off goes on after the last one that is
-whole.
+Every step writes its files first and its note last, so a run that was cut off goes on after the last one that is whole.
 """
 
 from __future__ import annotations

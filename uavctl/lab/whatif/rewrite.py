@@ -1,8 +1,7 @@
 """Specific forces of the vehicle's inertial sensors, as they would have been in another course of the flight.
 
 The controller turns a specific force by the attitude that the vehicle told last, R f + g. In the other course the
-vehicle accelerates by δa more, so it is told f + Rᵀ δa: the recorded attitude turns that into just δa more. The
-vehicle
+vehicle accelerates by δa more, so it is told f + Rᵀ δa: the recorded attitude turns that into just δa more. The vehicle
 would have leaned otherwise too, and f and R would both be others; that shows in neither sum, so the attitude stays.
 """
 

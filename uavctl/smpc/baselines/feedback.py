@@ -1,7 +1,6 @@
 """Gains of the cascaded PID, tuned on the very scene that they fly in: plant, weights, limits, start and link.
 
-A coarse grid, the same for all axes, then a cross-entropy search (Rubinstein 1999) over the logarithms of all
-gains:
+A coarse grid, the same for all axes, then a cross-entropy search (Rubinstein 1999) over the logarithms of all gains:
 each generation is drawn around the best of the one before. Every candidate meets the same noise and losses, and the
 draws have a seed of their own: the same arguments give the same gains.
 """

@@ -1,7 +1,6 @@
 """MPC for the worst-case delay: all information counts as d steps old, which is what the paper argues against.
 
-The mean x̂ predicted over d steps has the error S = Σ_{i<d} A^i N A'^i, always, and is moved by A^d E w(k-d) in
-each
+The mean x̂ predicted over d steps has the error S = Σ_{i<d} A^i N A'^i, always, and is moved by A^d E w(k-d) in each
 step. Under u = mean + K_ρ(x̂ - mean) a stage t of the plan has the covariance S + Z_t, its input K_ρ Z_t K_ρ', with
 Z_{t+1} = (A + B K_ρ) Z_t (A + B K_ρ)' + A^d N A'^d from Z_0 = 0: κ standard deviations are taken off the rows.
 """

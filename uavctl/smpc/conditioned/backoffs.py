@@ -1,17 +1,11 @@
 """What plans with risk conditioned on the age keep from a limit that they rest at.
 
-A plan keeps its back-offs wherever its reference is: they are rows of the program. The reference decides how often
-a
-new position leaves a plan that cannot keep them. So it keeps the larger of two distances from a limit. At the
-first,
-a plan that rests there at all ages would be outside no more often than allowed. At the second, no more than a share
-of
-the new plans need slack, by a model of what they begin from: after t steps without news (probability q_t) the mean
-is
-at the reference, or at the back-off β_t where that is further, and news are e ~ N(0, S_t), S_t = Σ_t - Σ_0. With
-the
-whole reach g_s of the inputs, stage s of the new plan has to leave its back-off if c'A^s e > max(d, β_t) - β_s +
-g_s.
+A plan keeps its back-offs wherever its reference is: they are rows of the program. The reference decides how often a
+new position leaves a plan that cannot keep them. So it keeps the larger of two distances from a limit. At the first,
+a plan that rests there at all ages would be outside no more often than allowed. At the second, no more than a share of
+the new plans need slack, by a model of what they begin from: after t steps without news (probability q_t) the mean is
+at the reference, or at the back-off β_t where that is further, and news are e ~ N(0, S_t), S_t = Σ_t - Σ_0. With the
+whole reach g_s of the inputs, stage s of the new plan has to leave its back-off if c'A^s e > max(d, β_t) - β_s + g_s.
 """
 
 from __future__ import annotations

@@ -1,18 +1,14 @@
 """Chance-constrained MPC with risk conditioned on the age of information: open-loop plans, back-offs by age.
 
-A plan is made at each new position and played out until the next one. So the plan that moved the vehicle to x(k)
-was
-based on information that was t = 1, 2 … steps old, with the probability π_t that the link's age of information
-gives,
+A plan is made at each new position and played out until the next one. So the plan that moved the vehicle to x(k) was
+based on information that was t = 1, 2 … steps old, with the probability π_t that the link's age of information gives,
 and disturbances are independent of losses. By total probability
 
     P(x(k) not in X) = Σ_t π_t P(x(k) not in X | information t steps old) <= Σ_t π_t Σ_i ε_ti <= 1 - δ_x,
 
-where row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i
-with
+where row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i with
 the estimate's own covariance P. The budget ε̄_t of an age is fixed, because plans of different ages share it at one
-moment; how a plan spreads ε̄_t over its rows is free (iterative risk allocation). `docs/theory.md` has statement
-and
+moment; how a plan spreads ε̄_t over its rows is free (iterative risk allocation). `docs/theory.md` has statement and
 proof. Two spreads of ε̄_t are at hand: one for targets that leave room from all limits, one for the others and for
 motions, whose plans meet limits at any age.
 

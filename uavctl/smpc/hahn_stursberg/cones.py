@@ -2,8 +2,7 @@
 
 minimise ½ zᵀPz + q(p)ᵀz + c(p)  subject to  E z + F p + g in a product of cones, for Clarabel.
 
-Clarabel sees the variables in units of their natural size and relative to an origin that follows the parameters,
-the
+Clarabel sees the variables in units of their natural size and relative to an origin that follows the parameters, the
 cost in units of its size, and rows with a largest entry of 1. So its tolerances mean the same in any units, and a
 question far from the usual still has small numbers for an answer.
 """

@@ -1,8 +1,7 @@
 """The exact decision problem, component by component, in Clarabel.
 
 Problem (19) with its terminal condition reduced, state constraints softened by exact penalties, and an artificial
-reference: the plan ends in the equilibrium nearest to the target that can be reached. Where no equilibrium is
-within
+reference: the plan ends in the equilibrium nearest to the target that can be reached. Where no equilibrium is within
 reach of N steps, a second program lets the terminal equality give way, and the answer says so.
 """
 

@@ -1,8 +1,7 @@
 """The solution of a parametric QP as a piecewise affine map: its critical regions, found from facet to facet.
 
 On the set of parameters that have the same rows active, minimiser and multipliers are affine, and that set is a
-polytope (theory 5.3). The search starts in the region of one parameter and steps across every facet; it draws
-nothing,
+polytope (theory 5.3). The search starts in the region of one parameter and steps across every facet; it draws nothing,
 so the same program gives the same regions.
 """
 

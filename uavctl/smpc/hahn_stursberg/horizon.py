@@ -1,15 +1,11 @@
 """Stacked prediction of one component: means, disturbance feedback, covariance cost.
 
-x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ
-and
-rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the
-entries
+x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ and
+rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the entries
 of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
 
-Disturbances that the state does not show apart, as under an E or a W without full column rank, are not fed back
-apart
-either: M_{t,r} = Θ_{t,r} T with T w the part of w that E w determines, in units of its standard deviation. Feedback
-of
+Disturbances that the state does not show apart, as under an E or a W without full column rank, are not fed back apart
+either: M_{t,r} = Θ_{t,r} T with T w the part of w that E w determines, in units of its standard deviation. Feedback of
 the rest would only add variance. Where nothing is redundant T = I, and θ are entries of M.
 
 A plan that is based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean

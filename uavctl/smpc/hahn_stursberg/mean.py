@@ -1,11 +1,8 @@
 """The mean half of one component's decision problem, as a QP with constant matrices.
 
-The mean inputs v_0 … v_{N-1} and the reference y meet x̄_N = x_eq y in the coordinates w = (v, y) = Z q + W p, so q
-is
-free. Every row reads lower <= A q + R p <= upper, less a back-off on both sides where disturbances reach it; p
-holds
-what a question brings: the state, the target, the present position. State rows are soft, and so is y = y_target,
-whose
+The mean inputs v_0 … v_{N-1} and the reference y meet x̄_N = x_eq y in the coordinates w = (v, y) = Z q + W p, so q is
+free. Every row reads lower <= A q + R p <= upper, less a back-off on both sides where disturbances reach it; p holds
+what a question brings: the state, the target, the present position. State rows are soft, and so is y = y_target, whose
 l1 price is the offset weight.
 """
 

@@ -1,11 +1,9 @@
 """Bounds of one component's optimum from a library of policies, by a few small QPs.
 
 From below: the mean with φ replaced by the library's cuts. The bound is the Lagrangian's value at the multipliers
-found, so no error of the QP solver can make it wrong. From above: the mean under the policy of the heaviest cut;
-where
+found, so no error of the QP solver can make it wrong. From above: the mean under the policy of the heaviest cut; where
 that leaves a gap, a choice of policies that are worth mixing, and the mean together with their convex weights. Both
-plans can be flown. No number depends on what was solved before: the state of every row is given to the QP solver
-anew.
+plans can be flown. No number depends on what was solved before: the state of every row is given to the QP solver anew.
 """
 
 from __future__ import annotations

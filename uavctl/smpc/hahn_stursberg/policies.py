@@ -1,7 +1,6 @@
 """The covariance half of one component's decision problem.
 
-φ(ρ) = min J_cov(M) over the policies M with back-offs at most ρ is convex and does not know the state. Each solve
-gives
+φ(ρ) = min J_cov(M) over the policies M with back-offs at most ρ is convex and does not know the state. Each solve gives
 a policy, and from its multipliers a cut φ(ρ) >= D - μᵀρ that holds for every ρ, whatever the solver's error: the
 multipliers are projected on the dual cones first, and what then is left of stationarity is paid for (P ≻ 0).
 """

@@ -3,12 +3,9 @@
 Nothing is reduced here: the terminal condition is the full matrix inequality Σ_ξ - Ξ_H ⪰ 0, the gains are matrices,
 and the covariances come from the recursion (1). The target takes the place of the origin.
 
-(19c) has no interior, and an interior-point method shows it. With Clarabel's own settings the paper's example (τ =
-4)
-ends INACCURATE, one axis up to 1e-6 and both jointly 6e-7 off, and a plant with coupled axes can fail altogether.
-With
-REGULARIZATION in the linear algebra nearly all end OPTIMAL and agree with the reduced form to 1e-8, the joint
-problem
+(19c) has no interior, and an interior-point method shows it. With Clarabel's own settings the paper's example (τ = 4)
+ends INACCURATE, one axis up to 1e-6 and both jointly 6e-7 off, and a plant with coupled axes can fail altogether. With
+REGULARIZATION in the linear algebra nearly all end OPTIMAL and agree with the reduced form to 1e-8, the joint problem
 after some ten times the time of its axes. What remains inaccurate is reported as such and does not fly.
 """
 

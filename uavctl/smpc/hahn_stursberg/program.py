@@ -1,8 +1,7 @@
 """The decision problem of one component as one conic program.
 
 Variables: mean inputs v_0 … v_{N-1}, gains θ, reference y, its l1 distance a from the target, one slack and one
-back-off for each pair of rows ±c and stage. Numbers are relative to the equilibrium at the present position, so
-that a
+back-off for each pair of rows ±c and stage. Numbers are relative to the equilibrium at the present position, so that a
 vehicle far from the origin is computed as well as one at the origin.
 """
 

@@ -1,7 +1,6 @@
 """Search for the gain of least stationary cost: smooth, but not convex.
 
-A local optimiser with exact gradients (SLSQP) runs from several stable gains, and the best result is taken. There
-is
+A local optimiser with exact gradients (SLSQP) runs from several stable gains, and the best result is taken. There is
 no chance in it: the same task gives the same bits.
 """
 
