@@ -31,7 +31,7 @@ class Flight:
         self.name: Name = name
         airframe = {"airframe": WITH_SIH_DRAG} if name == "px4" else {}  # the one of the recorded flights
         self.vehicle: Quadrotor = quadrotor(name, wind=steady(wind), at=(0.0, 0.0, -5.0), speed=speed, **airframe)
-        config = load_config("room-hahn-stursberg", [f"sim.autopilot.autopilot={name}"])
+        config = load_config("room-hahn-stursberg", [f"sim.autopilot={name}"])
         self.autopilot = Autopilot(config, self.vehicle, 0, np.random.SeedSequence(1), airborne=airborne)
         self.client = Client()
         self.seen: list[tuple[int, Any]] = []

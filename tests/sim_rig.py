@@ -112,8 +112,7 @@ class Bench:
 
 def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
     return Bench(
-        load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot.autopilot={autopilot}", *overrides]),
-        airborne=airborne,
+        load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne
     )
 
 

@@ -27,7 +27,7 @@ def drawn(seed: int, flight_s: float = FLIGHT_S) -> Config:
     plant = str(rng.choice(["linear", "quadrotor"], p=[0.7, 0.3]))
     autopilot = str(rng.choice(["px4", "ardupilot"]))
     config = load_config(
-        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", f"sim.seed={seed}"]
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.seed={seed}"]
     )
     config = replace(config, duration_s=flight_s)
     link = replace(

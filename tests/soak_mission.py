@@ -170,7 +170,7 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
         seed: Of every draw.
         path: Recording; None for none.
     """
-    config = load_config("room-hahn-stursberg", [*MISSION, f"sim.autopilot.autopilot={autopilot}", f"sim.seed={seed}"])
+    config = load_config("room-hahn-stursberg", [*MISSION, f"sim.autopilot={autopilot}", f"sim.seed={seed}"])
     ground = _Ground(prepared)
     worlds: list[World] = []
 

@@ -129,7 +129,7 @@ def drawn_pair(seed: int) -> Config:
     rng = np.random.default_rng([seed, 14])
     plant, autopilot = WORLDS[seed % len(WORLDS)]
     config = load_config(
-        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", f"sim.seed={seed}"]
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.seed={seed}"]
     )
     sim, link = config.sim, config.link
     wind = sim.wind

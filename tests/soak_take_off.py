@@ -71,9 +71,9 @@ def troubled(autopilot: str, seed: int) -> Flight:
         *RELAYED,
         "sim.streams=onboard",
         f"sim.seed={seed}",
-        f"sim.autopilot.autopilot.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
-        f"sim.autopilot.autopilot.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
-        f"sim.autopilot.autopilot.clears={'true' if autopilot == 'px4' else 'false'}",
+        f"sim.checks.flicker_s={rng.choice([0.0, 0.7, 2.0])}",
+        f"sim.checks.invalid=[[{begin_s:.2f}, {begin_s + length_s:.2f}]]",
+        f"sim.checks.clears={'true' if autopilot == 'px4' else 'false'}",
     ).relayed()
     if autopilot == "px4":
         flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", HEIGHT_M)

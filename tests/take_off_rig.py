@@ -38,9 +38,7 @@ class Flight:
     """The loop and the peers; between them the test may change, drop or add what is said."""
 
     def __init__(self, autopilot: str, *overrides: str) -> None:
-        self.config = load_config(
-            "room-hahn-stursberg", [*ON_THE_FLOOR, f"sim.autopilot.autopilot={autopilot}", *overrides]
-        )
+        self.config = load_config("room-hahn-stursberg", [*ON_THE_FLOOR, f"sim.autopilot={autopilot}", *overrides])
         self.memory = Memory()
         design, controller = shared(self.config)
         self.memory.put("/uavctl/header", 0, header(self.config, design))

@@ -45,7 +45,7 @@ def around(at_s: float) -> tuple[float, float, float] | None:
 
 
 def moving(*wrong: str, autopilot: str, matrix: list[list[float]] | None = None, more: tuple[str, ...] = ()) -> Checked:
-    setup = [f"sim.autopilot.autopilot={autopilot}", ALOFT, *more]
+    setup = [f"sim.autopilot={autopilot}", ALOFT, *more]
     return look(setup, wrong, seconds=6.5, airborne=True, setpoints=around, twist=twisted(matrix or scaled(1.0)))
 
 
@@ -66,7 +66,7 @@ def test_a_right_set_up_with_a_frame_of_its_own_is_good(autopilot: str, setup: s
 @BOTH
 @pytest.mark.parametrize("place", [ORIGIN, AWAY])
 def test_a_right_set_up_at_rest_is_not_refused_and_what_cannot_be_seen_is_told(autopilot: str, place: str) -> None:
-    found = look([f"sim.autopilot.autopilot={autopilot}", place])
+    found = look([f"sim.autopilot={autopilot}", place])
     assert found.bad == []
     axes = found["axes"]
     assert axes.state is ItemState.UNDETERMINED and "up is taken for down" in axes.value and axes.hint
@@ -125,7 +125,7 @@ def test_a_wrong_unit_or_a_mirror_is_named_when_it_moves(autopilot: str, matrix:
     "wrong", ["frame.convention=enu", "frame.yaw_deg=90", "frame.yaw_deg=180", "frame.yaw_deg=-30"]
 )
 def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: str) -> None:
-    found = look([f"sim.autopilot.autopilot={autopilot}", AWAY], [wrong])
+    found = look([f"sim.autopilot={autopilot}", AWAY], [wrong])
     assert found["axes"].state is ItemState.BAD
 
 
@@ -134,7 +134,7 @@ def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: s
 @pytest.mark.parametrize("matrix", [scaled(1000.0), scaled(100.0), scaled(0.01), *MIRRORED.values(), Y_UP, FLU])
 def test_a_wrong_unit_or_a_mirror_is_caught_at_rest_off_the_origin(autopilot: str, matrix: list[list[float]]) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot.autopilot={autopilot}", AWAY, more], twist=twisted(matrix))
+    found = look([f"sim.autopilot={autopilot}", AWAY, more], twist=twisted(matrix))
     assert found["axes"].state is ItemState.BAD
 
 
@@ -142,7 +142,7 @@ def test_a_wrong_unit_or_a_mirror_is_caught_at_rest_off_the_origin(autopilot: st
 @BOTH
 def test_at_rest_on_the_origin_the_noise_tells_the_unit(autopilot: str) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot.autopilot={autopilot}", ORIGIN, more], twist=twisted(scaled(1000.0)))
+    found = look([f"sim.autopilot={autopilot}", ORIGIN, more], twist=twisted(scaled(1000.0)))
     assert found["position noise"].state is ItemState.BAD and "millimetres" in found["position noise"].hint
 
 
@@ -155,19 +155,14 @@ def test_at_rest_on_the_origin_the_noise_tells_the_unit(autopilot: str) -> None:
 def test_at_rest_on_the_origin_the_attitude_tells_a_turned_frame(
     autopilot: str, right: str, wrong: str, message: str
 ) -> None:
-    setup = [f"sim.autopilot.autopilot={autopilot}", ORIGIN, right, f"sim.camera.message={message}"]
+    setup = [f"sim.autopilot={autopilot}", ORIGIN, right, f"sim.camera.message={message}"]
     assert look(setup)["heading"].state is ItemState.GOOD
     declared = message == "odometry" and "enu" in right  # it says so itself, and is believed
     assert (look(setup, [wrong])["heading"].state is ItemState.BAD) == (not declared)
 
 
 def test_cameras_that_see_another_body_are_caught() -> None:
-    setup = [
-        "sim.autopilot.autopilot=px4",
-        ALOFT,
-        "sim.camera.swapped=[[0.0,99.0]]",
-        "sim.camera.other_body_m=[0.0,0.0,-1.0]",
-    ]
+    setup = ["sim.autopilot=px4", ALOFT, "sim.camera.swapped=[[0.0,99.0]]", "sim.camera.other_body_m=[0.0,0.0,-1.0]"]
     found = look(setup, seconds=6.5, airborne=True, setpoints=around)
     assert found["axes"].state is ItemState.BAD and "m for the cameras" in found["axes"].value
 

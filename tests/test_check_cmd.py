@@ -213,7 +213,7 @@ def test_the_runner_is_bounded_and_answers_the_vehicle() -> None:
 
 
 def test_it_waits_for_an_estimator_that_is_starting_but_not_for_ever() -> None:
-    bench = Bench("sim.autopilot.autopilot=ardupilot", "check.wait_s=3.0")
+    bench = Bench("sim.autopilot=ardupilot", "check.wait_s=3.0")
     for name, value in {"GPS1_TYPE": 0, "EK3_SRC1_POSXY": 6, "VISO_TYPE": 1}.items():
         bench.peers.autopilot.parameters.set(name, value)
     found = bench.run(2.0)

@@ -28,7 +28,7 @@ def state(found: Checked, name: str) -> ItemState:
 
 
 def test_every_item_has_a_want_and_every_one_that_is_not_good_says_what_to_do() -> None:
-    for found in (look(), look(["sim.autopilot.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
+    for found in (look(), look(["sim.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
         for one in found.items.values():
             assert one.name and one.value and one.want
             assert bool(one.hint) == (one.state is not ItemState.GOOD)
@@ -252,7 +252,7 @@ def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
 @BOTH
 def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
     """Every message to the vehicle is one of these, and every command asks for a message."""
-    config = load_config("room-hahn-stursberg", [f"sim.autopilot.autopilot={autopilot}", "relay.enabled=true"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "relay.enabled=true"])
     peers, flight = Peers(config, 0, airborne=False), Preflight(config, make_links, 0)
     kinds, commands = set(), set()
     for tick in range(300):
@@ -337,7 +337,7 @@ def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilo
             assert peers.autopilot.parameters.set(name, value), name
 
     more = ["relay.enabled=true", "frame.yaw_deg=20", "sim.camera.rate_hz=30.0", "sim.plant=quadrotor"]
-    found = look([f"sim.autopilot.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
+    found = look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
     assert not found.bad
     assert state(found, "relay") is ItemState.GOOD and state(found, "own position") is ItemState.GOOD
     # What the vehicle believes because we told it shows nothing of our axes.

@@ -25,7 +25,7 @@ def with_parameters(autopilot: str, *more: str, **values: float) -> Checked:
         for name, value in values.items():
             assert peers.autopilot.parameters.set(name, value), name
 
-    return look([f"sim.autopilot.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
+    return look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
 
 
 @BOTH

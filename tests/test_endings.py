@@ -104,7 +104,7 @@ def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode: str) -> None:
-    rig = Endings(tmp_path, f"sim.autopilot.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
+    rig = Endings(tmp_path, f"sim.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
     rig.at(HandoverState.RELEASED, interrupt, after_s=3.0)
     told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
     assert f"in the air, in mode {mode}" in told.ending["sentence"]
@@ -118,7 +118,7 @@ def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
 
 def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
-    rig = Endings(tmp_path, "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]", "sim.autopilot.autopilot.clears=true")
+    rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
     told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
     assert "had acted and ended" in told.ending["sentence"]
 
@@ -142,7 +142,7 @@ def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Typ
 
 
 def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
-    poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.vehicle.quadrotor.charge=0.1")
+    poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
     told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
     assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
 
@@ -155,7 +155,7 @@ def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None
 
 
 def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Endings(tmp_path, "sim.autopilot.autopilot=ardupilot", "hand_over.climb_s=4.0")
+    rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
     monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
     told = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
     assert "FAILED" in told.ending["sentence"]

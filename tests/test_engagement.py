@@ -75,14 +75,7 @@ def test_a_place_that_is_not_reached_is_told_in_the_exit_code(
 def test_a_refused_take_off_is_told_with_the_vehicle_s_reason(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    poor = [
-        "--set",
-        "sim.plant=quadrotor",
-        "--set",
-        "sim.vehicle.quadrotor.charge=0.1",
-        "--set",
-        "hand_over.ground_s=4",
-    ]
+    poor = ["--set", "sim.plant=quadrotor", "--set", "sim.quadrotor.charge=0.1", "--set", "hand_over.ground_s=4"]
     words = ["--arm", "--takeoff", "1.2", "--duration", "20", "--out", str(tmp_path), *poor, *FLOOR]
     code, _, err = typed(capsys, "loopback", *words)
     assert code == 1 and "low battery" in err and "TEMPORARILY_REJECTED" in err

@@ -68,7 +68,7 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
 
 @pytest.mark.fault(8)
 def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
-    flight = Flight('sim.autopilot.autopilot="ardupilot"')
+    flight = Flight('sim.autopilot="ardupilot"')
     flight.run(1.5)
     assert flight.speed_mps > 0.3
     flight.run(8.0, uplink=False)  # the last acceleration for GUID_TIMEOUT = 3 s, then the brakes

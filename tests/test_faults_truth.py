@@ -32,8 +32,7 @@ def world(request: pytest.FixtureRequest) -> Config:
     """The preset from its start, where plans begin at once; nothing is lost unless a fault says so."""
     plant, autopilot = request.param
     return load_config(
-        "room-hahn-stursberg",
-        [f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"],
+        "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"]
     )
 
 
@@ -107,9 +106,7 @@ def test_as_delivered_the_preset_stays_near_the_room_too(
     as_flown: Prepared, autopilot: str, fault: FaultConfig, moved_m: float
 ) -> None:
     """Plans of the age-conditioned scheme in steps of a tick; from 0.3 s on it may brake for as far as it has gone."""
-    config = load_config(
-        "room", ["sim.plant=quadrotor", f"sim.autopilot.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"]
-    )
+    config = load_config("room", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"])
     flight = bounded(fly_true(as_flown, with_faults(config, fault), flight_s=14.0))
     assert flight.moved_m < moved_m
     assert flight.outside_m <= 0.3
@@ -197,9 +194,7 @@ def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: floa
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.fault(41)
 def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str) -> None:
-    config = load_config(
-        "room-hahn-stursberg", ["sim.plant=quadrotor", f"sim.autopilot.autopilot={autopilot}", "sim.seed=3"]
-    )
+    config = load_config("room-hahn-stursberg", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])
     gale = FaultConfig(at_s=6.0, kind="wind", velocity_mps=(9.0, 0.0, 0.0))
     flight = fly_true(prepared, with_faults(config, gale))
     assert flight.ended in ("AUTO.LAND", "LAND")

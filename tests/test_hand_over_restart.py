@@ -142,7 +142,7 @@ class Air:
 
     def __init__(self, autopilot: str, begins_s: float = 0.0) -> None:
         self.config = load_config(
-            "room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", f'sim.autopilot.autopilot="{autopilot}"']
+            "room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", f'sim.autopilot="{autopilot}"']
         )
         self._tick = round(begins_s * 1e9) // TICK_NS
         self.peers = Peers(self.config, self._tick * TICK_NS)

@@ -20,7 +20,7 @@ from uavctl.errors import ConfigError
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 NONE = InertialErrors(*[0.0] * len(fields(InertialErrors)))
-FLOWN = "sim.autopilot.inertial.flown=true"
+FLOWN = "sim.inertial.flown=true"
 LEVEL_MPS2 = (0.0, 0.0, -G)
 
 
@@ -120,7 +120,7 @@ def test_all_errors_grow_by_the_configured_factor(name: str) -> None:
     assert e.scaled(3.0).wander_rad == pytest.approx(3.0 * e.wander_rad)
     tilts = []
     for errors in (1, 3):
-        one = bench(name, QUADROTOR, "sim.seed=4", f"sim.autopilot.inertial.errors={errors}")
+        one = bench(name, QUADROTOR, "sim.seed=4", f"sim.inertial.errors={errors}")
         tilts.append(recorded(one, name, 2.0).turned_by)
     assert tilts[1] == pytest.approx(3.0 * tilts[0], abs=1e-4)
 
@@ -217,7 +217,7 @@ def test_a_seed_gives_the_same_bytes_and_another_seed_others(name: str) -> None:
 @BOTH
 def test_who_asks_for_no_inertial_data_gets_the_same_bytes_whatever_their_errors(name: str) -> None:
     for plant in ("sim.plant=linear", QUADROTOR):
-        exact, wrong = (streams(bench(name, plant, f"sim.autopilot.inertial.errors={e}"), QUATERNION) for e in (0, 10))
+        exact, wrong = (streams(bench(name, plant, f"sim.inertial.errors={e}"), QUATERNION) for e in (0, 10))
         assert exact == wrong
 
 
@@ -260,12 +260,12 @@ def test_who_flies_by_it_tells_it_from_the_start() -> None:
 def test_the_linear_plant_cannot_fly_by_it() -> None:
     with pytest.raises(ConfigError) as caught:
         load_config("room-hahn-stursberg", [FLOWN])
-    assert 'sim.autopilot.inertial.flown: has no effect with plant "linear"' in caught.value.problems[0]
+    assert 'sim.inertial.flown: has no effect with plant "linear"' in caught.value.problems[0]
 
 
 def test_first_messages_are_those_of_the_first_unit() -> None:
     for name, kind in FIRST.items():
-        one = bench(name, "sim.autopilot.inertial.errors=0", airborne=False)
+        one = bench(name, "sim.inertial.errors=0", airborne=False)
         ask(one, kind)
         one.wait(0.1)
         assert si(one.of(NAMES[kind])[-1])[2] == pytest.approx(-G)

@@ -54,7 +54,7 @@ def furthest_m(
         silent_s: from when on the vehicle says nothing of its own velocity.
     """
     preset = preset or f"room-{autopilot}"
-    design = (f"sim.autopilot.autopilot={autopilot}", *(("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()))
+    design = (f"sim.autopilot={autopilot}", *(("estimator.inertial_std_mps2=0.0",) if lie == "none" else ()))
     flown = load_config(
         preset,
         [

@@ -164,7 +164,7 @@ class Indoors:
         self.config = load_config(
             "room-hahn-stursberg",
             [
-                f"sim.autopilot.autopilot={name}",
+                f"sim.autopilot={name}",
                 "sim.camera.rate_hz=30.0",
                 "relay.enabled=true",
                 "link.loss=0.0",

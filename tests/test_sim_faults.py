@@ -27,8 +27,7 @@ HEAD = ["link.loss=0", "link.jitter_s=0", "sim.camera.rate_hz=10", "sim.camera.p
 def config(*faults: str, plant: str = "linear", autopilot: str = "px4") -> Config:
     listed = ", ".join(f"{{{fault}}}" for fault in faults)
     return load_config(
-        "room-hahn-stursberg",
-        [*HEAD, f"sim.plant={plant}", f"sim.autopilot.autopilot={autopilot}", f"sim.fault=[{listed}]"],
+        "room-hahn-stursberg", [*HEAD, f"sim.plant={plant}", f"sim.autopilot={autopilot}", f"sim.fault=[{listed}]"]
     )
 
 

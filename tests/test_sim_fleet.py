@@ -107,9 +107,7 @@ class Station:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_only_it(autopilot: str) -> None:
     told: tuple[list[Truth], list[Truth]] = ([], [])
-    config = load_config(
-        "room-hahn-stursberg", [f"sim.autopilot.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"]
-    )
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"])
     pair = [
         Seat(one.config, one.vehicle, one.mocap, told[i].append)
         for i, one in enumerate(fleet(config, ANY, ANY, 2, ignore))

@@ -29,7 +29,7 @@ from sim.autopilot.telemetry import in_thousandths
 from sim.vehicle.quadrotor import Quadrotor
 
 REQUEST, GET_INTERVAL, DENIED = 512, 510, 2
-EXACT = "sim.autopilot.inertial.errors=0"
+EXACT = "sim.inertial.errors=0"
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 PLANTS = pytest.mark.parametrize("plant", ["sim.plant=linear", QUADROTOR])
 OWN = {"px4": (HIGHRES,), "ardupilot": (RAW, SECOND)}
@@ -155,7 +155,7 @@ def test_the_acceleration_told_is_that_of_the_linear_plant(name: str) -> None:
 
 
 def test_in_free_fall_there_is_no_specific_force_but_drag() -> None:
-    one = bench("px4", QUADROTOR, EXACT, "sim.start_position_m=[0.0,0.0,-40.0]", "sim.vehicle.quadrotor.charge=0.0001")
+    one = bench("px4", QUADROTOR, EXACT, "sim.start_position_m=[0.0,0.0,-40.0]", "sim.quadrotor.charge=0.0001")
     one.wait(0.6)
     assert one.ask(REQUEST, HIGHRES) == 0
     force = np.array(si(one.of("HIGHRES_IMU")[-1])[:3])

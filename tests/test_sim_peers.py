@@ -20,9 +20,7 @@ def test_a_flight_that_begins_in_the_air_begins_with_a_known_position(airborne: 
 
 
 def test_nothing_that_is_sent_reaches_the_vehicle_in_an_uplink_blackout_and_what_it_says_goes_on() -> None:
-    config = load_config(
-        "room-hahn-stursberg", ["link.uplink_blackout=[[1.0, 2.0]]", "sim.autopilot.autopilot=ardupilot"]
-    )
+    config = load_config("room-hahn-stursberg", ["link.uplink_blackout=[[1.0, 2.0]]", "sim.autopilot=ardupilot"])
     peers, client = Peers(config, 3 * S), Client()
     answered: list[int] = []
     told: list[int] = []

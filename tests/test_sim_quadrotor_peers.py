@@ -34,9 +34,7 @@ HIGH = [
 
 
 def rough(autopilot: str, seconds: float, *more: str) -> Memory:
-    return lockstep(
-        "room-hahn-stursberg", seconds, QUADROTOR, *GUSTS, *LINK, f"sim.autopilot.autopilot={autopilot}", *more
-    )
+    return lockstep("room-hahn-stursberg", seconds, QUADROTOR, *GUSTS, *LINK, f"sim.autopilot={autopilot}", *more)
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -57,7 +55,7 @@ def test_preset_room_flies_it_with_gusts_bursts_and_delay_bit_for_bit(autopilot:
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
 def test_over_udp_preset_room_flies_it_in_real_time(autopilot: str, mode: str, tmp_path: Path) -> None:
-    settings = [QUADROTOR, *GUSTS, *LINK, *HIGH, f"sim.autopilot.autopilot={autopilot}"]
+    settings = [QUADROTOR, *GUSTS, *LINK, *HIGH, f"sim.autopilot={autopilot}"]
     more = [word for setting in settings for word in ("--set", setting)]
 
     def on_its_way(truths: list[Truth]) -> bool:
@@ -94,7 +92,7 @@ def test_its_state_is_in_the_order_of_the_plant_and_begins_where_it_is_told() ->
 
 
 def test_its_battery_begins_with_the_charge_asked_for() -> None:
-    peers = Peers(load_config("room-hahn-stursberg", [QUADROTOR, "sim.vehicle.quadrotor.charge=0.25"]), 0)
+    peers = Peers(load_config("room-hahn-stursberg", [QUADROTOR, "sim.quadrotor.charge=0.25"]), 0)
     assert isinstance(peers.vehicle, Quadrotor)
     assert peers.vehicle.battery.remaining == pytest.approx(0.25)
     peers.advance(1_000_000_000)
@@ -103,7 +101,7 @@ def test_its_battery_begins_with_the_charge_asked_for() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_it_takes_off_and_lands(autopilot: Literal["px4", "ardupilot"]) -> None:
-    one = Bench(load_config("room-hahn-stursberg", [QUADROTOR, f"sim.autopilot.autopilot={autopilot}"]), airborne=False)
+    one = Bench(load_config("room-hahn-stursberg", [QUADROTOR, f"sim.autopilot={autopilot}"]), airborne=False)
     assert one.peers.truth().position_m == (-2.4, -1.9, 0.0)
     one.wait(30.0)
     if autopilot == "px4":
@@ -133,8 +131,8 @@ def test_a_script_flies_the_linear_plant() -> None:
         ([QUADROTOR, "sim.start_position_m=[0, 0, 0]"], "sim.start_position_m[2]: 0 m is not above the floor"),
         ([QUADROTOR, "sim.start_position_m=[0, 0, 1.5]"], "sim.start_position_m[2]: 1.5 m is not above"),
         (["sim.wind.gust_wind_mps=3"], 'sim.wind: has no effect with plant "linear"'),
-        (["sim.vehicle.quadrotor.charge=0.5"], 'sim.vehicle.quadrotor: has no effect with plant "linear"'),
-        ([QUADROTOR, "sim.vehicle.quadrotor.charge=0"], "sim.vehicle.quadrotor.charge: expected a number > 0"),
+        (["sim.quadrotor.charge=0.5"], 'sim.quadrotor: has no effect with plant "linear"'),
+        ([QUADROTOR, "sim.quadrotor.charge=0"], "sim.quadrotor.charge: expected a number > 0"),
     ],
 )
 def test_what_makes_no_sense_is_refused(overrides: list[str], words: str) -> None:

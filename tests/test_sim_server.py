@@ -166,7 +166,7 @@ def test_udpin_answers_whoever_speaks() -> None:
 
 def test_tcp_takes_a_client_a_stream_in_pieces_and_the_next_client() -> None:
     mocap, mocap_url = udp()
-    ardupilot = config("sim.autopilot.autopilot=ardupilot")
+    ardupilot = config("sim.autopilot=ardupilot")
     with mocap, serving(ardupilot, "tcpin://127.0.0.1:0", mocap_url, duration_s=None, airborne=False) as served:
         assert served.ready is not None
         address = ("127.0.0.1", int(served.ready.vehicle.rsplit(":", 1)[1]))
@@ -183,7 +183,7 @@ def test_tcp_takes_a_client_a_stream_in_pieces_and_the_next_client() -> None:
 
 def test_several_tcp_clients_get_the_same_and_are_all_heard() -> None:
     mocap, mocap_url = udp()
-    ardupilot = config("sim.autopilot.autopilot=ardupilot")
+    ardupilot = config("sim.autopilot=ardupilot")
     with mocap, serving(ardupilot, "tcpin://127.0.0.1:0", mocap_url, duration_s=None, airborne=False) as served:
         assert served.ready is not None
         address = ("127.0.0.1", int(served.ready.vehicle.rsplit(":", 1)[1]))
@@ -329,7 +329,7 @@ def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_
     clients = [udp() for _ in range(4)]
     told: tuple[list[Truth], list[Truth]] = ([], [])
     seats = [
-        Seat(config(f"sim.autopilot.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
+        Seat(config(f"sim.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
         for i, name in enumerate(("px4", "ardupilot"))
     ]
     readies: list[Ready] = []

@@ -168,7 +168,7 @@ def test_a_seed_gives_the_same_flight_bit_for_bit(autopilot: str) -> None:
         flyer, truths, _ = fly(
             "room-hahn-stursberg",
             20.0,
-            f"sim.autopilot.autopilot={autopilot}",
+            f"sim.autopilot={autopilot}",
             *noisy,
             script=lambda tick: (math.sin(tick / 9), 0.3, 0.1) if tick < 300 else None,
         )
@@ -186,7 +186,7 @@ def test_progress_is_told_after_every_step() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_time_missed_is_caught_up_as_if_nothing_had_been_missed(autopilot: str) -> None:
-    config = load_config("room-hahn-stursberg", [f"sim.autopilot.autopilot={autopilot}"])
+    config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}"])
     told: tuple[list[Truth], list[Truth]] = ([], [])
     due: tuple[list[Any], list[Any]] = ([], [])
     for steps, truths, got in zip((1, 977), told, due, strict=True):
@@ -200,7 +200,7 @@ def test_time_missed_is_caught_up_as_if_nothing_had_been_missed(autopilot: str) 
 
 
 def test_the_next_event_is_never_later_than_something_due() -> None:
-    peers = Peers(load_config("room-hahn-stursberg", ["sim.autopilot.autopilot=ardupilot"]), 0)
+    peers = Peers(load_config("room-hahn-stursberg", ["sim.autopilot=ardupilot"]), 0)
     peers.advance(0)
     for _ in range(2000):
         next_ns = peers.next_ns

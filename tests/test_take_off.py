@@ -73,9 +73,7 @@ def test_px4_is_flown_before_it_has_climbed_to_its_own_height() -> None:
 
 @pytest.mark.fault(26)
 def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_own_words() -> None:
-    flight = Flight(
-        "px4", "hand_over.ground_s=6.0", "sim.plant=quadrotor", "sim.vehicle.quadrotor.charge=0.1"
-    ).take_off()
+    flight = Flight("px4", "hand_over.ground_s=6.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1").take_off()
     flight.run(12.0, until=HandoverState.FAILED)
     assert "low battery" in flight.loop.failure and "TEMPORARILY_REJECTED" in flight.loop.failure
     assert 2 <= flight.commands().count(ARM) <= 6

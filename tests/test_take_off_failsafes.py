@@ -34,11 +34,7 @@ def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilo
 
 @pytest.mark.fault(61)
 def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
-    more = [
-        "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]",
-        "sim.autopilot.autopilot.clears=true",
-        "sim.autopilot.autopilot.flicker_s=1.0",
-    ]
+    more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
     flight = Flight("px4", *RELAYED, *more).relayed()
     assert flown(flight) == "engaged" and not flight.loop.failure
     assert "failsafe" in flight.states and flight.loop.decision is not None
@@ -51,11 +47,7 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
 
 @pytest.mark.fault(61)
 def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
-    flight = (
-        Flight("px4", *RELAYED, "sim.autopilot.autopilot.invalid=[[0.2, 1.4]]", "sim.autopilot.autopilot.clears=true")
-        .relayed()
-        .take_off()
-    )
+    flight = Flight("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
     flight.run(30.0, until=HandoverState.FAILSAFE)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
@@ -77,9 +69,7 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
 def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_ground(
     autopilot: str, after_s: float
 ) -> None:
-    more = ["sim.autopilot.autopilot.invalid=[[0.4, 2.0]]"] + (
-        ["sim.autopilot.autopilot.clears=true"] if autopilot == "px4" else []
-    )
+    more = ["sim.checks.invalid=[[0.4, 2.0]]"] + (["sim.checks.clears=true"] if autopilot == "px4" else [])
     flight = Flight(autopilot, *RELAYED, *more).relayed().take_off()
     flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(after_s)

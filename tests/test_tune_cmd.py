@@ -339,7 +339,7 @@ def test_corners_in_any_order_are_one_box() -> None:
 def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     with short_flights(steps=1, hold_s=7.5):
-        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot.autopilot=ardupilot", "--json"))
+        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot=ardupilot", "--json"))
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
     comparison = document["comparison"]

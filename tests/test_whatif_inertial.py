@@ -34,7 +34,7 @@ HOLDS_FROM_NS = 10_000_000_000
 PX4: Case = ("room-px4", 20.0, ())
 ARDUPILOT: Case = ("room-ardupilot", 20.0, ())
 LINEAR: Case = ("room", 10.0, ())
-LINEAR_ARDUPILOT: Case = ("room", 10.0, ("sim.autopilot.autopilot=ardupilot",))
+LINEAR_ARDUPILOT: Case = ("room", 10.0, ("sim.autopilot=ardupilot",))
 TARGET: Vec3 = (0.5, 0.5, -1.0)
 ELSEWHERE = "target.position_m=[0.5, 0.5, -1.0]"
 

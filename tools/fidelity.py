@@ -65,8 +65,8 @@ AS_RECORDED = (
 )
 # What goes wrong in the second flight: PX4's failsafe that clears itself in the climb, ArduPilot's that does not.
 TROUBLED = {
-    "px4": ("sim.autopilot.autopilot.invalid=[[0.2,1.4]]", "sim.autopilot.autopilot.clears=true"),
-    "ardupilot": ("sim.autopilot.autopilot.invalid=[[12.0,1000.0]]",),
+    "px4": ("sim.checks.invalid=[[0.2,1.4]]", "sim.checks.clears=true"),
+    "ardupilot": ("sim.checks.invalid=[[12.0,1000.0]]",),
 }
 Array = NDArray[np.float64]
 
@@ -193,7 +193,7 @@ def recorded(folder: Path, name: str, beside: str) -> Watched:
 
 def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Watched:
     """The same, of the simulator."""
-    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot.autopilot={autopilot}", *overrides])
+    config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot={autopilot}", *overrides])
     sink, truth = _Sink(), []
     loop = ControlLoop(config, build_controller(config, design_of(config)), sink, lambda: 0)
     peers = Peers(config, 0, airborne=False)
@@ -323,7 +323,7 @@ def _requests(folder: Path, recordings: Sequence[tuple[str, str, str]], real: Ma
         sent = [one.data for one in read_tlog(folder / f"{name}.tlog").packets if one.outgoing]
         asked = [one for _, one in _heard(((0.0, data) for data in sent), system=0) if _is_request(one)]
         last = {int(one.param1): one.param2 for one in asked}
-        peers = Peers(load_config("room-ardupilot", ["sim.autopilot.autopilot=ardupilot"]), 0, airborne=True)
+        peers = Peers(load_config("room-ardupilot", ["sim.autopilot=ardupilot"]), 0, airborne=True)
         mav = mavlink.MAVLink(None, 255, 0)
         for number, interval_us in last.items():
             order = mavlink.MAVLink_command_long_message(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)

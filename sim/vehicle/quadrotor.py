@@ -37,7 +37,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Quadrotor:
-    """A quadrotor in the air or on the floor z = 0, with the place of `sim.vehicle.linear.Vehicle`.
+    """A quadrotor in the air or on the floor z = 0, with the place of `LinearVehicle`.
 
     The physics moves on the grid start_ns + k 2.5 ms; what is asked takes effect at the next point of it, and
     positions between two points are read from the last one and its velocity and acceleration. So stops on the

@@ -230,7 +230,7 @@ def sim(
         "udpout://127.0.0.1:14560"
     ),
     autopilot: Annotated[
-        Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot.autopilot")
+        Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot")
     ] = None,
     airborne: Annotated[bool, Parameter(negative=(), help="start flying in OFFBOARD or GUIDED")] = False,
     duration: Annotated[
@@ -260,7 +260,7 @@ def sim(
     ] = False,
 ) -> int:
     """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""
-    overrides = () if autopilot is None else (f'sim.autopilot.autopilot="{autopilot}"',)
+    overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     config = common.with_overrides(overrides).load().config
     if faults is not None:
         config = with_faults(config, faults, problems)

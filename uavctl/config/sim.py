@@ -270,12 +270,12 @@ def sim(config: SimConfig) -> Iterator[ConfigProblem]:
     """All problems of `[sim]`."""
     for name in ("occluded", "swapped", "frozen"):
         yield from spans(f"sim.camera.{name}", getattr(config.camera, name))
-    yield from spans("sim.autopilot.autopilot.invalid", config.checks.invalid)
+    yield from spans("sim.checks.invalid", config.checks.invalid)
     if config.checks.clears and config.autopilot != "px4":
         yield ConfigProblem(
-            "sim.autopilot.autopilot.clears",
+            "sim.checks.clears",
             f'has no effect with autopilot "{config.autopilot}", which stays in the mode of its failsafe',
-            'remove it, or set sim.autopilot.autopilot = "px4"',
+            'remove it, or set sim.autopilot = "px4"',
         )
     yield from faults("sim.fault", config.fault, config.plant)
     if config.plant == "linear":
@@ -288,7 +288,7 @@ def sim(config: SimConfig) -> Iterator[ConfigProblem]:
                 )
         if config.inertial.flown:
             yield ConfigProblem(
-                "sim.autopilot.inertial.flown",
+                "sim.inertial.flown",
                 'has no effect with plant "linear", which is always level',
                 'remove it, or set sim.plant = "quadrotor"',
             )

@@ -176,7 +176,7 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
     more = [
         f"duration_s={seconds}",
         "sim.plant=quadrotor",
-        f"sim.autopilot.autopilot={cell.autopilot}",
+        f"sim.autopilot={cell.autopilot}",
         f"sim.seed={seed}",
         f"sim.camera.rate_hz={cell.rate_hz}",
         f"sim.wind.velocity_mps={list(wind)}",
@@ -195,7 +195,7 @@ def believed(cell: TrialCell) -> Config:
     Raises:
         ConfigError: An override is none.
     """
-    overrides = (f"sim.autopilot.autopilot={cell.autopilot}", *(cell.link if cell.pilot.knows_link else ()))
+    overrides = (f"sim.autopilot={cell.autopilot}", *(cell.link if cell.pilot.knows_link else ()))
     return _with_mission(cell.pilot.load(overrides), cell.scenario)
 
 
