@@ -314,6 +314,8 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
     with socket.socket(type=socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
+    for path in lock_paths(url):  # what a daemon of another test has left on this port
+        path.unlink(missing_ok=True)
     sets = [word for setting in rig.overrides for word in ("--set", setting)]
     places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
     try:
