@@ -1,6 +1,8 @@
 # `make fly` and `make test` each work alone, in a fresh clone, with Python >= 3.11 and make.
 PYTHON ?= python3
 VENV := .venv
+# Not quiet: a download that takes a minute shows how far it is.
+PIP := $(VENV)/bin/python -m pip install --disable-pip-version-check -c constraints.txt
 # One stamp: the environment is made again only when what goes into it changes.
 STAMP := $(VENV)/.installed
 
@@ -23,7 +25,7 @@ test-clients: $(STAMP) $(CLIENTS)/.installed
 
 # The safety core: every branch is run by its own tests, and every change of it fails one (docs/safety-core.md).
 mutation: $(STAMP)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt cosmic-ray
+	$(PIP) cosmic-ray
 	$(VENV)/bin/python tools/mutation.py
 
 docs: $(STAMP)
@@ -32,9 +34,10 @@ docs: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
+	@echo "setting up $(VENV): once, a minute or two with the downloads"
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt setuptools wheel
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[dev]'
+	$(PIP) setuptools wheel
+	$(PIP) --no-build-isolation -e '.[dev]'
 	touch $(STAMP)
 
 $(CLIENTS)/.installed: constraints-clients.txt

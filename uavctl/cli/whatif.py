@@ -39,7 +39,8 @@ from uavctl.config.load import parse
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
-from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, Kind
+from uavctl.lab.campaign.plugins import KINDS
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.comparison import (
     HEADINGS,
     WhatIf,
@@ -133,7 +134,7 @@ def plant_of(path: Path | None, before: Config) -> tuple[PlantConfig, str]:
     return plant, f"[plant] of {path}"
 
 
-def baseline_flyer(loaded: LoadedConfig, kind: Kind, start: Array) -> Prepared:
+def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
     """A baseline in the place of the solver.
 
     Args:
@@ -184,7 +185,13 @@ def whatif(
         tuple[str, ...],
         Parameter(name="--set", negative=(), metavar="KEY=VALUE", help="change one key; may be repeated"),
     ] = (),
-    controller: Annotated[Kind, Parameter(help="who flies: the SMPC, or one of a campaign's baselines")] = "smpc",
+    controller: Annotated[
+        str,
+        Parameter(
+            help=f"who flies: {', '.join(KINDS)}; or a controller of another package, by its entry point "
+            "uavctl.controllers or as module:Class"
+        ),
+    ] = "smpc",
     link: Annotated[
         tuple[str, ...],
         Parameter(

@@ -243,7 +243,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
 # Checks of the simulated side's configuration.
 
 
-# Keys that a kind of fault heeds; the others are spans.
+# Keys that a kind of fault heeds; the kinds that are not here are spans.
 _OF_KIND = {
     "wind": ("velocity_mps",),
     "battery": ("charge",),
@@ -325,7 +325,5 @@ def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[ConfigProblem]:
     elif fault.kind in ("parameter", "mode", "frame"):
         if not fault.name:
             yield ConfigProblem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
-    elif fault.kind in ("noise", "drift"):
-        return
-    elif fault.for_s == 0.0:
+    elif fault.kind not in _OF_KIND and fault.for_s == 0.0:
         yield ConfigProblem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")

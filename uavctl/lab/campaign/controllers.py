@@ -27,7 +27,8 @@ from uavctl.build.library import StoredLibrary, decode
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
-from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
+from uavctl.lab.campaign.plugins import make_controller
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec
 from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
@@ -188,7 +189,7 @@ class Recipe:
     """All that a controller is built from; it can be sent to another process."""
 
     key: str  # hash of all the others
-    kind: Kind  # what it is
+    kind: str  # one of `uavctl.lab.campaign.plugins.KINDS`, or of another package
     config: Config  # the configuration that it believes in
     design: Design | None = None  # its design, of the SMPC with scheme `hahn-stursberg`
     # Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`
@@ -256,9 +257,9 @@ def build(recipe: Recipe) -> BatchController:
         kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)
         kappa_u = kappa(needed(config.smpc.delta_u, "smpc.delta_u"), plant.n_u, len(problem.input_set.b), allocation)
         return WorstCaseDelay(problem, needed(config.smpc.tau, "smpc.tau"), kappa_x, kappa_u)
-    if recipe.gains is None:
-        raise ValueError("a PID without gains")
-    return CascadedPid(problem, recipe.gains)
+    if recipe.kind == "pid" and recipe.gains is not None:
+        return CascadedPid(problem, recipe.gains)
+    return make_controller(recipe.kind, problem)
 
 
 def sight_of(config: Config) -> FilterBelief:

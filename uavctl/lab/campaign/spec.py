@@ -28,7 +28,8 @@ from uavctl.config.document import (
 )
 from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
-from uavctl.errors import ConfigError
+from uavctl.errors import ConfigError, DesignError
+from uavctl.lab.campaign.plugins import KINDS, controller_class
 
 # What a campaign is asked to fly, as its TOML file says it.
 #
@@ -37,9 +38,6 @@ from uavctl.errors import ConfigError
 
 TRUE = "true"  # a controller that believes in the link it flies on
 
-Kind = Literal[
-    "smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid"
-]
 Measured = Literal["state", "position"]
 Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
@@ -56,7 +54,15 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
     """One controller."""
 
     name: Name
-    kind: Annotated[Kind, Meta(description="what it is")]
+    kind: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            max_length=200,
+            description=f"what it is: {', '.join(f'`{kind}`' for kind in KINDS)}; or a controller of another package, "
+            "by the name of its entry point `uavctl.controllers` or as `module:Class`",
+        ),
+    ]
     set: Annotated[
         Overrides, Meta(description="overrides of the configuration that it is designed from: what it believes")
     ] = ()
@@ -381,7 +387,7 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     if told.problems:
         raise ConfigError(told.problems)
     spec = cast("CampaignSpec | None", decode(CampaignSpec, table, "", found, {}))
-    told.tell(found)
+    told.tell([*found, *_kinds(table)])
     if spec is None:
         raise ConfigError(told.problems)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)
@@ -458,6 +464,18 @@ def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
             yield ConfigProblem(
                 f"disturbance[{i}].memory", f'has no meaning with kind "{disturbance.kind}"', "remove it, or take gusts"
             )
+
+
+def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
+    """Controllers that are neither ours nor to be found."""
+    given = table.get("controller")
+    for i, one in enumerate(given if isinstance(given, list) else ()):
+        kind = one.get("kind") if isinstance(one, dict) else None
+        if isinstance(kind, str) and kind and kind not in KINDS:
+            try:
+                controller_class(kind)
+            except DesignError as error:
+                yield ConfigProblem(f"controller[{i}].kind", error.reason, error.hint)
 
 
 def _known(key: str, name: str, names: Sequence[str], what: str) -> Iterator[ConfigProblem]:
