@@ -25,7 +25,7 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.library import LibrarySolver
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
 from full_problem import gains, margins  # the tests' own oracle
 from library_rig import KEPT, Asked, Case, case, closed_loop, flown, uniform

@@ -1,7 +1,7 @@
 """Hostile datagrams and stalls against the real daemon, over loopback, on a vehicle that streams telemetry.
 
 `python tools/attack.py --scenario datagrams`: one flight for each number of senders, signed or not, listed or not, in
-which each kind of `tests/attacker.py` is sent for some seconds at the rate limit of `[security]`. Told are the
+which each kind of `tests/support/attacker.py` is sent for some seconds at the rate limit of `[security]`. Told are the
 processor seconds a second that it added to the daemon's, ticks that were missed, and falls back.
 `python tools/attack.py --scenario stall --runs 50`: the daemon is stopped (SIGSTOP) for 0.3 to 2.5 s under 600 messages
 a second, the pilot takes over in the middle, and the setpoints are counted that come after it woke.
@@ -20,7 +20,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
 from attack_rig import attacks, stalls  # the tests' own
 from attacker import BELIEVED_UNSIGNED, WORDS

@@ -40,15 +40,15 @@ PAGE = ROOT / "docs" / "safety-core.md"
 # The safety core, and the tests that must see every change of it.
 TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/envelope.py": (
-        "tests/test_envelope_observer.py",
-        "tests/test_envelope_velocity.py",
-        "tests/test_envelope.py",
+        "tests/flight/test_envelope_observer.py",
+        "tests/flight/test_envelope_velocity.py",
+        "tests/flight/test_envelope.py",
     ),
-    "uavctl/flight/fallback.py": ("tests/test_fallback.py",),
-    "uavctl/flight/limits.py": ("tests/test_limits.py",),
-    "uavctl/flight/gating.py": ("tests/test_reach_rules.py", "tests/test_stuck_rules.py"),
-    "uavctl/mavlink/handover_guards.py": ("tests/test_mode.py",),
-    "uavctl/mavlink/signing.py": ("tests/test_signing.py",),
+    "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
+    "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
+    "uavctl/flight/gating.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
+    "uavctl/mavlink/handover_guards.py": ("tests/mavlink/test_mode.py",),
+    "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py",),
 }
 CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless
 

@@ -32,7 +32,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the process is forked, so it may have no threads
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
 from cost_rig import cost, flown_ticks  # the tests' own
 from cut_rig import NAME, Cuts, alike, refused

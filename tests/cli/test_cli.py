@@ -1,0 +1,207 @@
+"""The command line as it is typed: exit codes, what goes where, refusals."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from places import ROOT
+
+from uavctl import __version__
+from uavctl.cli.app import app, run
+
+PRESET = ROOT / "uavctl" / "presets" / "paper.toml"
+STATE = "35,-2,-20,-4"
+
+
+def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = run(arguments)
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    code, out, _ = typed(capsys, *arguments, "--json")
+    assert code == 0
+    assert out.count("\n") == 1  # one document, on a line of its own
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+def test_solve_gives_the_paper_s_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    answer = document(capsys, "solve", "--config", "paper", "--state", STATE)
+    assert {
+        "status", "cost", "cost_lower", "gap", "inputs", "states", "backoff_x", "backoff_u", "slack", "method",
+        "solve_us",
+    } <= answer.keys()  # fmt: skip
+    assert answer["status"] == "optimal" and answer["method"] in ("frozen", "mixture", "exact")
+    assert answer["cost_lower"] - 0.01 <= 61669.93 <= answer["cost"] + 0.01
+    assert answer["gap"] <= 1e-3 and answer["gave_way"] == []
+    assert answer["inputs"][0] == pytest.approx([-7.5, 7.5], abs=1e-6)
+    assert (len(answer["states"]), len(answer["inputs"])) == (13, 12)
+    assert answer["states"][0] == [35.0, -2.0, -20.0, -4.0]
+
+
+def test_solve_shows_people_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = typed(capsys, "solve", "--config", "paper", "--method", "exact", "--state", STATE)
+    assert code == 0
+    assert "method exact: optimal" in out and "61669.93" in out and "gap" in out and "v_e" in out
+
+
+def test_solve_says_what_gave_way(capsys: pytest.CaptureFixture[str]) -> None:
+    outside = "49,-2,-20,-14"
+    answer = document(capsys, "solve", "--config", "paper", "--state", outside)
+    assert answer["method"] == "exact" and answer["slack"] > 10
+    assert {"constraint", "stage", "index", "amount"} == answer["gave_way"][0].keys()
+    code, out, _ = typed(capsys, "solve", "--config", "paper", "--state", outside)
+    assert code == 0
+    assert "lower limit of east position gave way by" in out
+
+
+@pytest.mark.parametrize("state", ["1,2", "1,2,3,x", "1,2,3,nan", ""])
+def test_a_state_that_is_none_is_refused(capsys: pytest.CaptureFixture[str], state: str) -> None:
+    code, out, err = typed(capsys, "solve", "--config", "paper", f"--state={state}")
+    assert (code, out) == (2, "")
+    assert "give 4 numbers" in err
+
+
+def test_design_shows_assumption_4_with_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "design", "--config", "paper")
+    assert {
+        "tau", "delays", "alpha", "gamma_x", "gamma_u", "spectral_radius", "assumptions", "library_size", "gap_max",
+        "design_id", "wall_s",
+    } <= found.keys()  # fmt: skip
+    assert (found["tau"], found["delays"]) == (4, [5] * 12)
+    assert found["spectral_radius"] == pytest.approx(0.9714, abs=5e-5)
+    assert [check["item"] for check in found["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
+    assert all(check["ok"] and {"value", "limit"} <= check.keys() for check in found["assumptions"])
+    assert found["assumptions"][0]["value"] == pytest.approx(1 - 0.3**5)
+    code, out, _ = typed(capsys, "design", "--config", "paper")
+    assert code == 0
+    assert "Assumption 4" in out and "0.9976" in out and "Policy library" in out
+
+
+def test_design_makes_the_policy_library_and_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "design", "--config", "paper")
+    library = found["library"]
+    assert {"library_id", "bytes", "file", "cached", "made_s", "components", "check"} == library.keys()
+    assert [part["name"] for part in library["components"]] == ["component 0", "component 1"]
+    assert found["library_size"] == sum(part["policies"] for part in library["components"]) > 20
+    assert 0.0 < found["gap_max"] == library["check"]["worst_gap"] <= 1e-3
+    methods = library["check"]["methods"]
+    assert methods["frozen"] + methods["mixture"] > 0.5 * library["check"]["states"] == 100
+    assert methods.keys() == {"frozen", "mixture", "exact"}
+    assert library["bytes"] == Path(library["file"]).stat().st_size <= 5_000_000
+    assert document(capsys, "design", "--config", "paper")["library"] == {**library, "cached": True}
+    none = document(capsys, "design", "--config", "paper", "--set", "solver.method=exact")
+    assert (none["library"], none["library_size"], none["gap_max"]) == (None, 0, None)
+
+
+WRONG = {
+    "unknown key": (("horizon = 12", "horizn = 12"), "smpc.horizn", "unknown key", 'nearest valid name "horizon"'),
+    "wrong shape": (("[0.0, 0.61, 0.0, 0.0], ", ""), "plant.a", "is 3 x 4", "give 3 rows of 3 numbers"),
+    "target too near the limits": (
+        ("position_m = [0.0,", "position_m = [45.0,"), "target.position_m", "Assumption 4.3 fails", "move the target",
+    ),
+    "tau as long as the horizon": (("tau = 4", "tau = 12"), "smpc.tau", "do not fit into", "longer horizon"),
+    "tau too long for the horizon": (("tau = 4", "tau = 11"), "smpc.tau", "free steps", "smpc.horizon of at least"),
+    "unstable gain": (("[-0.058, -1.172, 0.0", "[-0.6, -1.2, 0.0"), "smpc.k_tau", "unstable", "smaller gain"),
+    "W is no covariance": (
+        ("w = [[0.6, 0.0], [0.0, 0.6]]", "w = [[0.6, 0.7], [0.7, 0.6]]"), "plant.w", "not positive semidefinite",
+        "give a covariance",
+    ),
+    "delta out of reach": (("delta_x = 0.95", "delta_x = 0.995"), "smpc.delta_x", "out of reach", "lower it"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, what: str) -> None:
+    (old, new), key, reason, todo = WRONG[what]
+    text = PRESET.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace(old, new), encoding="utf-8")
+    code, out, err = typed(capsys, "design", "--config", str(file), "--json")
+    assert (code, out) == (2, "")
+    name = key.partition(".")[2]
+    lines = enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+    line = next(number for number, content in lines if content.startswith(f"{name} ="))
+    (told,) = [each for each in err.splitlines() if f"{file}:{line}: {key}: " in each]
+    assert reason in told
+    assert todo in told.partition(reason)[2] or todo in told
+    assert "Traceback" not in err
+
+
+def test_overrides_repeat_and_their_errors_name_them(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(
+        capsys, "design", "--config", "paper", "--set", "smpc.tau=3", "--set", "schedule.delays=4",
+        "--set", "smpc.delta_x=0.9", "--set", "sets.state_lower=[-90, -20, -90, -20]",
+        "--set", "sets.state_upper=[90, 20, 90, 20]", "--set", "solver.method=exact",
+    )  # fmt: skip
+    assert (found["tau"], found["delays"]) == (3, [4] * 12)
+    code, out, err = typed(capsys, "design", "--set", "link.los=0.3", "--set", "smpc.tau=0")
+    assert (code, out) == (2, "")
+    assert "--set link.los=0.3: link.los: unknown key" in err
+    assert "--set smpc.tau=0: smpc.tau: expected a whole number >= 1, got 0" in err
+
+
+@pytest.mark.parametrize(
+    "arguments", [("desgn",), ("solve",), ("design", "--confg", "paper"), ("solve", "--method", "x")]
+)
+def test_usage_errors_exit_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
+    code, out, err = typed(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err
+
+
+def test_help_tells_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = typed(capsys, "--help")
+    assert code == 0
+    assert "Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration" in " ".join(out.split())
+    for name in ("loopback", "fly", "sim", "design", "solve", "bench", "log"):
+        assert name in out
+        assert app[name].help  # the module is there, and has the function that is named
+
+
+def test_a_fresh_process_writes_one_document_and_keeps_to_one_thread() -> None:
+    # The variable only counts if it is set before numpy is imported.
+    script = (
+        "import atexit, os, sys; from uavctl.cli import main; assert 'numpy' not in sys.modules;"
+        "atexit.register(lambda: sys.stderr.write(os.environ['OMP_NUM_THREADS'])); main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "design", "--config", "paper", "--set", "solver.method=exact", "--json"],
+        env={name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"},
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "1")
+    assert json.loads(done.stdout)["tau"] == 4
+    done = subprocess.run(
+        [sys.executable, "-m", "uavctl", "--version"], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.strip() == __version__
+
+
+def test_an_interruption_is_one_line(tmp_path: Path) -> None:
+    """Also while modules are imported, which takes most of a short command's time."""
+    command = [sys.executable, "-X", "importtime", "-m", "uavctl", "log", "info", str(tmp_path / "flight.mcap")]
+    # A shell has what it runs in the background ignore interruptions, and so do all that this starts.
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    )
+    assert process.stderr is not None
+    # What is not read yet holds it up: else a machine that is busy lets it end before it is interrupted.
+    fcntl.fcntl(process.stderr, fcntl.F_SETPIPE_SZ, 4096)
+    lines = iter(process.stderr.readline, "")
+    assert any("cyclopts" in line for line in lines)
+    process.send_signal(signal.SIGINT)
+    rest = [line for line in lines if not line.startswith("import time:")]
+    process.stderr.close()
+    assert (process.wait(), rest) == (130, ["interrupted\n"])

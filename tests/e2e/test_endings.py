@@ -1,0 +1,458 @@
+"""How a flight ended: console, status, service manager, summary, page, recording and exit code say the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from endings_rig import PRESET, TAKE_OFF, Endings, Sync, Told, flown, interrupt, is_a, words_of
+from places import ROOT
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+from logs.recording.summary import summarise
+from logs.report import flight_page as report
+from sim.autopilot.profile import FAILED, PERSONALITIES, Role
+from uavctl import loop as control
+from uavctl.cli import flying
+from uavctl.cli.app import run
+from uavctl.daemon.lock import sole_daemon
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.outcome import Cause, FlightCourse, make_ending
+from uavctl.records import Command, Order
+
+Type = Callable[..., Told]
+NO_COMMANDS = is_a("COMMAND_LONG")
+
+
+@pytest.fixture
+def typed(capsys: pytest.CaptureFixture[str]) -> Type:
+    """Flies, and has all places agree on one sentence."""
+
+    def fly(rig: Endings, cause: Cause, *words: str, good: bool = False) -> Told:
+        told = flown(rig, capsys, *words)
+        assert told.summary, told.console
+        assert told.ending["cause"] == cause, told.ending
+        told.agrees()
+        assert told.code == (0 if good else 1), told.ending
+        return told
+
+    return fly
+
+
+def order(what: Order) -> Callable[[Endings], None]:
+    def do(rig: Endings) -> None:
+        rig.flying.order(Command(order=what))
+
+    return do
+
+
+def stick(mode: str) -> Callable[[Endings], None]:
+    return lambda rig: rig.stick(mode)
+
+
+def fail(mode: Role) -> Callable[[Endings], None]:
+    """A failsafe of the vehicle's own."""
+    return lambda rig: rig.peers.autopilot.pilot.fail(PERSONALITIES[rig.config.sim.autopilot].by_role(mode), rig.now_ns)
+
+
+def deafen(kind: str) -> Callable[[Endings], None]:
+    """From now on the vehicle hears no message of a kind."""
+
+    def do(rig: Endings) -> None:
+        is_one = is_a(kind)
+        rig.hears = lambda data: not is_one(data)
+
+    return do
+
+
+# As ordered
+
+
+def test_the_mission_is_over(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "mission.waypoints=[[0.3,0.0,-1.2]]", "mission.hold_s=0.5", "mission.then='land'")
+    told = typed(rig, Cause.MISSION, *TAKE_OFF, good=True)
+    assert "landed and disarmed" in told.ending["sentence"]
+
+
+def test_the_operator_orders_the_landing(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, order(Order.LAND), after_s=2.0)
+    typed(rig, Cause.ORDERED, *TAKE_OFF, good=True)
+
+
+def test_the_operator_ends_it(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=2.0)
+    told = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    assert "landed and disarmed" in told.ending["sentence"]
+
+
+def test_the_operator_hands_over_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(HandoverState.ENGAGED, interrupt, after_s=3.0)
+    told = typed(rig, Cause.OPERATOR, good=True)
+    assert "in the air, in mode OFFBOARD" in told.ending["sentence"]
+
+
+def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
+    typed(Endings(tmp_path), Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
+
+
+@pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
+def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode: str) -> None:
+    rig = Endings(tmp_path, f"sim.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=3.0)
+    told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
+    assert f"in the air, in mode {mode}" in told.ending["sentence"]
+
+
+def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0)
+    rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=1.0)
+    typed(rig, Cause.PILOT_LANDED, good=True)
+
+
+def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
+    # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
+    rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
+    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
+    assert "had acted and ended" in told.ending["sentence"]
+
+
+# The take-off
+
+
+def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.CLIMBING, stick("POSCTL"), after_s=0.6)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
+    told = typed(rig, Cause.PILOT, *TAKE_OFF)
+    assert "before the controller was in charge" in told.ending["sentence"]
+
+
+def test_the_operator_ends_it_in_the_climb(tmp_path: Path, typed: Type) -> None:
+    typed(Endings(tmp_path).at(HandoverState.CLIMBING, interrupt, after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
+
+
+def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Type) -> None:
+    typed(Endings(tmp_path).at(HandoverState.CLIMBING, order(Order.LAND), after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
+
+
+def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
+    poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
+    told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
+    assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
+
+
+def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.ground_s=4.0")
+    rig.hears = lambda data: not NO_COMMANDS(data)
+    told = typed(rig, Cause.NO_MODE, *TAKE_OFF)
+    assert "did not answer" in told.ending["sentence"]
+
+
+def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
+    monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
+    told = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
+    assert "FAILED" in told.ending["sentence"]
+
+
+def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
+    told = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.NO_CLIMB, *TAKE_OFF)
+    assert "landed and disarmed" in told.ending["sentence"]
+
+
+def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.engage_s=3.0")
+    rig.at(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
+    told = typed(rig, Cause.NOT_GRANTED, *TAKE_OFF)
+    assert "landed and disarmed" in told.ending["sentence"]
+
+
+def test_no_positions_come(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.ground_s=4.0", "link.blackout=[[0.0, 1000.0]]")
+    typed(rig, Cause.NO_POSITIONS, *TAKE_OFF)
+
+
+def test_no_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.ground_s=4.0")
+    rig.told = lambda data: False
+    typed(rig, Cause.NO_VEHICLE, *TAKE_OFF)
+
+
+def test_another_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
+    other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(other))
+    rig = Endings(tmp_path)
+    for at_s in (0.3, 0.6, 1.2):
+        rig.after(at_s, lambda one: one.lines["vehicle"].arrived.append((beat, one.now_ns)))
+    typed(rig, Cause.NOT_ALONE, *TAKE_OFF)
+
+
+def test_the_vehicle_is_in_the_air_already(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, airborne=True)
+    rig.stick("POSCTL")
+    told = typed(rig, Cause.NOT_BEGUN, *TAKE_OFF)
+    assert "armed already" in told.ending["sentence"]
+
+
+def test_the_pilot_never_switches(tmp_path: Path, typed: Type) -> None:
+    typed(Endings(tmp_path).after(4.0, interrupt), Cause.NOT_FLOWN)
+
+
+def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Endings(tmp_path, airborne=True)
+    begin = rig.fly
+
+    def left(loop: ControlLoop, *given: Any, **more: Any) -> bool:
+        loop.order(Command(order=Order.STAND_BY, flown_ns=0))
+        return begin(loop, *given, **more)
+
+    monkeypatch.setattr(rig, "fly", left)
+    rig.after(12.0, interrupt)
+    told = typed(rig, Cause.LEFT)
+    assert "in the air" in told.ending["sentence"]
+
+
+# In flight
+
+
+def test_the_place_is_not_reached(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path)
+    told = typed(rig, Cause.NOT_REACHED, *TAKE_OFF, "--goto", "2.2,1.2,-1.2", "--duration", "4")
+    assert "2.2,1.2,-1.2" in told.ending["sentence"]
+
+
+def test_the_fallback_lands_it(tmp_path: Path, typed: Type) -> None:
+    told = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK, *TAKE_OFF)
+    assert "age of information" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+
+
+@pytest.mark.parametrize("words", [TAKE_OFF, ()])
+def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
+    # The cameras take another body for ours: its positions are not believed, and ours do not come back.
+    swapped = 'sim.fault=[{at_s=9.0,kind="swapped",for_s=100.0}]'
+    rig = Endings(tmp_path, "fallback.land=false", swapped, airborne=not words)
+    told = typed(rig, Cause.FALLBACK_STOPPED, *words)
+    assert "jumped" in told.ending["sentence"]
+
+
+def test_landing_fails(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.land_s=6.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
+    told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
+    assert "in the air" in told.ending["sentence"]
+
+
+def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._disarm(), after_s=2.0)
+    typed(rig, Cause.DISARMED, *TAKE_OFF)
+
+
+def test_the_envelope_lets_it_go(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "target.position_m=[2.0,1.0,-1.2]", peers=("frame.yaw_deg=90.0",))
+    told = typed(rig, Cause.LET_GO, *TAKE_OFF)
+    assert told.summary["let_go"] and told.summary["let_go"] in told.ending["sentence"]
+
+
+def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, fail(Role.LAND), after_s=2.0)
+    typed(rig, Cause.FAILSAFE_LANDED, *TAKE_OFF)
+
+
+def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.climb_s=8.0")
+    rig.at(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
+    told = typed(rig, Cause.FAILSAFE, *TAKE_OFF)
+    assert "has not ended in 8 s" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+
+
+def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
+    rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
+    told = typed(rig, Cause.FAILSAFE)
+    assert "in the air" in told.ending["sentence"]
+
+
+def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
+    def young(rig: Endings) -> None:
+        mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for boot_ms in (100, 150):
+            data = bytes(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0).pack(mav))
+            rig.lines["vehicle"].arrived.append((data, rig.now_ns))
+
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, young, after_s=2.0)
+        .at(HandoverState.RELEASED, interrupt, after_s=2.0)
+    )
+    typed(rig, Cause.RESTARTED, *TAKE_OFF)
+
+
+@pytest.mark.parametrize("words", [TAKE_OFF, ()])
+def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
+    def silence(rig: Endings) -> None:
+        rig.told = lambda data: False
+
+    rig = Endings(tmp_path, "hand_over.land_s=6.0", airborne=not words).at(HandoverState.ENGAGED, silence, after_s=2.0)
+    rig.at(HandoverState.ENGAGED, interrupt, after_s=12.0)
+    told = typed(rig, Cause.SILENT, *words)
+    assert "not heard for" in told.ending["sentence"]
+
+
+def test_the_connection_is_closed(tmp_path: Path, typed: Type) -> None:
+    def close(rig: Endings) -> None:
+        rig.lines["vehicle"].closed = True
+
+    typed(Endings(tmp_path).at(HandoverState.ENGAGED, close, after_s=2.0), Cause.CONNECTION, *TAKE_OFF)
+
+
+@pytest.mark.fault(64)
+@pytest.mark.usefixtures("control_may_fail")
+def test_the_controller_fails_and_the_relay_goes_on(
+    tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise ArithmeticError("the core is broken")
+
+    rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
+    rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "step", broken), after_s=2.0)
+    told = typed(rig, Cause.CONTROL, *TAKE_OFF)
+    assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+    assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console
+    assert told.ending["relay"] in told.page
+    assert told.relay is not None and told.relay.alone
+
+
+def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
+    rig.at(HandoverState.ENGAGED, Endings.ask_status, after_s=1.0).at(
+        HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0
+    )
+    rig.at(HandoverState.RELEASED, interrupt, after_s=1.0).at(HandoverState.RELEASED, Endings.ask_status, after_s=3.0)
+    rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=5.0).at(
+        HandoverState.RELEASED, Endings.ask_status, after_s=6.0
+    )
+    told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
+    flying, alone, landing = rig.statuses
+    assert (flying["ending"], flying["relay"]["alone"]) == ("", False)
+    assert flying["relay"]["sent"] < alone["relay"]["sent"] < landing["relay"]["sent"]
+    for one, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
+        assert one["relay"]["alone"] and one["relay"]["sent_hz"] > 0.0 and one["relay"]["last_s"] < 3.0
+        assert one["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in one["ending"]
+        assert one["who_flies"] == HandoverState.RELEASED
+    assert told.relay is not None and told.relay.alone
+
+
+def test_the_operator_is_answered_with_the_end_that_is_under_way(tmp_path: Path, typed: Type) -> None:
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
+        .at(HandoverState.LANDING, Endings.ask_status, after_s=0.5)
+    )
+    typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    (status,) = rig.statuses
+    assert status["ending"].lower().startswith(Cause.OPERATOR) and "in the air" in status["ending"]
+    assert status["who_flies"] in (HandoverState.LANDING, HandoverState.SETTLING) and status["relay"] is None
+
+
+# Ends that leave less behind
+
+
+def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = (
+        Endings(tmp_path)
+        .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
+        .at(HandoverState.ENGAGED, interrupt, after_s=0.1)
+    )
+    told = flown(rig, capsys, *TAKE_OFF)
+    (recorded,) = told.recorded
+    assert (recorded.cause, recorded.exit_code) == (Cause.SIGNALLED, 130)
+    assert told.code == 130 and f"ended: {recorded.sentence}" in told.console and told.status == recorded.sentence
+    assert "in the air" in recorded.sentence
+    page = told.path.with_name("again.html")
+    code = run(["log", "report", str(told.path), "--out", str(page)])
+    capsys.readouterr()
+    assert code == 0 and words_of(page).count(recorded.sentence) == 2
+
+
+def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(_: Endings) -> None:
+        monkeypatch.setattr(Sync, "full", True)
+
+    rig = Endings(tmp_path).at(HandoverState.ENGAGED, fill, after_s=2.0)
+    told = flown(rig, capsys, *TAKE_OFF, "--duration", "12")
+    ending = told.ending
+    assert ending["cause"] == Cause.TIME and not ending["as_ordered"] and told.code == ending["exit_code"] == 1
+    assert "the recording lacks" in ending["sentence"] and "No space left on device" in ending["sentence"]
+    assert f"ended: {ending['sentence']}" in told.console and ending["sentence"] in told.page
+    assert ending["sentence"].startswith(told.status.removesuffix("."))
+
+
+# What the daemon has no part in
+
+
+def test_an_end_that_is_cut_off_is_told_everywhere(
+    tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
+    monkeypatch.setattr(flying, "LANDING_S", 1.0)
+    rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
+    told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
+    assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
+
+
+def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["loopback", *PRESET, "--duration", "4", "--out", str(tmp_path), "--json"]
+    code = run(arguments)
+    out, err = capsys.readouterr()
+    ending, path = json.loads(out)["ending"], tmp_path / "flight.mcap"
+    assert (code, ending["cause"], ending["exit_code"]) == (0, Cause.IN_FLIGHT, 0)
+    assert f"ended: {ending['sentence']}" in " ".join(err.split())
+    assert words_of(path.with_suffix(".html")).count(ending["sentence"]) == 2
+    flight = FlightData.from_records(read(path))
+    assert [msgspec.to_builtins(one) for one in flight.endings] == [ending]
+    assert summarise(flight, wall_s=None).ending.sentence == ending["sentence"]
+
+
+def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # As an older daemon left it: nobody flew the vehicle, and there is no last word.
+    path = flown(Endings(tmp_path).after(4.0, interrupt), capsys).path
+    flight = replace(FlightData.from_records(read(path), path), endings=())
+    summary = summarise(flight, wall_s=None)
+    report.write_report(flight, summary, tmp_path / "again.html")
+    assert (summary.ending.cause, summary.ending.as_ordered, summary.ending.exit_code) == (Cause.WAITING, False, 1)
+    assert summary.ended == Cause.WAITING
+    assert words_of(tmp_path / "again.html").count(summary.ending.sentence) == 2
+
+
+def test_an_end_that_was_cut_off_says_so() -> None:
+    course = FlightCourse(engaged=True, flown=True)
+    course.stop(Cause.OPERATOR)
+    assert course.ending(over=False).cause == Cause.CUT_OFF and course.ending(over=False).exit_code == 1
+    assert course.ending(over=True).cause == Cause.OPERATOR and course.ending(over=True).exit_code == 0
+
+
+def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> None:
+    page = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
+    table = page.partition("| the sentence begins with |")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "---" not in line]
+    for cause in set(Cause) - {Cause.WAITING, Cause.SIGNALLED}:
+        (code,) = [row[1] for row in rows if row[0].partition(" (")[0] == cause.value]
+        assert code == str(make_ending(cause, "").exit_code), cause
+
+
+def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
+    typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
+    with sole_daemon("udpin://127.0.0.1:1") as tenure:
+        assert not tenure.leaves

@@ -1,0 +1,77 @@
+"""The import contracts of pyproject.toml: kept by the tree, and able to bite."""
+
+from __future__ import annotations
+
+import tomllib
+from copy import deepcopy
+from typing import Any
+
+import grimp
+import pytest
+from importlinter.configuration import configure
+from importlinter.contracts.forbidden import ForbiddenContract
+from importlinter.contracts.layers import LayersContract
+from importlinter.domain.contract import Contract
+from places import ROOT
+
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+TYPES: dict[str, type[Contract]] = {"layers": LayersContract, "forbidden": ForbiddenContract}
+
+
+@pytest.fixture(scope="module")
+def graph() -> grimp.ImportGraph:
+    configure()
+    return grimp.build_graph(*SETTINGS["root_packages"], include_external_packages=True, cache_dir=None)
+
+
+def broken(graph: grimp.ImportGraph) -> set[str]:
+    """Names of the contracts that the graph breaks."""
+    session = {key: value for key, value in SETTINGS.items() if key != "contracts"}
+    names = set()
+    for settings in SETTINGS["contracts"]:
+        options: dict[str, Any] = {key: value for key, value in settings.items() if key not in ("name", "type")}
+        contract = TYPES[settings["type"]](settings["name"], session, options)
+        if not contract.check(deepcopy(graph), verbose=False).kept:
+            names.add(settings["name"].partition(":")[0])
+    return names
+
+
+def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
+    assert broken(graph) == set()
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported", "contract"),
+    [
+        ("uavctl.config", "uavctl.smpc", "Layers"),
+        ("uavctl.smpc", "uavctl.flight", "Layers"),
+        ("uavctl.flight", "uavctl.loop", "Layers"),
+        ("uavctl.loop", "uavctl.daemon.daemon", "Layers"),
+        ("uavctl.records", "uavctl.frames", "Layers"),
+        ("logs", "sim", "Layers"),
+        ("uavctl.smpc", "uavctl.config", "The control core is pure"),
+        ("uavctl.flight", "uavctl.mavlink", "The control core is pure"),
+        ("uavctl.smpc", "socket", "The control core is pure"),
+        ("uavctl.flight", "time", "The control core is pure"),
+        ("uavctl.flight", "pymavlink", "The control core is pure"),
+        ("uavctl.mavlink", "socket", "MAVLink is sans IO"),
+        ("sim", "uavctl.smpc", "The simulator knows nothing of the controller"),
+        ("sim", "uavctl.loop", "The simulator knows nothing of the controller"),
+        ("uavctl.daemon.daemon", "logs", "The daemon sees a sink, never the recordings"),
+        ("uavctl.cli.replay", "logs.report.flight_page", "A replay does not wait for what draws pages"),
+    ],
+)
+def test_one_planted_import_breaks_its_contract(
+    graph: grimp.ImportGraph, importer: str, imported: str, contract: str
+) -> None:
+    planted = deepcopy(graph)
+    planted.add_import(importer=importer, imported=imported)
+    assert contract in broken(planted)
+
+
+def test_an_indirect_import_counts(graph: grimp.ImportGraph) -> None:
+    planted = deepcopy(graph)
+    # Neither step is forbidden by itself: the frames are below the core, and only the core must not know sockets.
+    planted.add_import(importer="uavctl.smpc", imported="uavctl.frames")
+    planted.add_import(importer="uavctl.frames", imported="socket")
+    assert "The control core is pure" in broken(planted)

@@ -1,0 +1,49 @@
+"""Commands that the front page and the quick start ask one to type can be flown."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+from places import ROOT
+
+from uavctl.build.controller import build_design
+from uavctl.cli.common import Common
+
+
+def flights() -> list[str]:
+    """Every `uavctl loopback` of a block of commands."""
+    found = []
+    for page in ("README.md", "docs/quick-start.md"):
+        for block in re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.M | re.S):
+            found += [line for line in block.splitlines() if line.startswith("uavctl loopback")]
+    return found
+
+
+def test_the_pages_have_such_commands() -> None:
+    assert len(flights()) >= 6
+
+
+@pytest.mark.parametrize("line", flights())
+def test_a_design_can_be_made_of_each(line: str) -> None:
+    words = shlex.split(line, comments=True)
+    given = [
+        (words[place], words[place + 1]) for place in range(len(words) - 1) if words[place] in ("--set", "--config")
+    ]
+    config = next((value for name, value in given if name == "--config"), "room-hahn-stursberg")
+    overrides = tuple(value for name, value in given if name == "--set")
+    assert build_design(Common(config=config, overrides=overrides).load().config).schedule
+
+
+def test_lists_are_quoted_as_shells_want_them() -> None:
+    """Some shells take brackets for a pattern of file names."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    bare = re.compile(r"(?:--set|--link) (?=[^'\"\s])[^\s`]*\[")
+    assert [(page.name, one) for page in pages for one in bare.findall(page.read_text(encoding="utf-8"))] == []
+
+
+def test_a_command_for_one_recording_is_not_given_all_of_them() -> None:
+    bare = re.compile(r"^uavctl log (?:replay|report|whatif|export|info) [^\"\n]*\*", re.M)
+    for page in ("README.md", "docs/quick-start.md"):
+        assert not bare.search((ROOT / page).read_text(encoding="utf-8"))

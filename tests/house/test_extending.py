@@ -1,0 +1,114 @@
+"""The recipes of docs/extending.md, walked: the packages are copied, changed as the page says, and its commands run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from places import ROOT
+
+from logs.recording.reader import records
+from uavctl.records import Truth
+
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PACKAGES = ("uavctl", "sim", "logs")
+
+
+@dataclass
+class Recipe:
+    """One section of the page."""
+
+    blocks: list[tuple[str, str]]
+    tree: Path  # the packages, changed as it says
+    work: Path  # where its files lie and its commands run
+
+    def run(self, words: str) -> str:
+        """One of its commands, to a good end; what it printed."""
+        words = words.replace("uavctl ", f"{sys.executable} -m uavctl ", 1) if words.startswith("uavctl ") else words
+        words = re.sub(r"^python ", f"{sys.executable} ", words)
+        environment = {**os.environ, "PYTHONPATH": str(self.tree), "PYTHONSAFEPATH": "1"}
+        done = subprocess.run(
+            ["sh", "-c", words],
+            cwd=self.work,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+
+def change(tree: Path, text: str) -> int:
+    """Make the changes of a block; how many files the tree has more or otherwise."""
+    first, _, body = text.partition("\n")
+    path = tree / first.removeprefix("--- ")
+    source = path.read_text(encoding="utf-8")
+    for part in body.split("@@\n"):
+        lines = part.splitlines(keepends=True)
+        old = "".join(line[1:] for line in lines if line[0] in " -")
+        new = "".join(line[1:] for line in lines if line[0] in " +")
+        assert source.count(old) == 1, f"{first}: stands there {source.count(old)} times:\n{old}"
+        source = source.replace(old, new)
+    path.write_text(source, encoding="utf-8")
+    return 1
+
+
+def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
+    """Copy the packages and make the changes of a recipe: itself, its commands, and how many files it touched."""
+    (section,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    recipe = Recipe(BLOCK.findall(section), folder / "tree", folder / "work")
+    recipe.work.mkdir()
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, recipe.tree / package, ignore=shutil.ignore_patterns("__pycache__"))
+    commands: list[str] = []
+    touched = 0
+    for language, text in recipe.blocks:
+        named = re.match(r"# (\S+\.\w+)\n", text)
+        if language == "diff":
+            touched += change(recipe.tree, text)
+        elif language == "sh":
+            commands += text.splitlines()
+        elif named:
+            inside = named[1].split("/")[0] in PACKAGES
+            path = (recipe.tree if inside else recipe.work) / named[1]
+            path.write_text(text[named.end() :], encoding="utf-8")
+            touched += inside
+    return recipe, commands, touched
+
+
+def test_a_controller_flies_in_a_campaign_and_a_what_if_without_an_edit(tmp_path: Path) -> None:
+    recipe, commands, touched = walk("A controller", tmp_path)
+    campaign, flight, again = commands
+    told = json.loads(recipe.run(f"{campaign} --json"))
+    cells = {cell["controller"]: cell for cell in told["cells"]}
+    assert touched == 0
+    assert cells["careful"]["runs"] == 200
+    assert cells["careful"]["failed"] == 0
+    assert cells["careful"]["cost"] > cells["ours"]["cost"]  # half of the regulator arrives late
+    recipe.run(flight)
+    assert json.loads(recipe.run(f"{again} --json"))["controller"] == "mine:Careful"
+
+
+def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
+    recipe, (script, info), touched = walk("A topic", tmp_path)
+    assert touched == 2
+    assert recipe.run(script) == "[0.25]\n"
+    assert "/uavctl/distance" in recipe.run(info)
+
+
+def test_a_fault_happens(tmp_path: Path) -> None:
+    recipe, (flight,), touched = walk("A fault", tmp_path)
+    assert touched == 2
+    told = json.loads(recipe.run(f"{flight} --json"))
+    amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / told["recording"], Truth)}
+    assert amiss[min(amiss)] == ()
+    assert amiss[max(amiss)] == ("calm",)

@@ -1,0 +1,77 @@
+"""docs/faults.md: each row is shown by tests that carry its number; the files that it names are among them."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from functools import cache
+
+import pytest
+from places import TESTS
+
+PAGE = TESTS.parent / "docs" / "faults.md"
+NUMBERS = range(1, 66)
+
+
+def marked(source: str) -> list[tuple[int, str]]:
+    """(row, function) of every test in a file that is marked with a row; parsed, not run.
+
+    Raises:
+        ValueError: A row that is not in the table, or a mark on what pytest does not run.
+    """
+    found = []
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        for mark in function.decorator_list:
+            if not (isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.fault"):
+                continue
+            rows = [ast.literal_eval(argument) for argument in mark.args]
+            if not function.name.startswith("test_") or not rows or not set(rows) <= set(NUMBERS):
+                raise ValueError(f"{function.name}: {ast.unparse(mark)} on line {mark.lineno} marks no row by a test")
+            found += [(row, function.name) for row in rows]
+    return found
+
+
+@cache
+def all_marked() -> dict[int, set[str]]:
+    """The files, without `.py`, that show each row."""
+    files: dict[int, set[str]] = defaultdict(set)
+    for path in sorted(TESTS.rglob("test_*.py")):
+        for row, _ in marked(path.read_text(encoding="utf-8")):
+            files[row].add(path.stem)
+    return files
+
+
+@cache
+def rows_of_page() -> dict[int, tuple[str, ...]]:
+    """Cells of each row: fault, reaction, shown in."""
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in lines if re.match(r"\| \d+ \|", line)]
+    assert len({row[0] for row in rows}) == len(rows), "a number twice"
+    return {int(number): tuple(cells) for number, *cells in rows}
+
+
+def test_the_page_has_every_row_in_order_and_complete() -> None:
+    rows = rows_of_page()
+    assert list(rows) == list(NUMBERS)
+    assert all(len(cells) == 3 and all(cells) for cells in rows.values())
+
+
+@pytest.mark.parametrize("row", NUMBERS)
+def test_a_row_is_shown_where_the_page_says(row: int) -> None:
+    shown_by = all_marked()[row]
+    assert shown_by, f"no test is marked with fault({row})"
+    named = set(re.findall(r"`(\w+)`", rows_of_page()[row][2]))
+    assert named
+    assert named <= shown_by, f"row {row} is shown by {sorted(shown_by)}"
+
+
+def test_marks_are_found_as_pytest_finds_them() -> None:
+    text = '@pytest.mark.parametrize("x", [1])\n@pytest.mark.fault(3, 4)\ndef test_a(): ...\n# @pytest.mark.fault(5)\n'
+    assert marked(text) == [(3, "test_a"), (4, "test_a")]
+    assert marked("class TestIt:\n    @pytest.mark.fault(7)\n    def test_b(self): ...") == [(7, "test_b")]
+    for wrong in ("@pytest.mark.fault(99)\ndef test_a(): ...", "@pytest.mark.fault(1)\ndef helper(): ..."):
+        with pytest.raises(ValueError, match="marks no row"):
+            marked(wrong)

@@ -1,0 +1,66 @@
+"""The campaigns in docs/campaigns: they can be read, and every SMPC in them has the design that the file says."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from uavctl.build.controller import build_design
+from uavctl.errors import DesignError
+from uavctl.lab.campaign.controllers import Setting, met
+from uavctl.lab.campaign.spec import read_campaign
+from uavctl.lab.campaign.trials import is_trial, read_trial
+
+FOLDER = ROOT / "docs" / "campaigns"
+EVERY = sorted(FOLDER.glob("*.toml"))
+FILES = [file for file in EVERY if not is_trial(file)]
+# (file, controller, link that it believes in): there is no such design, as the file's head says.
+REFUSED = {
+    *(("loss", "smpc as printed", f"{loss} %") for loss in range(40, 100, 10)),
+    ("room-hahn-stursberg", "hahn-stursberg", "60 %"),
+    *(("bursts", "smpc as printed", name) for name in ("bursts of 2", "bursts of 3", "bursts of 5", "seldom, of 5")),
+}
+
+
+def test_they_are_there() -> None:
+    assert [file.stem for file in EVERY] == [
+        "bursts",
+        "corners",
+        "delay",
+        "flights",
+        "loss",
+        "position-only",
+        "position-walls",
+        "room-hahn-stursberg",
+        "room",
+        "walls",
+        "wrong-link",
+        "wrong",
+    ]
+
+
+def test_the_flights_of_the_quadrotor_can_be_read_and_are_as_many_as_the_file_says() -> None:
+    (file,) = set(EVERY) - set(FILES)
+    spec, text = read_trial(file)
+    cells = math.prod(map(len, (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.controller, spec.link)))
+    assert spec.name == file.stem and f"{spec.runs} flights of each of {cells} cells" in text
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
+    campaign, _ = read_campaign(file)
+    spec, refused = campaign.spec, set()
+    assert spec.name == file.stem
+    for (i, link), config in campaign.believed.items():
+        if spec.controller[i].kind == "smpc" and not config.conditioned:  # which takes no promise of a design's
+            try:
+                build_design(config)
+            except DesignError:
+                refused.add((file.stem, spec.controller[i].name, link))
+    assert refused == {one for one in REFUSED if one[0] == file.stem}
+    for flown, disturbance in product(campaign.flown_plant, spec.disturbance):
+        met(Setting(spec, campaign.base, flown.plant, campaign.flown_link[0].link, disturbance), 0, 1)

@@ -1,0 +1,181 @@
+"""A campaign's file: what it gives, and every way in which it can be wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from campaign_rig import HEAD, controller, read, table
+from places import ROOT
+
+from uavctl.config import load_config
+from uavctl.config.types import Config
+from uavctl.errors import ConfigError
+from uavctl.lab.campaign.spec import campaign_of, read_campaign
+from uavctl.lab.campaign.tasks import document
+
+LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
+
+
+def problems(folder: Path, *parts: str) -> list[str]:
+    with pytest.raises(ConfigError) as refused:
+        read(folder, *parts)
+    return [problem.removeprefix(f"{folder}/small.toml:") for problem in refused.value.problems]
+
+
+def same(one: Config, other: Config) -> bool:
+    return msgspec.json.encode(one) == msgspec.json.encode(other)
+
+
+def test_a_short_file_has_all_defaults(tmp_path: Path) -> None:
+    campaign = read(tmp_path, controller("lqg"))
+    spec = campaign.spec
+    assert (spec.runs, spec.steps, spec.master) == (1000, 50, 0)
+    assert [len(one) for one in (spec.link, spec.disturbance, spec.plant)] == [1, 1, 1]
+    assert same(campaign.base, load_config("paper")) and same(campaign.believed[0, "as configured"], campaign.base)
+
+
+def test_each_controller_believes_what_it_is_told(tmp_path: Path) -> None:
+    campaign = read(
+        tmp_path,
+        'set = ["smpc.delta_u=0.8"]\n',
+        controller("smpc", 'set = ["risk.allocation=halfspace"]'),
+        controller("lqg", 'link = "bad"'),
+        LINKS,
+        table("plant", "strong", 'set = ["plant.w=[[1.2, 0.0], [0.0, 1.2]]"]'),
+        '[[tuning]]\ncontrollers = ["smpc"]\nlinks = ["bad"]\nset = ["smpc.tau=3", "risk.allocation=ellipsoid"]\n',
+    )
+    believed = campaign.believed
+    assert set(believed) == {(0, "good"), (0, "bad"), (1, "bad")}
+    assert {one.smpc.delta_u for one in believed.values()} == {0.8}
+    good, bad, wrong = believed[0, "good"], believed[0, "bad"], believed[1, "bad"]
+    assert (good.link.loss, good.risk.allocation, good.smpc.tau) == (0.1, "halfspace", 4)
+    assert (bad.link.loss, bad.risk.allocation, bad.smpc.tau) == (0.6, "ellipsoid", 3)
+    assert (wrong.link.loss, wrong.risk.allocation, wrong.smpc.tau) == (0.6, "ellipsoid", 4)
+    # Only what is flown changes with the plant.
+    assert [one.plant.w[0][0] for one in campaign.flown_plant] == [1.2]
+    assert {one.plant.w[0][0] for one in believed.values()} == {0.6}
+    assert [one.link.loss for one in campaign.flown_link] == [0.1, 0.6]
+    assert [campaign.believed_link(i, j) for i in (0, 1) for j in (0, 1)] == ["good", "bad", "bad", "bad"]
+
+
+def test_a_configuration_file_is_found_beside_the_campaign(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text((ROOT / "uavctl/presets/paper.toml").read_text())
+    file = tmp_path / "campaign.toml"
+    file.write_text('name = "mine"\nconfig = "mine.toml"\n' + controller("lqg"))
+    assert same(read_campaign(file)[0].base, load_config("paper"))
+
+
+def test_what_is_kept_gives_the_same_campaign_back(tmp_path: Path) -> None:
+    campaign = read(tmp_path, 'set = ["sets.state_lower=[-inf, -8, -25, -8]"]\n', controller("lqg"), LINKS)
+    kept = msgspec.json.decode(msgspec.json.encode(document(campaign, ())))
+    back = campaign_of(kept)
+    assert back.spec == campaign.spec and back.configuration == campaign.configuration
+    assert same(back.base, campaign.base) and back.base.sets.state_lower[0] == -np.inf
+    assert all(same(back.believed[key], one) for key, one in campaign.believed.items())
+
+
+def test_another_number_of_runs(tmp_path: Path) -> None:
+    read(tmp_path, controller("lqg"))
+    assert read_campaign(tmp_path / "small.toml", 7)[0].spec.runs == 7
+
+
+def test_wrong_keys_and_values_are_told_at_once_with_line_and_nearest_name(tmp_path: Path) -> None:
+    told = problems(
+        tmp_path, "stps = 20\nruns = 0\n", table("controller", "a", 'kind = "lgq"'), table("disturbance", "b")
+    )
+    assert [one.split(":")[0] for one in told] == ["3", "4", "7"]
+    assert 'stps: unknown key (nearest valid name "steps")' in told[0]
+    assert "runs: expected a whole number >= 1" in told[1]
+    assert any('controller[0].kind: there is no controller "lgq" (nearest valid name "lqg")' in one for one in told)
+
+
+def test_a_quadrotor_which_campaigns_do_not_fly_is_refused_where_it_stands(tmp_path: Path) -> None:
+    quadrotor = '"sim.start_position_m=[0, 0, -1.5]", "sim.plant=quadrotor"'
+    why = 'sim.plant is "quadrotor", and campaigns fly the linear plant; set sim.plant = "linear"'
+    (told,) = problems(tmp_path, f"set = [{quadrotor}]\n", controller("lqg"))
+    assert told.startswith(f"3: set[1]: {why}")
+    (told,) = problems(tmp_path, controller("lqg", f"set = [{quadrotor}]"))
+    assert told.startswith(f"6: controller[0].set[1]: {why}")
+    text = (ROOT / "uavctl/presets/room-hahn-stursberg.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace("[sim]", '[sim]\nplant = "quadrotor"'), encoding="utf-8")
+    file = tmp_path / "campaign.toml"
+    file.write_text('name = "mine"\nconfig = "mine.toml"\n' + controller("lqg"), encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        read_campaign(file)
+    assert refused.value.problems[0].startswith(f"{file}:2: config: {why}")
+
+
+def test_wrong_overrides_are_told_where_they_stand(tmp_path: Path) -> None:
+    told = problems(
+        tmp_path,
+        controller("smpc", 'set = ["smpc.tua=3"]'),
+        table("link", "good", 'set = ["link.los=0.1", "plant.dt_s=2"]'),
+        table("plant", "other", 'set = ["plant.a=[[1.0]]"]'),
+    )
+    assert len(told) >= 4
+    expected = {
+        'controller[0].set[0]: smpc.tua=3: smpc.tua: unknown key (nearest valid name "tau")': "6",
+        'link[0].set[0]: link.los=0.1: link.los: unknown key (nearest valid name "loss")': "9",
+        "link[0].set[1]: plant.dt_s=2: only link.* acts on what is flown": "9",
+        "plant[0].set: plant.b: is 4 x 2": "12",
+    }
+    for text, line in expected.items():
+        assert [one for one in told if one.startswith(f"{line}: {text}")], (text, told)
+
+
+def test_names_have_to_be_known_and_different(tmp_path: Path) -> None:
+    told = problems(
+        tmp_path,
+        controller("lqg", 'link = "goood"'),
+        controller("lqg"),
+        LINKS,
+        table("link", "true"),
+        table("disturbance", "calm", "memory = 0.5"),
+        '[[tuning]]\ncontrollers = ["lgq"]\nlinks = ["bed"]\nset = ["smpc.tau=3"]\n',
+    )
+    text = "\n".join(told)
+    assert 'controller[1].name: "lqg" is there twice' in text
+    assert 'controller[0].link: there is no link "goood" (nearest valid name "good")' in text
+    assert 'link[2].name: "true" means' in text
+    assert 'disturbance[0].memory: has no meaning with kind "gaussian"' in text
+    assert 'tuning[0].controllers[0]: there is no controller "lgq" (nearest valid name "lqg")' in text
+    assert 'tuning[0].links[0]: there is no link "bed" (nearest valid name "bad")' in text
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("start = [1.0]", "start: has 1 entries, n_x = 4"),
+        ("start_box = [[0.0, 0.0, 0.0, 0.0]]", "start_box: is not 2 rows of n_x = 4 numbers"),
+        ("start_box = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]]", "start_box: a lower limit is above the upper one"),
+        ("start = [0, 0, 0, 0]\nstart_box = [[0, 0, 0, 0], [1, 1, 1, 1]]", "start_box: there is a start too"),
+        ("controller = []", "controller: is empty"),
+        ('set = ["link.loss=2"]', "set[0]: link.loss=2: link.loss"),
+    ],
+)
+def test_starts_and_lists_have_to_fit(tmp_path: Path, line: str, told: str) -> None:
+    parts = [f"{line}\n"] if line.startswith("controller") else [f"{line}\n", controller("lqg")]
+    assert any(told in one for one in problems(tmp_path, *parts))
+
+
+def test_a_plant_of_another_size_is_refused(tmp_path: Path) -> None:
+    step = table("plant", "slow", 'set = ["plant.dt_s=2.0"]')
+    told = problems(tmp_path, controller("lqg"), step)
+    assert "plant[0].set: the plant has n_x, n_u = (4, 2), Δt = 2 s where the configuration has" in told[0]
+
+
+def test_a_file_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_campaign(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text(HEAD + "runs = \n")
+    with pytest.raises(ConfigError, match=r"bad\.toml:3: TOML syntax"):
+        read_campaign(tmp_path / "bad.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match="UTF-8"):
+        read_campaign(tmp_path / "bytes.toml")
+    (tmp_path / "unknown.toml").write_text('name = "a"\nconfig = "papr"\n' + controller("lqg"))
+    with pytest.raises(ConfigError, match="no such file or preset"):
+        read_campaign(tmp_path / "unknown.toml")

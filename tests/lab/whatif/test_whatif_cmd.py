@@ -1,0 +1,170 @@
+"""`uavctl log whatif` as it is typed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from places import DATA
+from report_rig import unpaged, unwritten
+
+from logs.recording.reader import header
+from uavctl.cli.app import run
+from uavctl.config import load_config
+from uavctl.config.load import dump_config
+
+
+def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = run(arguments)
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flown")
+    words = ["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)]
+    with unpaged():
+        assert run(words) == 0
+    return folder / "flight.mcap"
+
+
+@pytest.fixture
+def no_figures() -> Iterator[None]:
+    """For flights whose pages nobody reads."""
+    with unpaged(), unwritten():
+        yield
+
+
+def document(capsys: pytest.CaptureFixture[str], flown: Path, out: Path, *more: str) -> dict[str, Any]:
+    code, text, errors = typed(capsys, "log", "whatif", str(flown), "--out", str(out), "--json", *more)
+    assert code == 0, errors
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_nothing_changed_reproduces_the_flight(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, flown, tmp_path)
+    assert found["reproduction"] == {"identical": True, "decisions": 200, "largest_state": 0.0, "largest_input": 0.0}
+    assert found["recorded"]["cost"] == found["reproduced"]["cost"] == found["what_if"]["cost"]
+    assert (found["link"], found["controller"], found["changed"], found["compared_s"]) == ("recorded", "smpc", [], 20.0)
+    assert found["largest_departure_m"] == found["inertial_moved"] == found["inertial_left_out"] == 0
+    assert found["model"]["moves"] == 19 and 0.9 < found["model"]["r2"] < 1.0
+
+
+def test_another_cost_is_recorded_reported_and_replays(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "other"
+    found = document(capsys, flown, out, "--set", "cost.input=[20.0, 20.0]")
+    assert found["reproduction"]["identical"] and found["largest_departure_m"] > 1.0
+    assert found["what_if"]["cost"] > found["recorded"]["cost"] + 1.0
+    assert found["changed"] == ["cost.input=[20.0, 20.0]"]
+    assert header(out / "flight.mcap").config_toml.count("input = [20.0, 20.0]") == 1
+    for key, text in (("page", "<svg"), ("report", "<svg")):
+        assert text in Path(found[key]).read_text(encoding="utf-8")
+    code, text, _ = typed(capsys, "log", "replay", str(out / "flight.mcap"), "--json")
+    assert code == 0 and json.loads(text)["identical"]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_people_get_the_worth_of_it_first_and_then_the_figures(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, _ = typed(
+        capsys, "log", "whatif", str(flown), "--controller", "lqg", "--set", "link.loss=0.2", "--out", str(tmp_path)
+    )
+    assert code == 0
+    assert text.startswith("Reproduced with nothing changed, bit for bit.")
+    assert text.index("Reproduced") < text.index("Model (the recording's [plant])") < text.index("what-if")
+    assert "Changed: link.loss=0.2; controller lqg; link: configured." in text
+    assert "lqg" in text and "Decision time" not in text
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_the_design_may_believe_in_another_link_than_the_one_flown(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = document(capsys, flown, tmp_path / "a", "--set", "link.loss=0.1", "--link", "recorded")
+    assert found["link"] == "recorded" and found["what_if"]["lost"] == found["recorded"]["lost"]
+    found = document(capsys, flown, tmp_path / "b", "--link", "configured", "--seed", "5")
+    assert found["link"] == "configured" and found["what_if"]["lost"] != found["recorded"]["lost"]
+    assert found["changed"] == ["--seed 5"]
+    # A link that no design could count on is flown by one that knows nothing of it.
+    found = document(capsys, flown, tmp_path / "c", "--link", "loss=0.7", "--link", "jitter_s=0.2")
+    assert found["link"] == "loss=0.7, jitter_s=0.2"
+    assert found["what_if"]["lost"] > 10 and found["what_if"]["max_age"] > found["recorded"]["max_age"]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = load_config("paper", ["plant.b=[[0.25, 0.0], [0.45, 0.0], [0.0, 0.25], [0.0, 0.45]]"])
+    model = tmp_path / "identified.toml"
+    model.write_text(dump_config(config), encoding="utf-8")
+    found = document(capsys, flown, tmp_path / "a", "--model", str(model), "--set", "target.position_m=[1.0, 0.0, 0.0]")
+    assert found["model"]["source"] == f"[plant] of {model}" and found["reproduction"]["identical"]
+    own = document(capsys, flown, tmp_path / "b", "--set", "target.position_m=[1.0, 0.0, 0.0]")
+    assert found["model"]["rms_m"] > own["model"]["rms_m"]
+    assert found["what_if"]["cost"] != own["what_if"]["cost"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "sim.seed=3"), "sim.seed is part of what was recorded"),
+        (("--set", "source.system_id=3"), "source.system_id is part of what was recorded"),
+        (("--set", "smpc.horizn=3"), 'nearest valid name "horizon"'),
+        (("--set", "nothing"), "is not an override"),
+        (("--set", "plant.dt_s=0.5"), "steps of 0.5 s, the recorded flight 4 states"),
+        (("--set", "link.loss=0.9"), "out of reach"),
+        (
+            ("--config", "room-hahn-stursberg"),
+            "room-hahn-stursberg: plant has 9 states, 3 inputs, axes north, east, down and steps of 0.2 s",
+        ),
+        (("--config", "missing.toml"), "no such file or preset"),
+        (("--model", "room-hahn-stursberg"), "--model room-hahn-stursberg: plant has 9 states"),
+        (("--seed", "4"), "--seed is of a simulated link"),
+        (("--link", "none"), "--link none: give `recorded` or `configured` alone, or KEY=VALUE"),
+        (("--link", "recorded", "--link", "loss=0.1"), "give `recorded` or `configured` alone"),
+        (("--link", "los=0.1"), 'nearest valid name "loss"'),
+        (("--controller", "genius"), "genius"),
+    ],
+)
+def test_what_cannot_be_changed_is_told(
+    flown: Path, arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, errors = typed(capsys, "log", "whatif", str(flown), *arguments)
+    assert code == 2 and not out
+    assert words in " ".join(errors.split())
+
+
+def test_other_files_are_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, errors = typed(capsys, "log", "whatif", str(DATA / "arducopter-vicon.tlog"))
+    assert code == 2 and "another program's recording" in errors
+    code, _, errors = typed(capsys, "log", "whatif", str(tmp_path / "none.mcap"))
+    assert code == 1 and "no such recording" in errors
+    text = tmp_path / "text.mcap"
+    text.write_text("nothing of the kind")
+    code, _, errors = typed(capsys, "log", "whatif", str(text))
+    assert code == 1 and "not a recording" in errors
+    code, _, errors = typed(capsys, "log", "whatif", str(flown), "--out", str(text))
+    assert code in (1, 2) and str(text) in " ".join(errors.split())
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_torn_recording_is_flown_to_its_end(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torn = tmp_path / "torn.mcap"
+    data = flown.read_bytes()
+    torn.write_bytes(data[: len(data) * 6 // 10])
+    code, text, errors = typed(capsys, "log", "whatif", str(torn), "--out", str(tmp_path / "out"), "--json")
+    assert code == 0 and "torn" in errors
+    found = json.loads(text)
+    assert found["compared_s"] < 20.0 and found["recorded"]["steps"] == found["what_if"]["steps"] > 2
+    torn.write_bytes(data[:3000])
+    code, _, errors = typed(capsys, "log", "whatif", str(torn), "--out", os.devnull)
+    assert code == 1 and "no header" in errors

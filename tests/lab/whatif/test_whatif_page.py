@@ -1,0 +1,113 @@
+"""The page of a what-if draws the limits, the reserve kept from them and the horizon, as the report does."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from report_rig import data, drawn
+from synthetic_scene import room
+
+from logs.recording.flight import FlightData
+from logs.recording.summary import FlightSummary, summarise
+from logs.report.svg import colour
+from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, story, write_page
+
+
+@pytest.fixture(scope="module")
+def recorded() -> FlightData:
+    return data(room(), 6.0)
+
+
+@pytest.fixture(scope="module")
+def other(recorded: FlightData) -> FlightData:
+    """A flight with a shorter horizon and a nearer wall in the north."""
+    design = recorded.design
+    b_x = list(design.b_x)
+    b_x[design.state_box.row_upper[design.position_index[0]]] -= 0.25
+    nearer = msgspec.structs.replace(design, b_x=tuple(b_x), horizon=7)
+    return dataclasses.replace(recorded, design=nearer)
+
+
+def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], str]:
+    """The page's axes by their titles, and its text."""
+    summary = summarise(recorded, wall_s=None)
+    with drawn() as kept:
+        text = write_page(worse_link(summary), recorded, other)
+    return {title: figure.axes[0] for title, figure in kept.items()}, text
+
+
+def worse_link(summary: FlightSummary) -> WhatIf:
+    """A what-if over a link that loses more, with no key changed; the same figures on every side."""
+    return WhatIf(
+        flight="flight.mcap",
+        reproduction=Reproduction(identical=True, decisions=1, largest_state=0.0, largest_input=0.0),
+        model=ModelFit(source="the recording's [plant]", ahead_s=1.0, moves=0, r2=None, rms_m=None),
+        controller="smpc",
+        link="loss=0.5",
+        changed=(),
+        compared_s=6.0,
+        ended="the recording ends",
+        largest_departure_m=0.0,
+        inertial_moved=0,
+        inertial_left_out=0,
+        recorded=summary,
+        reproduced=summary,
+        what_if=summary,
+        recording="",
+        report="",
+        page="",
+    )
+
+
+def levels(ax: Axes) -> list[float]:
+    """Heights of the horizontal lines in the colour of limits."""
+    lines = [line for line in ax.lines if to_hex(line.get_color()) == to_hex(colour("limit"))]
+    return sorted(float(np.asarray(line.get_ydata())[0]) for line in lines)
+
+
+def test_limits_are_those_of_the_flight_that_might_have_been(recorded: FlightData, other: FlightData) -> None:
+    axes, _ = figures(recorded, other)
+    box = other.design.state_box
+    for name, index in zip(other.design.axes, other.design.position_index, strict=True):
+        assert levels(axes[name]) == pytest.approx(sorted((box.lower[index], box.upper[index])))
+    first = other.design.position_index[0]
+    assert box.upper[first] == pytest.approx(recorded.design.state_box.upper[first] - 0.25)
+
+
+def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: FlightData) -> None:
+    axes, _ = figures(recorded, other)
+    design = other.design
+    for name, index in zip(design.axes, design.position_index, strict=True):
+        row = design.state_box.row_upper[index]
+        scale = abs(design.c_x[row][index])
+        kept = [max(stage[row] for stage in plan.backoff_x) / scale for plan in other.flown_plans.values()]
+        edges = [band.get_paths()[0].get_extents() for band in axes[name].collections]
+        assert len(edges) == 2
+        above = max(edges, key=lambda one: one.y1)
+        assert above.y1 == pytest.approx(design.state_box.upper[index])
+        assert above.y0 == pytest.approx(design.state_box.upper[index] - max(kept))
+
+
+def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
+    summary = summarise(recorded, wall_s=None)
+    (said,) = (text for text in story(worse_link(summary)) if "link: loss=0.5" in text)
+    assert "nothing" not in said
+
+
+def test_inertial_messages_that_are_left_out_are_told(recorded: FlightData) -> None:
+    found = worse_link(summarise(recorded, wall_s=None))
+    assert not any("inertial" in text for text in story(found))
+    lacking = msgspec.structs.replace(found, inertial_moved=30, inertial_left_out=12)
+    (said,) = (text for text in story(lacking) if "inertial" in text)
+    assert said.startswith("12 of 42 inertial messages of the vehicle are left out")
+
+
+def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:
+    axes, text = figures(recorded, other)
+    assert levels(axes["Age of the newest position"]) == [7.0]
+    assert "horizon H = 7" in text and "reserve kept" in text

@@ -1,0 +1,201 @@
+"""Figures and words where a flight has little to show, or much of the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+from loopback_rig import lockstep
+from report_rig import data, drawn, words_of
+from synthetic_scene import room
+
+from logs.recording.flight import FlightData
+from logs.recording.summary import summarise
+from logs.recording.topics import RecorderNote
+from logs.report import figures as plots_link
+from logs.report import figures as plots_solver
+from logs.report import plots
+from logs.report.figures import picture
+from logs.report.plots import POINTS, along, path_3d
+from logs.report.svg import colour
+from logs.report.verdicts import judge, judge_link, plain
+from uavctl.records import ControlMode, Decision
+
+
+@pytest.fixture(scope="module")
+def flight() -> FlightData:
+    return data(room(), 12.0)
+
+
+@pytest.fixture(scope="module")
+def short() -> FlightData:
+    return FlightData.from_records(lockstep("room-hahn-stursberg", 2.0, "solver.method=exact").entries)
+
+
+def test_a_long_stay_takes_no_point_from_the_journey() -> None:
+    journey = np.linspace([0.0, 0.0, -1.0], [6.0, 3.0, -1.0], 200)
+    stay = journey[-1] + 0.01 * np.random.default_rng(0).standard_normal((20_000, 3))
+    whole = np.vstack([journey, stay])
+    kept = along(whole)
+    gone_m = np.linalg.norm(np.diff(whole, axis=0), axis=1).sum()
+    assert len(kept) <= POINTS
+    assert kept[0].tolist() == whole[0].tolist() and kept[-1].tolist() == whole[-1].tolist()
+    step_m = np.linalg.norm(np.diff(kept, axis=0), axis=1)
+    assert step_m.max() <= gone_m / POINTS + np.linalg.norm(np.diff(whole, axis=0), axis=1).max()
+    assert len(along(np.full((10, 3), np.nan))) == 0
+
+
+def test_the_reserve_is_drawn_as_long_as_a_plan_is_flown(flight: FlightData) -> None:
+    last = max(flight.flown_plans.values(), key=lambda plan: plan.base_ns)
+    silent = last.base_ns + flight.design.dt_ns  # as if no news had come after that plan
+    decisions = tuple(
+        msgspec.structs.replace(d, plan_seq=last.seq) if d.at_ns >= silent else d for d in flight.decisions
+    )
+    with drawn() as figures:
+        list(plots.axes_over_time(dataclasses.replace(flight, decisions=decisions)))
+    for figure in figures.values():
+        bands = figure.axes[0].collections
+        assert bands and all(band.get_paths()[0].get_extents().x1 == pytest.approx(flight.duration_s) for band in bands)
+
+
+def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
+    tiny = tuple(msgspec.structs.replace(plan, slack=1e-9, terminal_miss=1e-9) for plan in flight.plans)
+    seen = words_of(dataclasses.replace(flight, plans=tiny))
+    assert "plan-slack" not in seen.plots
+    assert "No plan that was flown gave way anywhere." in " ".join(seen.text)
+
+
+def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
+    gaps = np.geomspace(1.5e-9, 4e-9, len(flight.plans))
+    plans = tuple(msgspec.structs.replace(plan, gap=gap) for plan, gap in zip(flight.plans, gaps, strict=True))
+    with drawn() as figures:
+        list(plots_solver.certificates(dataclasses.replace(flight, plans=plans)))
+    ax = figures["Certified gap"].axes[0]
+    low, high = ax.get_ylim()
+    assert low <= 100.0 * gaps[0] and 100.0 * gaps[-1] <= high and high < 1000.0 * gaps[-1]
+    assert ax.get_ylabel() == "% of the cost (log scale)"
+    assert sum(low <= tick <= high for tick in ax.get_yticks()) >= 2
+
+
+def test_arrivals_without_delay_are_drawn_from_zero(flight: FlightData) -> None:
+    inputs = tuple(
+        msgspec.structs.replace(
+            one, samples=tuple(msgspec.structs.replace(s, received_ns=s.captured_ns) for s in one.samples)
+        )
+        for one in flight.step_inputs
+    )
+    quick = dataclasses.replace(flight, step_inputs=inputs)
+    with drawn() as figures:
+        list(plots_link.link(quick, judge_link(quick, None)))
+    ax = figures["Capture to arrival, by the stamps"].axes[0]
+    assert -0.1 < ax.get_xlim()[0] <= 0.0 and ax.get_xlim()[1] >= 1.0
+
+
+def test_a_short_flight_is_not_said_to_prove_anything(short: FlightData) -> None:
+    seen = words_of(short)
+    text = " ".join(seen.text)
+    assert "too few to judge the model" in text
+    assert "where a right model stays" not in text  # a legend without a figure
+    assert "1 of 9 flown steps had no promise: it takes a plan that was flown in the step before" in text
+    told = judge_link(short, None).news
+    assert told.rate < 0.7 and "so few may still be chance" in text
+
+
+def test_promised_risks_are_what_was_configured(short: FlightData) -> None:
+    verdicts = judge(short).verdicts
+    promised = {one.name: one.promised for one in verdicts.risk.limits}
+    assert (promised["all states"], promised["all inputs"]) == (0.05, 0.1)
+    assert verdicts.link.promised_ages[:3] == (0.7, 0.21, 0.063)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [(-1291.4, "−1291"), (-63.5321, "−63.5"), (0.2994, "0.299"), (0.0, "0"), (-3e-15, "0"), (1e6, "1000000")],
+)
+def test_figures_of_clocks_have_no_exponent(value: float, told: str) -> None:
+    assert plain(value) == told
+
+
+def part_of(flight: FlightData, from_tick: int) -> FlightData:
+    """What a later file of a recording holds."""
+    begun_ns = flight.decisions[from_tick].at_ns
+    return dataclasses.replace(
+        flight,
+        decisions=flight.decisions[from_tick:],
+        truths=tuple(one for one in flight.truths if one.at_ns >= begun_ns),
+        estimates=tuple(one for one in flight.estimates if one.at_ns >= begun_ns),
+    )
+
+
+def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
+    text = " ".join(words_of(part_of(flight, 80)).text)
+    assert "Flight “room”, a part" in text
+    assert "This is a part of a flight: it begins at tick 80, 4 s into the flight. All times count from there." in text
+    assert "Part of a flight" in text and "begins at tick 80, 4 s into the flight" in text
+    assert "The controller was flying already, and flew 40 steps of 0.2 s." in text
+    assert "took over at the first tick" not in text
+
+
+def note(text: str, segment: int = 1) -> RecorderNote:
+    return RecorderNote(at_ns=0, segment=segment, written=0, dropped=0, refused=0, failures=0, text=text)
+
+
+@pytest.mark.parametrize(
+    ("last", "told", "breaks_off"),
+    [
+        ("end", "", False),
+        ("begin", "The recording breaks off here: it was not closed in order", True),
+        ("goes on in the next file", "The flight goes on in the next file.", False),
+        ("recovered from torn.mcap: 0 messages and 5 bytes lost", "The recording was recovered from torn.mcap", True),
+    ],
+)
+def test_a_recording_that_is_not_all_of_the_flight_says_so(
+    flight: FlightData, last: str, told: str, breaks_off: bool
+) -> None:
+    cut = dataclasses.replace(flight, notes=(note("begin"), note(last)))
+    text = " ".join(words_of(cut).text)
+    assert told in text
+    assert ("The recording breaks off." in text) is breaks_off
+    assert ("breaks off" in text) is breaks_off
+
+
+def test_a_later_file_has_its_own_figures(flight: FlightData) -> None:
+    part = dataclasses.replace(part_of(flight, 80), notes=(note("goes on after flight.mcap", 2), note("end", 2)))
+    found, whole = summarise(part, wall_s=None), summarise(flight, wall_s=None)
+    assert "This is file 2 of a flight: it begins at tick 80, 4 s into the flight." in " ".join(words_of(part).text)
+    first, last = part.truths[0], part.truths[-1]
+    assert found.lost is not None
+    assert (found.lost, found.received) == (last.lost - first.lost, last.sent - first.sent - found.lost)
+    assert (whole.lost, whole.received) == (last.lost, last.sent - last.lost)
+    assert found.accepted <= found.received
+
+
+def test_a_part_that_waits_first_tells_when_it_was_taken_over(flight: FlightData) -> None:
+    part = part_of(flight, 80)
+
+    def wait(decision: Decision) -> Decision:
+        return msgspec.structs.replace(decision, mode=ControlMode.WAIT) if decision.tick < 90 else decision
+
+    text = " ".join(words_of(dataclasses.replace(part, decisions=tuple(map(wait, part.decisions)))).text)
+    assert "The controller took over 0.5 s after the first tick" in text
+
+
+def test_a_whole_flight_is_no_part(flight: FlightData) -> None:
+    assert "art of a flight" not in " ".join(words_of(flight).text)
+
+
+def test_without_truth_nothing_is_drawn_in_its_colour(flight: FlightData) -> None:
+    def key(one: FlightData) -> tuple[set[str], list[str]]:
+        """Colours of the lines of the path in three dimensions, and what the small picture explains."""
+        with drawn() as figures:
+            path_3d(one)
+            picture(one)
+        deep = {str(line.get_color()) for line in figures[""].axes[0].lines if line.get_marker() == "None"}
+        return deep, [text.get_text() for text in figures["The path, from above"].legends[0].get_texts()]
+
+    seen, explained = key(flight)
+    assert colour("truth") in seen and "position lost" in explained
+    seen, explained = key(dataclasses.replace(flight, truths=()))
+    assert colour("truth") not in seen and "position lost" not in explained

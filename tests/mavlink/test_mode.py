@@ -1,0 +1,124 @@
+"""The table of the hand-over: every pair of what is and what is seen, against a grid written down by hand."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+from places import ROOT
+
+from uavctl.mavlink.handover_guards import (
+    LEAVES_NONE,
+    TRANSITIONS,
+    HandoverEvent,
+    HandoverState,
+    Sending,
+    drawing,
+    page,
+)
+
+# W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, V failsafe, X released,
+# L landing, S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
+GRID = """
+     reboot land refused silence take-off engage left disarmed failsafe other granted external pending
+W    W      W    F       W       W        W      X    R+       W        R+    W       E*       W
+R    R      R    F       W       M+       B+     R    R+       R        R+    R       E*       R
+M    F      D    F       M       M        M      M    M        M        X     A+      M        M+
+A    F      L    F       A       A        A      A    A        V        X     C+      A        A+
+C    F      L    L       C       C        C      C    F        V        X     G+      C        C+
+G    F      L    L       G       G        G      G    F        V        X     E*      G        G+
+B    X      X    X       B       B        B      B    D        B        X     E*      B        B+
+E    X      L    E       E*      E        E      E    D        V        X     E       E*       E
+V    F      L    L       V       V        G+     V    D        V        X     C+      V        V
+X    X      X    X       X       X        B+     X    D        X        X     X       X        X
+L    L      L    F       L       L        L      L    D        L        X     S       L        L
+S    S      S    F       S       S        S      S    D        L        X     S       S        S
+D    D      D    D       D       D        D      D    D        D        D     D       D        D
+F    F      F    F       F       F        F      F    F        F        F     F       F        F
+"""
+LETTERS = dict(zip("WRMACGBEVXLSDF", HandoverState, strict=True))
+SENDING = {"": Sending.NOTHING, "+": Sending.NEUTRAL, "*": Sending.SETPOINTS}
+
+
+def wanted() -> dict[tuple[HandoverState, HandoverEvent], tuple[HandoverState, Sending]]:
+    head, *rows = (line.split() for line in GRID.strip().splitlines())
+    return {
+        (LETTERS[letter], HandoverEvent(seen)): (LETTERS[cell[0]], SENDING[cell[1:]])
+        for letter, *cells in rows
+        for seen, cell in zip(head, cells, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    "pair", list(product(HandoverState, HandoverEvent)), ids=lambda pair: f"{pair[0].name}-{pair[1].name}"
+)
+def test_every_pair(pair: tuple[HandoverState, HandoverEvent]) -> None:
+    assert TRANSITIONS[pair] == wanted()[pair]
+
+
+def test_the_grid_and_the_table_are_complete() -> None:
+    assert set(wanted()) == set(TRANSITIONS) == set(product(HandoverState, HandoverEvent))
+
+
+@pytest.mark.fault(25)
+def test_setpoints_are_sent_by_who_is_engaged_only() -> None:
+    flying = {(after, seen) for (_, seen), (after, sending) in TRANSITIONS.items() if sending is Sending.SETPOINTS}
+    assert flying == {
+        (HandoverState.ENGAGED, seen) for seen in (HandoverEvent.EXTERNAL, HandoverEvent.GRANTED, HandoverEvent.SILENCE)
+    }
+    assert TRANSITIONS[HandoverState.ENGAGED, HandoverEvent.OTHER] == (HandoverState.RELEASED, Sending.NOTHING)
+
+
+@pytest.mark.fault(25)
+def test_only_an_order_leads_out_of_released_and_towards_arming() -> None:
+    out = {seen for seen in HandoverEvent if TRANSITIONS[HandoverState.RELEASED, seen][0] is not HandoverState.RELEASED}
+    assert out == {HandoverEvent.ENGAGE, HandoverEvent.DISARMED}
+    assert TRANSITIONS[HandoverState.WAITING, HandoverEvent.LEFT] == (HandoverState.RELEASED, Sending.NOTHING)
+    towards = {seen for (before, seen), (after, _) in TRANSITIONS.items() if before is not after is HandoverState.MODE}
+    assert towards == {HandoverEvent.TAKE_OFF}
+
+
+def test_no_way_leads_back_from_landing_into_flight() -> None:
+    reached, todo = set[HandoverState](), [HandoverState.LANDING]
+    while todo:
+        state = todo.pop()
+        reached.add(state)
+        # From released the operator may order it back: that is a flight anew.
+        ways = {TRANSITIONS[state, seen][0] for seen in HandoverEvent if seen is not HandoverEvent.ENGAGE}
+        todo += [one for one in ways if one not in reached]
+    assert reached == {
+        HandoverState.LANDING,
+        HandoverState.SETTLING,
+        HandoverState.RELEASED,
+        HandoverState.DONE,
+        HandoverState.FAILED,
+    }
+
+
+@pytest.mark.fault(31)
+def test_what_a_daemon_that_ends_leaves_behind_has_had_setpoints_or_may_have() -> None:
+    left = set(HandoverState) - LEAVES_NONE
+    assert left == {*LETTERS.values()} - {HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE}
+    assert {after for after, sending in TRANSITIONS.values() if sending is Sending.SETPOINTS} <= left
+
+
+def test_every_state_has_an_end() -> None:
+    for start in HandoverState:
+        reached, todo = set[HandoverState](), [start]
+        while todo:
+            state = todo.pop()
+            reached.add(state)
+            todo += [after for seen in HandoverEvent if (after := TRANSITIONS[state, seen][0]) not in reached]
+        assert reached & {HandoverState.DONE, HandoverState.FAILED}
+
+
+def test_the_drawing_has_every_way_once() -> None:
+    lines = drawing().splitlines()
+    ways = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
+    assert sum("-->" in line for line in lines) == len(ways) + 3  # the beginning, two ends
+    assert "    RELEASED --> RETURNING: engage" in lines
+
+
+def test_the_page_of_the_documentation_is_the_table_s() -> None:
+    told = (ROOT / "docs" / "hand-over.md").read_text(encoding="utf-8")
+    assert told == page() and drawing() in told

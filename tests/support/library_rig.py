@@ -1,0 +1,312 @@
+"""Presets with their libraries, questions to ask of them, and the policies that their answers stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import cvxpy as cp
+import numpy as np
+from design_rig import one_axis, paper_plant, spec
+from full_problem import backoff_table, horizons
+from numpy.typing import NDArray
+
+from uavctl.build.controller import build_design
+from uavctl.build.library import library_for
+from uavctl.config import load_config
+from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
+from uavctl.smpc.hahn_stursberg.exact import PartSolver, with_late
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
+from uavctl.smpc.hahn_stursberg.mixture import Mixture
+from uavctl.smpc.hahn_stursberg.policies import Policy
+from uavctl.smpc.link import bernoulli
+from uavctl.smpc.sets import Polytope
+
+Array = NDArray[np.float64]
+
+PRESETS = ("paper", "room-hahn-stursberg")
+# Stages and rows that a margin may miss by: 1e-6 of the row's unit.
+KEPT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A design with its library."""
+
+    design: Design
+    library: Library
+
+    @cached_property
+    def components(self) -> tuple[Component, ...]:
+        return decompose(self.design)
+
+    @cached_property
+    def problems(self) -> list[MeanProblem]:
+        return [MeanProblem(self.design, horizon_of(self.design, part)) for part in self.components]
+
+    @cached_property
+    def policies(self) -> list[tuple[Policy, ...]]:
+        parts = zip(self.library.variants[0], self.problems, strict=True)
+        return [part.policies(problem) for part, problem in parts]
+
+    @cached_property
+    def mixtures(self) -> list[Mixture]:
+        return [Mixture(*pair) for pair in zip(self.problems, self.policies, strict=True)]
+
+    @cached_property
+    def backoffs(self) -> list[Array]:
+        """Back-offs of every policy of each component, see `backoff_table`."""
+        found = zip(self.components, self.library.variants[0], strict=True)
+        return [backoff_table(self.design, part, i, library.theta) for i, (part, library) in enumerate(found)]
+
+    @cached_property
+    def exact(self) -> list[PartSolver]:
+        return [PartSolver(self.design, part) for part in self.components]
+
+    @cached_property
+    def solver(self) -> LibrarySolver:
+        return LibrarySolver(self.design, self.library)
+
+    @cached_property
+    def alone(self) -> LibrarySolver:
+        """The library without the exact program."""
+        return LibrarySolver(self.design, self.library, exact=False)
+
+    def question(self, i: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
+        part = self.components[i]
+        return self.problems[i].question(x[part.states], target[part.states], outlook)
+
+
+@cache
+def design_of(name: str) -> Design:
+    return build_design(load_config(name))
+
+
+@cache
+def case(name: str) -> Case:
+    design = design_of(name)
+    return Case(design, library_for(design).library)
+
+
+# --- questions -------------------------------------------------------------------------------------------------------
+
+
+def bounds(design: Design) -> tuple[Array, Array]:
+    """Box of the states; where it is open, three standard deviations around the target."""
+    around = 3.0 * np.sqrt(np.diagonal(design.terminal.sigma_x + design.estimate_cov))
+    lower, upper = design.target - around, design.target + around
+    for row, side in zip(design.state_set.c, design.state_set.b, strict=True):
+        (used,) = np.nonzero(row)
+        assert used.size == 1
+        (upper if row[used[0]] > 0 else lower)[used[0]] = side / row[used[0]]
+    return lower, upper
+
+
+def uniform(design: Design, rng: np.random.Generator, boxes: float = 1.0) -> Array:
+    """A state drawn uniformly from the box, or from one so many times as wide."""
+    lower, upper = bounds(design)
+    middle, half = 0.5 * (upper + lower), 0.5 * (upper - lower)
+    return np.asarray(middle + boxes * half * rng.uniform(-1.0, 1.0, middle.size))
+
+
+def near(design: Design, rng: np.random.Generator) -> Array:
+    """A state around the target, as far as disturbances take it."""
+    return np.asarray(rng.multivariate_normal(design.target, design.terminal.sigma_x, method="eigh"))
+
+
+def equilibrium(design: Design, rng: np.random.Generator, boxes: float = 1.0) -> Array:
+    """A place to rest, drawn as `uniform` is."""
+    x = uniform(design, rng, boxes)
+    target = np.zeros(x.size)
+    for part, _ in horizons(design):
+        target[part.states] = part.x_eq @ (part.coordinates @ x[part.states])
+    return target
+
+
+def moving_limits(design: Design, rng: np.random.Generator) -> Array:
+    """Limits of the positions that close in, or open up, stage by stage; the target stays inside."""
+    b, c = design.state_set.b, design.state_set.c
+    room = b - c @ design.target
+    share = rng.uniform(0.7, 1.1, (2, b.size))
+    limits = b - room * (1.0 - np.linspace(share[0], share[1], design.horizon + 1))
+    # Rows that no reference moves keep their room for the terminal set: they are no fences.
+    held = ~np.isin(np.abs(c) @ np.arange(c.shape[1]), design.plant.position_index)
+    limits[:, held] = b[held]
+    return np.asarray(limits)
+
+
+def path(design: Design, rng: np.random.Generator) -> Path:
+    """A wandering path that is no motion of the plant."""
+    lower, upper = bounds(design)
+    steps = rng.normal(size=(design.horizon, lower.size)).cumsum(axis=0)
+    top = design.input_set.b[: design.plant.n_u].max()
+    return Path(0.03 * (upper - lower) * steps, 0.1 * top * rng.normal(size=(design.horizon, design.plant.n_u)))
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A question about the whole plant."""
+
+    kind: str
+    x: Array
+    target: Array
+    outlook: Preview = NOMINAL
+
+
+KINDS = ("uniform", "near", "far target", "outside", "limits", "path", "limits and path")
+
+
+def asked(design: Design, kind: str, rng: np.random.Generator) -> Asked:
+    home = design.target
+    if kind == "uniform":
+        return Asked(kind, uniform(design, rng), home)
+    if kind == "near":
+        return Asked(kind, near(design, rng), home)
+    if kind == "far target":
+        return Asked(kind, uniform(design, rng), equilibrium(design, rng, 3.0))
+    if kind == "outside":
+        return Asked(kind, uniform(design, rng, 1.5), home)
+    limits = moving_limits(design, rng) if "limits" in kind else None
+    along = path(design, rng) if "path" in kind else None
+    return Asked(kind, uniform(design, rng), equilibrium(design, rng), Preview(limits, along))
+
+
+def all_kinds(design: Design, seed: int, count: int) -> Iterator[Asked]:
+    """`count` questions of every kind."""
+    rng = np.random.default_rng(seed)
+    for kind in KINDS:
+        for _ in range(count):
+            yield asked(design, kind, rng)
+
+
+def limits(design: Design) -> Array:
+    return np.tile(design.state_set.b, (design.horizon + 1, 1))
+
+
+def fence(design: Design, axis: int, at: float) -> Array:
+    """Upper limit of a position at every stage."""
+    found = limits(design)
+    found[:, design.state_set.c[:, design.plant.position_index[axis]] > 0.0] = at
+    return found
+
+
+def hard_questions(design: Design) -> list[Asked]:
+    rng = np.random.default_rng(61)
+    lower, upper = bounds(design)
+    home, found = design.target, []
+    for boxes in (1.5, 3.0, 10.0, 100.0):
+        found += [Asked(f"{boxes} boxes away", uniform(design, rng, boxes), home) for _ in range(6)]
+    found += [Asked("target out of reach", uniform(design, rng), equilibrium(design, rng, 50.0)) for _ in range(6)]
+    for _ in range(6):
+        x = uniform(design, rng)
+        at = x[design.plant.position_index[0]] - rng.uniform(0.1, 0.3) * (upper - lower)[0]
+        found.append(Asked("fence that shuts the drone out", x, home, Preview(limits=fence(design, 0, at))))
+    shut = -np.abs(limits(design))
+    found.append(Asked("no place left", home, home, Preview(limits=shut)))
+    return found
+
+
+def closed_loop(one: Case, start: Array, loss: float, steps: int, rng: np.random.Generator) -> list[Array]:
+    """States in which plans are asked for: a share `loss` of the steps has no news, and the last plan is played out."""
+    plant, target = one.design.plant, one.design.target
+    root = np.linalg.cholesky(plant.w + 1e-15 * np.eye(plant.n_w))
+    x, plan, found = start, np.zeros((0, plant.n_u)), []
+    for k in range(steps):
+        if k == 0 or rng.random() >= loss:
+            found.append(x)
+            plan = one.solver.solve(k, x, target).inputs
+        u, plan = plan[0], np.vstack([plan[1:], plan[-1:]])
+        x = plant.a @ x + plant.b @ u + plant.e @ (root @ rng.standard_normal(plant.n_w))
+    return found
+
+
+# --- a mean under a given policy, in another solver -------------------------------------------------------------------
+
+
+def mean_optimum(problem: MeanProblem, question: Question, backoff: Array) -> float:
+    """Least cost of the mean under fixed back-offs (m,), without the covariance's; inf where there is none."""
+    q = cp.Variable(problem.h.shape[0])
+    beyond = cp.Variable(len(problem.rows), nonneg=True)
+    soft = np.isfinite(problem.price)
+    value = problem.a @ q + question.offset
+    root = np.linalg.cholesky(problem.h).T
+    cost = 0.5 * cp.sum_squares(root @ q) + question.f @ q + question.constant
+    cost += np.where(soft, problem.price, 0.0) @ beyond + cp.sum(cp.multiply(problem.curve, cp.square(beyond)))
+    above, below = np.flatnonzero(question.upper < 1e29), np.flatnonzero(question.lower > -1e29)
+    rows = [
+        value[above] + backoff[above] <= question.upper[above] + beyond[above],
+        value[below] - backoff[below] >= question.lower[below] - beyond[below],
+    ]
+    if not soft.all():
+        rows.append(beyond[~soft] == 0.0)
+    program = cp.Problem(cp.Minimize(cost), rows)
+    program.solve(solver=cp.CLARABEL)
+    return float(program.value) if program.status == cp.OPTIMAL else np.inf
+
+
+# --- the policy that an answer stands for ----------------------------------------------------------------------------
+
+
+def flown(one: Case, ask: Asked, answer: Answer) -> list[Array]:
+    """Gains (n_θ,) of each component that an answer stands for: of the policies it may have, those with its back-offs.
+
+    A mixture is held to the mixture of its policies' back-offs, which its own never exceed.
+    """
+    return [_flown(one, i, ask, answer) for i in range(len(one.components))]
+
+
+def _flown(one: Case, i: int, ask: Asked, answer: Answer) -> Array:
+    part, mixture = one.components[i], one.mixtures[i]
+    told = np.concatenate([answer.backoff_x[:, part.rows_x].ravel(), answer.backoff_u[:, part.rows_u].ravel()])
+
+    def same(backoffs: Array) -> bool:
+        return bool(np.allclose(told, backoffs, rtol=1e-9, atol=1e-9 * told.max()))
+
+    table = one.backoffs[i]
+    if same(table[0]):
+        return np.asarray(mixture.theta[0])
+    variant = one.solver._variants[ask.outlook.late]
+    p = variant._of_question @ np.concatenate([ask.x, ask.target])
+    mixed = variant._mixed_share(i, p, variant._numbers(p, ask.outlook))
+    if mixed is not None and same(mixed.weights @ table[mixed.policies]):
+        return np.asarray(mixed.weights @ mixture.theta[mixed.policies])
+    theta = exact_gains(one, i, ask)
+    assert same(backoff_table(one.design, part, i, theta[None])[0]), "no policy has the answer's back-offs"
+    return theta
+
+
+def exact_gains(one: Case, i: int, ask: Asked) -> Array:
+    """Gains (n_θ,) of the exact program's answer for a component."""
+    part = one.components[i]
+    for program in (one.exact[i]._exact, one.exact[i]._missing):
+        solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.outlook))
+        if solution.status == "Solved":
+            break
+    return np.asarray(solution.variables[program.layout.theta])
+
+
+def small_spec() -> DesignSpec:
+    """One axis of the paper over six steps, with a good link."""
+    return spec(
+        "paper",
+        plant=one_axis(paper_plant()),
+        state_set=Polytope.from_box([-30.0, -8.0], [50.0, 7.0]),
+        input_set=Polytope.from_box([-7.5], [7.5]),
+        q_x=np.diag([10.0, 0.1]),
+        q_u=np.array([[0.1]]),
+        k_tau=np.array([[-0.058, -1.172]]),
+        horizon=6,
+        tau=1,
+        delays=2,
+        link=bernoulli(np.array([0.95])),
+        search_states=np.zeros((0, 2)),
+    )
+
+
+def small(late: int = 0) -> Design:
+    asked = small_spec()
+    return with_late(make_design(asked), asked, late)
