@@ -7,7 +7,8 @@ import random
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mavlink_rig import DATA, MS, SECOND, packets, read
+from mavlink_rig import MS, SECOND, packets, read
+from places import DATA
 
 from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, SlidingMinimum, StampRefusal
 

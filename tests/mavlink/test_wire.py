@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mavlink_rig import DATA, packets
+from mavlink_rig import packets
+from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import to_euler

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from loopback_rig import Memory, header, shared
-from mavlink_rig import DATA
 from numpy.typing import NDArray
+from places import DATA
 
 from logs.recording.flight import FlightData
 from logs.recording.tlog import TlogPacket, read_tlog

@@ -6,8 +6,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from mavlink_rig import DATA
 from numpy.typing import NDArray
+from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog

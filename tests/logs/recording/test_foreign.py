@@ -7,9 +7,10 @@ import struct
 from pathlib import Path
 
 import pytest
-from foreign_rig import DATA, TLOGS, by_tlog, flown, rows_of, write
+from foreign_rig import TLOGS, by_tlog, flown, rows_of, write
 from loopback_rig import lockstep, make_loop
 from mcap.writer import CompressionType
+from places import DATA
 
 from logs.recording.foreign import ForeignMcap, is_foreign, read_mcap
 from logs.recording.recorder import SyncRecorder

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from foreign_rig import DATA, TLOGS, Row, by_tlog, flown, write
+from foreign_rig import TLOGS, Row, by_tlog, flown, write
 from mcap_ros1._vendor.genpy.dynamic import generate_dynamic
 from mcap_ros1.writer import Writer as Ros1Writer
 from mcap_ros2.writer import Writer as Ros2Writer
+from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.foreign import ROS1, ROS2, UnreadableError, read_mcap, unwrapper

@@ -7,7 +7,8 @@ import struct
 from pathlib import Path
 
 import pytest
-from foreign_rig import DATA, TLOGS, Row, by_tlog, flown, rows_of, write
+from foreign_rig import TLOGS, Row, by_tlog, flown, rows_of, write
+from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.foreign import cut, read_mcap
