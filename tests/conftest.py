@@ -64,7 +64,7 @@ def control_may_fail() -> None:
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """For flights whose page nobody reads: drawing one takes longer than to fly."""
-    monkeypatch.setattr("uavctl.cli.flying.write_report", lambda *_: None)
+    monkeypatch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,15 @@ import pytest
 from report_rig import unpaged
 from udp_rig import assert_in_order, fly_over_udp
 
+from logs.recording.flight import FlightData
 from logs.recording.reader import RecordedMessage, read, records, walk
+from logs.recording.summary import summarise
 from uavctl.build.controller import build_design
 from uavctl.build.library import library_for
 from uavctl.cli.app import run
+from uavctl.cli.flying import draw_page
 from uavctl.config import load_config
+from uavctl.errors import UavctlError
 from uavctl.records import Header
 
 KEYS = {
@@ -131,3 +137,24 @@ def test_names_with_brackets_are_shown_as_they_are(tmp_path: Path, capsys: pytes
 def test_records_of_a_flight_have_the_types_of_their_topics(flown: Path) -> None:
     for topic, at_ns, record in read(flown):
         assert isinstance(record, msgspec.Struct) and topic.startswith("/") and at_ns >= 0
+
+
+def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path: Path) -> None:
+    """Page and process that draws it, without the fixture that keeps it from being drawn."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
+        assert run(["loopback", "--config", "room", "--duration", "1", "--out", str(tmp_path), "--json"]) == 0
+    (path,) = tmp_path.glob("*.mcap")
+    before = path.read_bytes()
+    summary = summarise(FlightData.from_records(read(path), path), wall_s=1.0)
+    draw_page(path, summary, tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    with pytest.raises(UavctlError, match=r"log report .*flight\.mcap"):
+        draw_page(path, summary, path / "flight.html")  # a file is no folder
+    assert path.read_bytes() == before
+
+
+def test_what_flies_loads_nothing_that_draws() -> None:
+    names = "uavctl.cli.fly, uavctl.cli.loopback, uavctl.cli.ctl"
+    script = f"import sys, {names}; print([name for name in sys.modules if name == 'matplotlib'])"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -58,7 +58,8 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
         ("sim", "uavctl.smpc", "The simulator knows nothing of the controller"),
         ("sim", "uavctl.loop", "The simulator knows nothing of the controller"),
         ("uavctl.daemon.daemon", "logs", "The daemon sees a sink, never the recordings"),
-        ("uavctl.cli.replay", "logs.report.flight_page", "A replay does not wait for what draws pages"),
+        ("uavctl.cli.replay", "logs.report.flight_page", "Neither what flies nor a replay loads what draws"),
+        ("uavctl.cli.fly", "logs.report.flight_page", "Neither what flies nor a replay loads what draws"),
     ],
 )
 def test_one_planted_import_breaks_its_contract(

@@ -92,7 +92,7 @@ def unwritten() -> Iterator[None]:
 def unpaged() -> Iterator[None]:
     """Flights without a page, as fixture `no_page` has it, for what a module's tests share."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uavctl.cli.flying.write_report", lambda *_: None)
+        patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
         yield
 
 

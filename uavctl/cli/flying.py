@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import pickle
 import shlex
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -26,14 +28,13 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.topics import HEADER, LIBRARY
 from logs.recording.views import Views
-from logs.report.flight_page import write_report
 from uavctl.build.controller import record_of, resting
 from uavctl.build.mission import build_mission
 from uavctl.cli.common import FREE_PORT, messages
 from uavctl.cli.prepare import Prepared, cpu, versions
 from uavctl.config import Config
 from uavctl.config.load import dump_config
-from uavctl.errors import ConnectionClosedError, RecordingError, UsageError
+from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import HandoverState
 from uavctl.outcome import lacking
@@ -346,8 +347,28 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
         recorder_dropped=0 if status.ok else _lacking(status),
         ending=None if ending is None else final(ending, status),
     )
-    write_report(flight, summary, page)
+    draw_page(path, summary, page)
     return summary
+
+
+def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
+    """Write the page of a recording in a process of its own: what draws has no place in one that flies.
+
+    Args:
+        path: of the recording.
+        summary: of the flight, as the console tells it.
+        page: where it is written.
+
+    Raises:
+        UavctlError: it cannot be written; the recording is as it was.
+    """
+    command = [sys.executable, "-P", "-m", "logs.report", str(path), str(page)]
+    done = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+    if done.returncode:
+        told = done.stderr.decode(errors="replace").strip().splitlines()
+        why = told[-1] if told else f"its process ended with {done.returncode}"
+        where = "" if str(page) in why else f"{page}: "
+        raise UavctlError(f"{where}{why}; `uavctl log report {path}` draws the page once that is mended")
 
 
 @contextmanager
