@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build.library import library_for
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
 from uavctl.config.types import Config
@@ -31,12 +30,15 @@ from uavctl.smpc.conditioned.planner import (
     conditioned_record,
 )
 from uavctl.smpc.estimate import InnovationForm, innovations, with_bias
-from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, design_record, make_design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule, optimal_cost, with_late
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope, equilibria
+
+# The paper's scheme is loaded where it is flown: it takes a tenth of the time in which the rest is.
+if TYPE_CHECKING:
+    from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
+    from uavctl.smpc.hahn_stursberg.library import Library
+
 
 NANOSECONDS = 1e9
 
@@ -92,6 +94,8 @@ def build_spec(config: Config) -> DesignSpec:
     Raises:
         DesignError: A key of scheme `hahn-stursberg` is missing; see also `build_plant` and `build_delayed_link`.
     """
+    from uavctl.smpc.hahn_stursberg.design import DesignSpec
+
     smpc, schedule, sets = config.smpc, config.schedule, config.sets
     tau, plant = needed(smpc.tau, "smpc.tau"), build_plant(config)
     # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
@@ -236,6 +240,9 @@ def build_design(config: Config) -> Design:
     Raises:
         DesignError: There is none, naming key, reason and what to do.
     """
+    from uavctl.smpc.hahn_stursberg.design import make_design
+    from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost, with_late
+
     spec = build_spec(config)
     design = make_design(spec, optimal_cost)
     check_schedule(design)
@@ -255,11 +262,16 @@ def build_solver(design: AnyDesign, config: Config, library: Library | None = No
     if isinstance(design, ConditionedDesign):
         return design.solver
     if config.solver.method == "library":
+        from uavctl.build.library import library_for
+        from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+
         found = library_for(design).library if library is None else library
         solver = LibrarySolver(design, found, exact=config.solver.exact)
         solver.prepare()
         return solver
     if config.solver.method == "exact":
+        from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+
         return ConicSolver(design)
     if design.late or design.estimate_cov.any():
         raise DesignError(
@@ -281,7 +293,11 @@ def resting(design: AnyDesign) -> NDArray[np.float64]:
 
 def record_of(design: AnyDesign) -> dict[str, object]:
     """A design of either scheme as plain numbers."""
-    return conditioned_record(design) if isinstance(design, ConditionedDesign) else design_record(design)
+    if isinstance(design, ConditionedDesign):
+        return conditioned_record(design)
+    from uavctl.smpc.hahn_stursberg.design import design_record
+
+    return design_record(design)
 
 
 def _promised(config: Config) -> float:
@@ -372,7 +388,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         mission=build_mission(config, design, resting(design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=_promised(config)),
-        late_steps=len(design.late) if isinstance(design, Design) else design.horizon,
+        late_steps=design.horizon if isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
         fallback=FallbackParameters(

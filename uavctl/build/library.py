@@ -15,51 +15,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib import metadata, resources
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from uavctl.build.code_id import maker_id
 from uavctl.errors import LibraryError
 from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary, Region, make_library
 from uavctl.smpc.plant import digest
-
-# Which code this is: hashes of the sources and of the versions of what they compute with.
-
-
-COMPUTES_WITH = ("numpy", "scipy", "clarabel", "daqp")
-
-
-@cache
-def maker_id() -> str:
-    """Hash of the code that makes libraries, and of the versions of what it computes with."""
-    versions = tuple((name, metadata.version(name)) for name in COMPUTES_WITH)
-    return digest((_sources("uavctl.smpc"), versions))
-
-
-@cache
-def decider_id() -> str:
-    """Hash of the code that a flight's records come from: from bytes to estimate, plan, decision and bytes again."""
-    return digest(
-        tuple(_sources(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
-    )
-
-
-def _sources(package: str) -> tuple[tuple[str, bytes], ...]:
-    """Names and contents of a package's modules, and of those of the packages in it; of `uavctl` only its own."""
-    found = []
-    for entry in resources.files(package).iterdir():
-        if entry.name.endswith(".py"):
-            found.append((f"{package}.{entry.name}", entry.read_bytes()))
-        elif package != "uavctl" and (entry / "__init__.py").is_file():
-            found.extend(_sources(f"{package}.{entry.name}"))
-    return tuple(sorted(found))
-
 
 # What a policy library achieves: answers from states that it has not been grown on.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,12 @@ from uavctl.errors import DesignError
 from uavctl.flight.mission import Fence, Mission, PlantMotion, Room, Trajectory, Waypoint, along, follow, hold, room
 from uavctl.labels import Names, names_of
 from uavctl.smpc.conditioned.planner import AnyDesign
-from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose
-from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, equilibria
+
+if TYPE_CHECKING:
+    from uavctl.smpc.hahn_stursberg.design import Design
+
 
 Array = NDArray[np.float64]
 
@@ -105,6 +107,9 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
 
 def build_rests(design: Design) -> Array:
     """Right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
+    from uavctl.smpc.hahn_stursberg.horizon import decompose
+    from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
+
     rests = design.state_set.b.copy()
     for part in decompose(design):
         rests[part.rows_x] -= terminal_backoff_x(design, part)

@@ -20,7 +20,6 @@ from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of
-from uavctl.cli.check import checked_before_arming, record_items
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
 from uavctl.cli.flying import (
     Engagement,
@@ -240,6 +239,8 @@ def fly_daemon(
             design = design_of(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
+        from uavctl.cli.check import checked_before_arming, record_items  # an eighth of what loading `fly` would take
+
         begun = time.perf_counter()
         with (
             as_realtime(as_realtime_process) as collect,

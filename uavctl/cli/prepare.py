@@ -8,18 +8,22 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from uavctl import __version__
+from uavctl.build.code_id import decider_id
 from uavctl.build.controller import build_controller
-from uavctl.build.library import StoredLibrary, decider_id, library_for
 from uavctl.cli.common import messages
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
-from uavctl.smpc.conditioned.planner import AnyDesign
-from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign
+
+if TYPE_CHECKING:
+    from uavctl.build.library import StoredLibrary
+
 
 # From a configuration to a controller that is ready to decide, with a progress bar where that takes seconds.
 
@@ -47,8 +51,10 @@ def prepare(config: Config, design: AnyDesign) -> Prepared:
 
 def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
     """The policy library of a design that asks for one: from the cache, or made under a progress bar."""
-    if not isinstance(design, Design) or not config.uses_library:
+    if isinstance(design, ConditionedDesign) or not config.uses_library:
         return None
+    from uavctl.build.library import library_for
+
     with ExitStack() as stack:
         bar: list[Callable[[str], None]] = []  # from the first round on: there is none for what the cache holds
 

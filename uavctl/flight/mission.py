@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 from uavctl.records import Vec3, Vector
 from uavctl.smpc.answer import Path, Preview
@@ -324,6 +323,8 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Pl
     regular = _REGULAR * sparse.eye_array(n * (n_x + n_u))
     system = sparse.block_array([[cost + regular, model.T], [model, None]], format="csc")
     given = np.concatenate([seen.T @ np.concatenate(right), np.zeros(n * n_u + (n - 1) * n_x)])
+    from scipy.sparse.linalg import spsolve  # loaded where a trajectory is flown, for it takes long
+
     found = spsolve(system, given)
     return PlantMotion(states=found[: n * n_x].reshape(n, n_x), inputs=found[n * n_x : n * (n_x + n_u)].reshape(n, n_u))
 

@@ -14,6 +14,12 @@ from uavctl.records import GaveWay, SolveStatus
 
 Array = NDArray[np.float64]
 
+# A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
+INPUT_TOLERANCE = 1e-6
+
+# What still counts as a constraint kept (each in its own unit, or summed over a plan).
+KEPT = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Path:
@@ -111,6 +117,24 @@ class Answer:
             gap=np.inf,
             iterations=iterations,
         )
+
+
+def inside(inputs: Array, c: Array, b: Array) -> tuple[Array, bool]:
+    """Cut inputs (H, n_u) back to c u <= b: a row of one entry exactly, others along the row.
+
+    Returns:
+        The inputs, and whether they were within INPUT_TOLERANCE of the limits before.
+    """
+    cut = inputs.copy()
+    for row, side in zip(c, b, strict=True):
+        (used,) = np.nonzero(row)
+        excess = np.maximum(cut @ row - side, 0.0)
+        cut -= np.outer(excess, row / (row @ row))
+        if used.size == 1:
+            limit = side / row[used[0]]
+            clip = np.minimum if row[used[0]] > 0 else np.maximum
+            cut[:, used[0]] = clip(cut[:, used[0]], limit)
+    return cut, bool(np.max(np.abs(cut - inputs), initial=0.0) <= INPUT_TOLERANCE)
 
 
 # Costs below are zero but for rounding: those of a plant without disturbance, at rest in its target.

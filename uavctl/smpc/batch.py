@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import Answer, Preview, Solver
-from uavctl.smpc.hahn_stursberg.exact import KEPT
+from uavctl.smpc.answer import KEPT, Answer, Preview, Solver
 from uavctl.smpc.plant import Plant
 
 # Many runs of one plant in step: what a controller of all of them sees, and what it answers.

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from uavctl.smpc.bounds import Lqr, lqr
 from uavctl.smpc.plant import Plant
@@ -67,6 +66,8 @@ def parts(problem: ControlProblem, beside: Array | None = None) -> tuple[Part, .
             [np.zeros((plant.n_u, plant.n_x), dtype=bool), (problem.q_u != 0) | (np.abs(c_u.T) @ np.abs(c_u) != 0)],
         ]
     )
+    from scipy.sparse.csgraph import connected_components  # loaded where a design is made, for it takes long
+
     _, label = connected_components(sparse.csr_array(coupled), directed=False)
     of_x, of_u = label[: plant.n_x], label[plant.n_x :]
     return tuple(

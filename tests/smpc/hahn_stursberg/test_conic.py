@@ -23,11 +23,11 @@ from optimisation_cases import (
 )
 
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import Answer
+from uavctl.smpc.answer import Answer, inside
 from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, inside
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.hahn_stursberg.program import Program

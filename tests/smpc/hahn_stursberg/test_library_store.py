@@ -14,6 +14,7 @@ import pytest
 from optimisation_cases import START, paper_spec
 
 from uavctl.build import library as library_store
+from uavctl.build.code_id import maker_id
 from uavctl.build.library import (
     Advance,
     LibraryCheck,
@@ -24,7 +25,6 @@ from uavctl.build.library import (
     encode,
     library_for,
     load,
-    maker_id,
 )
 from uavctl.errors import DesignError, LibraryError
 from uavctl.smpc.hahn_stursberg.design import Design, make_design

@@ -35,10 +35,10 @@ from uavctl.lab.bench.timing import (
     timed,
 )
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, Solver
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import KEPT, ConicSolver, PartSolver
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, make_library, state_box
 from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver

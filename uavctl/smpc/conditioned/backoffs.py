@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.conditioned.risk import AgeRisk, quantile, spent
@@ -158,6 +157,8 @@ class _RestingRows:
         def slack(d: float) -> float:
             room = np.maximum(d, before) - backoff + self.reach[:, row]
             return float(self.gaps @ spent(room, off).max(axis=1)) - SLACK * allowed / share
+
+        from scipy.optimize import brentq  # loaded where a design is made, for it takes long
 
         found = 0.0
         for excess in (resting, slack):

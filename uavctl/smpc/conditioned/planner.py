@@ -22,13 +22,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite
+from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT, NOMINAL, Answer, Preview, finite, inside
 from uavctl.smpc.batch import Decisions, gathered
 from uavctl.smpc.bounds import lqr
 from uavctl.smpc.conditioned.backoffs import Deviations, rest_backoffs
@@ -45,13 +46,15 @@ from uavctl.smpc.conditioned.risk import (
     shifted,
     spent,
 )
-from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import INPUT_TOLERANCE, KEPT, inside
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, parts, unseen
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
 from uavctl.smpc.sets import Polytope, equilibria
+
+if TYPE_CHECKING:
+    from uavctl.smpc.hahn_stursberg.design import Design
+
 
 Array = NDArray[np.float64]
 
@@ -454,7 +457,7 @@ class ConditionedDesign:
         return max(1, round(_SETTLED * self.horizon))
 
 
-AnyDesign = Design | ConditionedDesign  # what a flight is planned with, of either scheme
+AnyDesign: TypeAlias = "Design | ConditionedDesign"  # what a flight is planned with, of either scheme
 
 
 def conditioned_id(

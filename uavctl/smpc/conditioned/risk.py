@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from uavctl.errors import DesignError
@@ -66,6 +65,8 @@ def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = P
 
     def excess(level: float) -> float:
         return float(weights @ budgets(level)) - left
+
+    from scipy.optimize import brentq  # loaded where a design is made, for it takes long
 
     low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
     return AgeRisk(weights, beyond, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite, relative_gap
+from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, finite, inside, relative_gap
 from uavctl.smpc.hahn_stursberg.cones import BREAKDOWN, Expression, ProgramBuilder, Solution
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, assembled
 from uavctl.smpc.hahn_stursberg.horizon import (
@@ -36,12 +36,6 @@ from uavctl.smpc.plant import digest
 
 
 Array = NDArray[np.float64]
-
-# A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
-INPUT_TOLERANCE = 1e-6
-
-# What still counts as a constraint kept (each in its own unit, or summed over a plan).
-KEPT = 1e-6
 
 # The worst of several components' endings is the plan's: the later in this list, the worse.
 _ORDER = (
@@ -148,24 +142,6 @@ def gave_way(design: Design, answer: Answer, components: Sequence[Component], ou
     add("terminal", free, placed + backoff - limits[free:].min(axis=0))
     add("equilibrium", free, np.abs(answer.states[free] - answer.reference))
     return tuple(given)
-
-
-def inside(inputs: Array, c: Array, b: Array) -> tuple[Array, bool]:
-    """Cut inputs (H, n_u) back to c u <= b: a row of one entry exactly, others along the row.
-
-    Returns:
-        The inputs, and whether they were within INPUT_TOLERANCE of the limits before.
-    """
-    cut = inputs.copy()
-    for row, side in zip(c, b, strict=True):
-        (used,) = np.nonzero(row)
-        excess = np.maximum(cut @ row - side, 0.0)
-        cut -= np.outer(excess, row / (row @ row))
-        if used.size == 1:
-            limit = side / row[used[0]]
-            clip = np.minimum if row[used[0]] > 0 else np.maximum
-            cut[:, used[0]] = clip(cut[:, used[0]], limit)
-    return cut, bool(np.max(np.abs(cut - inputs), initial=0.0) <= INPUT_TOLERANCE)
 
 
 def _predict(design: Design, x: Array, inputs: Array) -> Array:

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial import HalfspaceIntersection, QhullError
 
-from uavctl.smpc.answer import LEAST_COST, Solver
+from uavctl.smpc.answer import LEAST_COST, Solver, inside
 from uavctl.smpc.batch import Decisions, OneByOne
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import inside
 from uavctl.smpc.hahn_stursberg.frozen import TOLERANCE, Frozen
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.library import Library, PartLibrary, state_box

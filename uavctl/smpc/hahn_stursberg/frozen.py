@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import Answer, Preview, relative_gap
+from uavctl.smpc.answer import Answer, Preview, inside, relative_gap
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import PartAnswer, inside, told
+from uavctl.smpc.hahn_stursberg.exact import PartAnswer, told
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Component
 from uavctl.smpc.hahn_stursberg.mean import RowKind
 from uavctl.smpc.hahn_stursberg.mixture import Mixture

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite, inside
 from uavctl.smpc.hahn_stursberg.cones import unless_panic
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import PartAnswer, assemble, inside
+from uavctl.smpc.hahn_stursberg.exact import PartAnswer, assemble
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, whole
 
 Array = NDArray[np.float64]
