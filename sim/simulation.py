@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from sim.vehicle.linear import LinearVehicle, Script, ScriptedChannel, linear_mo
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
 from uavctl.config.types import Config
-from uavctl.records import Flyer, Outgoing, Truth, Vec3
+from uavctl.records import Flyer, Received, Truth, Vec3
 
 # A simulated vehicle at one instant, for whoever watches.
 
@@ -126,7 +126,7 @@ class Peers:
         due.sort(key=lambda one: one[0])  # stable: the vehicle first
         return due
 
-    def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Iterable[Outgoing]]) -> None:
+    def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Received]) -> None:
         """Move time on and have every datagram heard in order of time; its answers are taken where time then is.
 
         Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
@@ -135,7 +135,7 @@ class Peers:
         while True:
             at_ns = max(min(to_ns, self._own_ns), self.now_ns)
             for arrival_ns, link, data in self.advance(at_ns):
-                for answer in hear(link, data, arrival_ns):
+                for answer in hear(link, data, arrival_ns).answers:
                     self.receive(answer.link, answer.data, at_ns)
             if at_ns >= to_ns:
                 return

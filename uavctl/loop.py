@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
-from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, initial_state, step
+from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
 from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver
 from uavctl.mavlink.handover_guards import LEAVES_NONE, HandoverState, HandoverView, Sending, against_moving
@@ -36,6 +36,7 @@ from uavctl.records import (
     Order,
     Outgoing,
     PositionSample,
+    Received,
     Record,
     Refused,
     RelayStats,
@@ -97,7 +98,7 @@ class ControlLoop:
         self._put: Callable[[str, int, Record], None] = sink.put
         self._stopwatch = stopwatch
         self._links = make_links(config)
-        self._relay = Relay(config.relay)
+        self._relay, self._relays = Relay(config.relay), config.relay.enabled
         self._hand_over = HandOver(config.hand_over, sees_it_down=config.relay.enabled)
         self._config = config.hand_over
         self._heard: tuple[Ack | Text, ...] = ()
@@ -108,8 +109,6 @@ class ControlLoop:
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
         self._unsure_since_ns: int | None = None  # what the vehicle said then was lost unread
-        self.heard_vehicle = False  # whether the last datagram came from the vehicle that is flown
-        self.heard_source = False  # whether it held a position of a source that has spoken for a while
         self.vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self.decision: Decision | None = None
@@ -158,7 +157,7 @@ class ControlLoop:
     @property
     def relay(self) -> RelayStats | None:
         """What has become of the positions for the vehicle; None where none are passed on."""
-        if not self._relay.enabled:
+        if not self._relays:
             return None
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self.decision is None else self.decision.at_ns
@@ -190,25 +189,23 @@ class ControlLoop:
         """Whether a vehicle would be left behind that has flown on our setpoints; None before one is heard."""
         return None if self.who_flies is HandoverState.WAITING else self.who_flies not in LEAVES_NONE
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
-        """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing.
-
-        Returns:
-            What is to be sent at once: answers to requests for our time, never anything that moves the vehicle.
-        """
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
+        """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
-        self.heard_vehicle = self.heard_source = False
+        from_vehicle = from_source = False
         source = self._links[link]
         for item in source.receive(data, at_ns):
-            self.heard_vehicle = self.heard_vehicle or isinstance(item, VehicleStatus)
+            from_vehicle = from_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._tell(item, at_ns)
             elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                self.heard_source = source.settled
-                self._relay.take(item, source.attitude)
-        return tuple([self._send(link, answer, at_ns) for answer in source.answers()])
+                from_source = source.settled
+                if self._relays:
+                    self._relay.take(item, source.attitude)
+        answers = tuple([self._send(link, answer, at_ns) for answer in source.answers()])
+        return Received(answers, from_vehicle, from_source)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
         """Take the word of a connection that it has dropped something unread.
@@ -244,7 +241,7 @@ class ControlLoop:
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
         autopilot = "" if self.vehicle is None else self.vehicle.autopilot
         # A vehicle that lands must not do so by positions that have just been found to be wrong.
-        if not self._state.disbelieves:
+        if self._relays and not disbelieves(self._state):
             for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
                 yield self._send(VEHICLE, data, at_ns)
         if self._adrift:
@@ -448,8 +445,8 @@ class ControlLoop:
         unfit = ""
         if out.setpoint is None or estimate is None:
             unfit = "the controller has no estimate of the position"
-        elif estimate.age_s > self._config.fresh_s:
-            unfit = f"the newest position is {estimate.age_s:.1f} s old"
+        elif (age_s := (estimate.at_ns - estimate.captured_ns) * 1e-9) > self._config.fresh_s:
+            unfit = f"the newest position is {age_s:.1f} s old"
         return HandoverView(
             at_ns=inp.at_ns,
             vehicle=self.vehicle,

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import StrEnum
 from functools import cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import msgspec
 
@@ -389,11 +389,19 @@ class Outgoing(Record, frozen=True, kw_only=True):
     data: bytes
 
 
+class Received(NamedTuple):
+    """What a datagram was, and what is to be sent at once because of it: never anything that moves the vehicle."""
+
+    answers: tuple[Outgoing, ...]  # to requests for our time
+    from_vehicle: bool  # it came from the vehicle that is flown, not from others on the same port
+    from_source: bool  # it held a position of a source that has spoken for a while
+
+
 class Flyer(Protocol):
     """What flies: bytes in, bytes out, time as an argument. The simulator is given one."""
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
-        """Take one datagram that arrived at `at_ns`; gives what is to be sent at once."""
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
+        """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
         ...
 
     def tick(self, tick: int, at_ns: int) -> Iterable[Outgoing]:

@@ -11,7 +11,7 @@ from sim_rig import Client, S, decode
 
 from sim.simulation import MOCAP, VEHICLE, Peers, World
 from uavctl.config import load_config
-from uavctl.records import Outgoing, Truth, Vec3
+from uavctl.records import Outgoing, Received, Truth, Vec3
 
 MS = 1_000_000
 
@@ -26,9 +26,9 @@ class Scripted:
     ticks: list[tuple[int, int]] = field(default_factory=list)
     answer: Callable[[str, bytes], tuple[Outgoing, ...]] = lambda link, data: ()
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         self.got.append((len(self.ticks), at_ns, link, data))
-        return self.answer(link, data)
+        return Received(self.answer(link, data), True, True)
 
     def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
         self.ticks.append((tick, at_ns))

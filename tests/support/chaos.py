@@ -25,6 +25,7 @@ from flight_rig import (
 from numpy.typing import NDArray
 
 from uavctl.flight.controller import Controller
+from uavctl.flight.decision import mode_of
 from uavctl.flight.gating import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
 from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
@@ -131,7 +132,7 @@ def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[S
         controller = replace(controller, trust=GateParameters(sigma=6.0, margin_m=0.3, jump_ns=DT_NS))
         world, state, output, begins = World(rng, controller), initial_state(), None, True
         missed, silent_until, tick = 0, 0, -1
-        while done < ticks and state.mode is not ControlMode.STOPPED:
+        while done < ticks and mode_of(state) is not ControlMode.STOPPED:
             tick += 1
             world.advance(tick, output)
             if rng.random() < 0.02:

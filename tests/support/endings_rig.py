@@ -300,7 +300,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
-        patch.setattr(fly_cmd, "checked_before_arming", lambda *_: ())
+        patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.fly.HealthWatch", Watched)
         patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
         sections = report._sections

@@ -28,7 +28,7 @@ from uavctl.config import Config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
-from uavctl.records import Command, Order, Outgoing, Record, Sink
+from uavctl.records import Command, Order, Outgoing, Received, Record, Sink
 
 SECOND_NS = 1_000_000_000
 
@@ -85,13 +85,13 @@ class Rig:
         self._rng = np.random.default_rng((config.sim.seed, 1))
         self._heard: list[bytes] = []
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram."""
         self._heard = [*self._heard[-20:], data]
         if self._doors is not None:
             data = self._doors.take(link, data, at_ns)
             if not data:
-                return ()
+                return Received((), False, False)
         return self.loop.receive(link, data, at_ns)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,20 @@ from uavctl.cli.flying import put_header, stop_limit_s
 from uavctl.cli.prepare import Prepared, prepare
 from uavctl.config import Config, load_config
 from uavctl.loop import ControlLoop
-from uavctl.records import Command, ControlMode, Decision, Event, Order, Outgoing, Plan, Record, Setpoint, Sink, Vec3
+from uavctl.records import (
+    Command,
+    ControlMode,
+    Decision,
+    Event,
+    Order,
+    Outgoing,
+    Plan,
+    Received,
+    Record,
+    Setpoint,
+    Sink,
+    Vec3,
+)
 
 ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell
@@ -71,7 +84,7 @@ class Watch:
             self.alarms.append(f"at {at_ns * 1e-9:.2f} s: {record.code}: {record.text}")
         self.sink.put(topic, at_ns, record)
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram."""
         return self.loop.receive(link, data, at_ns)
 

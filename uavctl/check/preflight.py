@@ -18,7 +18,7 @@ from uavctl.config.types import Config
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Message
 from uavctl.mavlink.relay import Relay
-from uavctl.records import Outgoing, PositionSample, Vec3, VehicleStatus
+from uavctl.records import Outgoing, PositionSample, Received, Vec3, VehicleStatus
 
 # Moving the body by hand as asked, to see the cameras' axes; pure, time is an argument.
 
@@ -154,8 +154,6 @@ class Preflight:
         take_off_m: height of the climb that is planned [m].
 
     Attributes:
-        heard_vehicle: whether the last datagram came from the vehicle.
-        heard_source: whether it held a position of a source that has spoken for a while.
         guide: the prompts, if they were asked for.
     """
 
@@ -175,23 +173,23 @@ class Preflight:
         self._asked_ns: int | None = None
         self._rounds = 0
         self._autopilot = ""
-        self.heard_vehicle = self.heard_source = False
         self.guide = Guide(PROMPT_NS) if move else None
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
-        """Take one datagram that arrived at `at_ns`; gives what is to be sent at once."""
-        self.heard_vehicle = self.heard_source = False
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
+        """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
+        from_vehicle = from_source = False
         for one in self._links[link].receive(data, at_ns):
             if isinstance(one, PositionSample):
-                self.heard_source = self._links[link].settled
+                from_source = self._links[link].settled
                 attitude = self._links[link].attitude
                 self._seen.add(one, attitude)
                 self._relay.take(one, attitude)
                 if self.guide is not None and self._is_safe:
                     self.guide.take(at_ns, one.position_m, self._heading_rad())
             elif isinstance(one, VehicleStatus):
-                self.heard_vehicle, self._autopilot = True, one.autopilot
-        return tuple(Outgoing(link=link, data=answer) for answer in self._links[link].answers())
+                from_vehicle, self._autopilot = True, one.autopilot
+        answers = tuple(Outgoing(link=link, data=answer) for answer in self._links[link].answers())
+        return Received(answers, from_vehicle, from_source)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
         """What is to be sent at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""

@@ -82,12 +82,12 @@ def run_preflight(
 
 def _receive(flight: Preflight, name: str, connection: Connection) -> None:
     for index, (data, received_ns) in enumerate(connection.receive()):
-        answers = flight.receive(name, data, received_ns)
-        if flight.heard_vehicle:  # cameras or a ground station may share the port
+        received = flight.receive(name, data, received_ns)
+        if received.from_vehicle:  # cameras or a ground station may share the port
             connection.answer(index)
-        elif flight.heard_source:
+        elif received.from_source:
             connection.trust(index)
-        for answer in answers:
+        for answer in received.answers:
             connection.send(answer.data)
 
 

@@ -6,7 +6,7 @@ import multiprocessing
 import socket
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
@@ -54,7 +54,7 @@ from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
 from uavctl.loop import ControlLoop
 from uavctl.outcome import Cause
-from uavctl.records import Outgoing, Sink, Truth
+from uavctl.records import Outgoing, Received, Sink, Truth
 
 START_LIMIT_S = 60.0
 TRUTH = "/sim/truth"
@@ -145,7 +145,7 @@ class _Timed:
         self._engagement = engagement
         self.stop = False
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         return self._loop.receive(link, data, at_ns)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:

@@ -141,12 +141,12 @@ class _Reader:
 
     def _hand_on(self, name: str, index: int, data: bytes, received_ns: int) -> None:
         connection = self._connections[name]
-        answers = self._loop.receive(name, data, received_ns)
-        if self._loop.heard_vehicle:  # cameras or a ground station may share the port
+        received = self._loop.receive(name, data, received_ns)
+        if received.from_vehicle:  # cameras or a ground station may share the port
             connection.answer(index)
-        elif self._loop.heard_source:
+        elif received.from_source:
             connection.trust(index)
-        for answer in answers:
+        for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
     def _look_at_losses(self, stalled: bool) -> None:

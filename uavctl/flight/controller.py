@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from uavctl.flight.envelope import NOT_WATCHING, OF_POSITIONS, Breach, EnvelopeParameters, Watching
+from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Watching
 from uavctl.flight.estimator import Coming, FilterHistory
-from uavctl.flight.fallback import Biases, Fallback, FallbackEnd, FallbackParameters
+from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
 from uavctl.flight.gating import GateParameters, Reach, SourceHealth, make_reach
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
 from uavctl.labels import Names
-from uavctl.records import Command, ControlMode, Plan, Vec3
+from uavctl.records import Command, Plan, Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 
@@ -44,6 +44,7 @@ class Controller:
     dead_ns: int = 0  # from sending an input until it begins to act [ns]
     late_steps: int = 0  # age up to which the solver counts what it has not seen since [steps]
     envelope: EnvelopeParameters | None = None  # what is possible; None: nothing is held against it
+    ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
     reach: Reach = field(init=False, repr=False)  # where the vehicle can be, made from the others
 
@@ -53,14 +54,10 @@ class Controller:
         for waypoint in self.mission.waypoints:
             if waypoint.target.shape != (self.plant.n_x,):
                 raise ValueError(f"target has shape {waypoint.target.shape}, wanted ({self.plant.n_x},)")
+        object.__setattr__(self, "ticks_per_step", self.dt_ns // self.tick_ns)
         object.__setattr__(self, "kalman", make_kalman(self.plant, self.estimator, self.dt_ns))
         ticks = self.horizon * self.ticks_per_step
         object.__setattr__(self, "reach", make_reach(self.plant, self.limits, self.trust, self.tick_ns, ticks))
-
-    @property
-    def ticks_per_step(self) -> int:
-        """Ticks in a Δt."""
-        return self.dt_ns // self.tick_ns
 
 
 class ControlState(msgspec.Struct, frozen=True, eq=False):
@@ -88,19 +85,3 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     taken_back: int | None = None  # the step in which positions were last taken back; None for none
     coming: Coming = ()  # inputs that were sent and do not act yet, oldest first
     held_m: Vec3 | None = None  # where HOLD began, as it was estimated [m]; None in other modes
-
-    @property
-    def disbelieves(self) -> bool:
-        """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
-        jumped = self.fallback is not None and self.fallback.end is FallbackEnd.BARRED
-        if jumped or self.breach is None:
-            return jumped
-        # An estimate that is outside right after the start may be so because positions are not what they say.
-        return self.breach.code in OF_POSITIONS or not self.watching.answered
-
-    @property
-    def mode(self) -> ControlMode:
-        """What flies."""
-        if self.fallback is not None:
-            return self.fallback.mode
-        return ControlMode.WAIT if self.plan is None else ControlMode.TRACK

@@ -47,6 +47,13 @@ from uavctl.smpc.plant import Plant
 _OURS = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
 
+def mode_of(state: ControlState) -> ControlMode:
+    """What flies."""
+    if state.fallback is not None:
+        return state.fallback.mode
+    return ControlMode.WAIT if state.plan is None else ControlMode.TRACK
+
+
 def take_orders(state: ControlState, inp: StepInput, controller: Controller) -> tuple[ControlState, tuple[Event, ...]]:
     """Take a tick's orders; each gets one event that answers it.
 
@@ -276,7 +283,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     if why_not and (inp.stop or (state.fallback is not None and state.fallback.end is FallbackEnd.STOP)):
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=inp.at_ns, end=FallbackEnd.STOP)
         return Choice(replace(state, plan=None, fallback=ended), f"the operator stopped; {why_not}")
-    if inp.vehicle is None and state.mode is not ControlMode.WAIT:
+    if inp.vehicle is None and mode_of(state) is not ControlMode.WAIT:
         return _wait_out(state, state.fallback or fb.enter(inp.at_ns), tick, inp, controller)
     if why_not:
         return Choice(replace(state, plan=None, fallback=None), why_not)

@@ -21,13 +21,14 @@ from uavctl.flight.decision import (
     back_mps2,
     choose,
     held_mps2,
+    mode_of,
     moving_mps,
     place,
     seen_of,
     take_orders,
     unready,
 )
-from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
+from uavctl.flight.envelope import ABSURD, NOT_WATCHING, OF_POSITIONS, Breach, Watching, contradicts, is_outside, watch
 from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
 from uavctl.flight.fallback import FallbackEnd
 from uavctl.flight.gating import REPEATED, MeasurementUpdate, forget, take
@@ -127,6 +128,15 @@ def initial_state() -> ControlState:
     return ControlState()
 
 
+def disbelieves(state: ControlState) -> bool:
+    """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
+    jumped = state.fallback is not None and state.fallback.end is FallbackEnd.BARRED
+    if jumped or state.breach is None:
+        return jumped
+    # An estimate that is outside right after the start may be so because positions are not what they say.
+    return state.breach.code in OF_POSITIONS or not state.watching.answered
+
+
 def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[ControlState, StepOutput]:
     """Run one control tick.
 
@@ -140,7 +150,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     history = state.history or begin(controller.kalman, origin_ns, inp.at_ns)
     history, coming = act(controller.kalman, history, state.coming, inp.at_ns)
     intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
-    before = state.mode
+    before = mode_of(state)
     lost = intake.moved and before in _NOT_FLOWN
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
@@ -184,7 +194,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         biases=_biases(state, tick, clean_ns),
     )
     choice = choose(begun, tick, inp, controller)
-    mode = choice.state.mode
+    mode = mode_of(choice.state)
     setpoint, applied = (None, None) if choice.mute else _setpoint(choice.state, mode, tick, inp, controller)
     acting = None if applied is None or unready(inp.vehicle) else applied
     belief, link = _link(state, tick, inp.at_ns, controller)
@@ -292,10 +302,10 @@ def _watched(
     """Hold the tick against the envelope, as long as it is we who fly."""
     if state.breach is not None:
         return state.watching, None
-    if controller.envelope is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
+    if controller.envelope is None or mode_of(state) in _NOT_FLOWN or not _is_ours(inp.vehicle):
         return NOT_WATCHING, None
     seen = seen_of(
-        tick, inp, state.accel_mps2, controller.plant, intake.accepted, braking=state.mode is ControlMode.BRAKE
+        tick, inp, state.accel_mps2, controller.plant, intake.accepted, braking=mode_of(state) is ControlMode.BRAKE
     )
     if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
         seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
@@ -327,7 +337,7 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
     biases = state.biases
     if clean_ns is not None:
         biases = tuple(one for one in biases if one[0] <= clean_ns)
-    if state.mode is not ControlMode.TRACK:
+    if mode_of(state) is not ControlMode.TRACK:
         return biases if state.fallback is not None else ()
     if not tick.boundary or tick.age_steps or tick.estimate is None or not tick.estimate.bias:
         return biases
@@ -336,7 +346,7 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
 
 def _flown_against(state: ControlState, tick: Tick, inp: StepInput) -> tuple[float, ...]:
     """The bias that is flown against; empty where there is none, or others fly."""
-    if tick.estimate is None or state.mode in _NOT_FLOWN or not _is_ours(inp.vehicle):
+    if tick.estimate is None or mode_of(state) in _NOT_FLOWN or not _is_ours(inp.vehicle):
         return ()
     return tick.estimate.bias
 
@@ -397,7 +407,7 @@ ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for 
 
 def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> str:
     """How it is with the vehicle's inertial data, as an event's code; empty where that is nothing to us."""
-    belief, flown = tick.history.newest.belief, state.mode not in _NOT_FLOWN and _is_ours(inp.vehicle)
+    belief, flown = tick.history.newest.belief, mode_of(state) not in _NOT_FLOWN and _is_ours(inp.vehicle)
     if not controller.kalman.n_felt or belief is None or not flown:
         return ""
     if belief.doubted_ns is not None:

@@ -19,7 +19,7 @@ from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion
 from uavctl.loop import VEHICLE, make_links
 from uavctl.mavlink.relay import Relay
-from uavctl.records import Outgoing, PositionSample, Vec3
+from uavctl.records import Outgoing, PositionSample, Received, Vec3
 
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 # What makes an estimator use external positions and nothing else, as on the recorded flights (docs/autopilots.md).
@@ -133,7 +133,7 @@ class OwnLoop:
             cascade = autopilot.craft.cascade
             cascade.tuning = replace(cascade.tuning, **dict(self.tuning.gains))  # type: ignore[arg-type]
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> tuple[Outgoing, ...]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram; its positions go on to the vehicle, at once or with the next tick."""
         source = self._links[link]
         for item in source.receive(data, at_ns):
@@ -141,7 +141,7 @@ class OwnLoop:
                 self.samples.append(item)
                 self.relay.take(item, source.attitude or LEVEL)  # of a body that is quite level no attitude is told
         answers = tuple(Outgoing(link=link, data=answer) for answer in source.answers())
-        return (*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers
+        return Received((*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers, True, True)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
         """Send what is due at a tick: heartbeats, positions, and where to be."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from statistics import median
@@ -24,7 +24,7 @@ from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
 from uavctl.lab.own_loop import Moment, OwnLoop, OwnTuning, Path
 from uavctl.loop import ControlLoop
-from uavctl.records import ControlMode, Decision, Flyer, Outgoing, Plan, Record, Setpoint, Vec3
+from uavctl.records import ControlMode, Decision, Flyer, Outgoing, Plan, Received, Record, Setpoint, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 
@@ -411,7 +411,7 @@ class WatchedFlyer:
     times_s: list[float] = field(default_factory=list)  # of the ticks
     positions_m: list[Vec3] = field(default_factory=list)  # true positions at these times
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram."""
         return self.flyer.receive(link, data, at_ns)
 

@@ -155,7 +155,9 @@ class HandOver:
             sending = Sending.NOTHING
         self._see_to_disarming(view)
         held = view.unfit if now.state in _ON_THE_GROUND else ""
-        ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
+        ask = None
+        if now.request.ask is not None:
+            ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
         if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
             ask = RequestKind.DISARM  # arming may have been granted after all
         return HandoverStep(sending, ask, (*events, *self._tell(view, before, sight)), passage)

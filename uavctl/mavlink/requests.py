@@ -54,7 +54,7 @@ class PendingRequest:
     """
 
     def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
-        self._ask = ask
+        self.ask = ask  # what is asked for; None for a wait in which nothing is said
         self._patience = patience
         self._begun_ns = at_ns
         self._next_ns = at_ns
@@ -66,17 +66,12 @@ class PendingRequest:
         self.asked_ns: int | None = None  # when it was made last
         self.granted_ns: int | None = None  # when it was accepted last
 
-    @property
-    def ask(self) -> RequestKind | None:
-        """What is asked for; None for a wait in which nothing is said."""
-        return self._ask
-
     def hear(self, message: Ack | Text, at_ns: int) -> None:
         """Take what the vehicle says."""
         if isinstance(message, Text):
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
-        elif self._ask is not None and self._tries and message.command == COMMANDS[self._ask]:
+        elif self.ask is not None and self._tries and message.command == COMMANDS[self.ask]:
             again, self._result = self._result == message.result, message.result
             if message.result == mavlink.MAV_RESULT_ACCEPTED:
                 self.granted_ns = at_ns
@@ -95,28 +90,28 @@ class PendingRequest:
         self._held = held
         if blind and self._tries:
             return None
-        if self._ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
+        if self.ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
             return None
-        if self._ask is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
+        if self.ask is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
             return None
         self._tries += 1
         self._waits, self.asked_ns = False, at_ns
         self._next_ns = at_ns + self._patience.answer_ns
-        return self._ask
+        return self.ask
 
     def given_up(self, at_ns: int) -> str:
         """Why nothing more is to be expected; empty while there is hope."""
         over = at_ns - self._begun_ns >= self._patience.limit_ns
-        out_of_tries = self._ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
+        out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
         return f"{self._what()}{self._why()}{self.words} ({self._effort(at_ns)})"
 
     def _what(self) -> str:
-        return "" if self._ask is None else f"{self._ask.value}: "
+        return "" if self.ask is None else f"{self.ask.value}: "
 
     def _why(self) -> str:
-        if self._ask is None:
+        if self.ask is None:
             return "it took too long"
         if self._held and self._result is None:
             return f"not asked for, because {self._held}"
@@ -135,4 +130,4 @@ class PendingRequest:
 
     def _effort(self, at_ns: int) -> str:
         seconds = f"{(at_ns - self._begun_ns) / SECOND_NS:.1f} s"
-        return seconds if self._ask is None else f"asked {self._tries} times in {seconds}"
+        return seconds if self.ask is None else f"asked {self._tries} times in {seconds}"

@@ -25,7 +25,7 @@ from uavctl.lab.trial import (
     own_loop,
 )
 from uavctl.loop import ControlLoop
-from uavctl.records import Outgoing, PositionSample, Record, StepInput
+from uavctl.records import Outgoing, PositionSample, Received, Record, StepInput
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SECONDS = 12.0
@@ -44,8 +44,10 @@ class Overheard:
         self.own = own
         self.sent: list[Any] = []
 
-    def receive(self, link: str, data: bytes, at_ns: int) -> Iterable[Outgoing]:
-        return self._keep(self.own.receive(link, data, at_ns))
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
+        received = self.own.receive(link, data, at_ns)
+        self._keep(received.answers)
+        return received
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
         yield from self._keep(self.own.tick(tick, at_ns))

@@ -1,0 +1,90 @@
+"""How many files a position and a planning tick cross, by a profiler, and that docs/tick.md draws them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import TypeVar
+
+import pytest
+from loopback_rig import Memory, make_loop
+from places import ROOT
+
+from sim.simulation import World
+from uavctl.config import load_config
+from uavctl.loop import ControlLoop
+from uavctl.records import Outgoing, Plan, Received
+
+PAGE = (ROOT / "docs" / "tick.md").read_text(encoding="utf-8")
+T = TypeVar("T")
+WARM_S = 1.0  # what is done once in a flight is done by then
+
+
+@dataclass
+class Watched:
+    """A loop whose calls are watched; implements `uavctl.records.Flyer`."""
+
+    loop: ControlLoop
+    memory: Memory
+    positions: list[frozenset[str]] = field(default_factory=list)
+    planning: list[frozenset[str]] = field(default_factory=list)
+    at_s: float = 0.0
+
+    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
+        received, files = crossed(lambda: self.loop.receive(link, data, at_ns))
+        if received.from_source and self.at_s > WARM_S:
+            self.positions.append(files)
+        return received
+
+    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+        before, self.at_s = len(self.memory.entries), at_ns * 1e-9
+        sent, files = crossed(lambda: list(self.loop.tick(tick, at_ns)))
+        if any(isinstance(record, Plan) for _, _, record in self.memory.entries[before:]) and self.at_s > WARM_S:
+            self.planning.append(files)
+        yield from sent
+
+
+def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
+    """What a call gives, and the product's files in which a function was called meanwhile."""
+    files: set[str] = set()
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            files.add(frame.f_code.co_filename)
+
+    sys.setprofile(watch)
+    try:
+        found = call()
+    finally:
+        sys.setprofile(None)
+    places = (name.removeprefix(f"{ROOT}/") for name in files if name.startswith(f"{ROOT}/"))
+    return found, frozenset(place for place in places if place.startswith(("uavctl/", "sim/", "logs/")))
+
+
+@pytest.fixture(scope="module")
+def watched() -> Watched:
+    config = load_config("room-px4")
+    memory = Memory()
+    flyer = Watched(make_loop(config, memory), memory)
+    World(config, flyer).run(5.0)
+    return flyer
+
+
+def test_a_position_crosses_few_files(watched: Watched) -> None:
+    assert len(watched.positions) > 30
+    assert max(map(len, watched.positions)) <= 20
+
+
+def test_a_planning_tick_crosses_few_files(watched: Watched) -> None:
+    assert len(watched.planning) > 30
+    assert max(map(len, watched.planning)) <= 25
+
+
+@pytest.mark.parametrize(("title", "of"), [("A position", "positions"), ("A planning tick", "planning")])
+def test_the_page_draws_what_is_crossed(watched: Watched, title: str, of: str) -> None:
+    (section,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    drawn = set(re.findall(r"uavctl/\S+\.py", section))
+    assert frozenset().union(*getattr(watched, of)) == drawn
