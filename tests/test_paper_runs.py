@@ -110,7 +110,7 @@ def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch
 
 
 def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
-    pilot = ChunkRunner(setup, many=False)
+    pilot = ChunkRunner(setup)
     few, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
     assert few.flown.states[2] == pytest.approx(more.flown.states[0], abs=1e-9)
 

@@ -30,7 +30,7 @@ from uavctl.config.types import PlantConfig
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, Kind
 from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.baselines import (
     CascadedPid,
     ControlProblem,
@@ -44,12 +44,10 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, News, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, News, OneByOne
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
-from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
-from uavctl.smpc.hahn_stursberg.library import Library
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
 
@@ -288,14 +286,9 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     if design is None:
         raise ValueError("an SMPC without a design")
     library = None if recipe.library is None else decode(recipe.library).library
-    decider = _decider(design, library, build_solver(design, config, library))
+    solver = build_solver(design, config, library)
+    decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
-
-
-def _decider(design: Design, library: Library | None, solver: Solver) -> Decider:
-    if library is None:
-        return OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
-    return ExplicitDecider(design, library, solver, design.target)
 
 
 def _tuned(config: Config, spec: CampaignSpec) -> PidGains:

@@ -25,7 +25,6 @@ from uavctl.errors import UavctlError
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions, OneByOne
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
@@ -87,17 +86,11 @@ class Chunk:
 class ChunkRunner:
     """Flies chunks of one design's runs."""
 
-    def __init__(self, setup: Setup, *, many: bool) -> None:
-        """Args: what flies; whether so much is flown that tables of answers are worth their seconds."""
+    def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
         self._setup = setup
         solver = LibrarySolver(design, setup.library, exact=config.solver.exact)
-        decider: Decider
-        if many:
-            decider = ExplicitDecider(design, setup.library, solver, design.target)
-        else:
-            decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
-        self._watched = Watched(decider, design)
+        self._watched = Watched(OneByOne(solver, design.target, (design.horizon, design.plant.n_u)), design)
         self._smpc = BatchSmpc(
             self._watched, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
         )
@@ -304,7 +297,7 @@ def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
 Advance = Callable[[int], None]
 
 CHUNK = 1000  # runs flown together; the same whoever flies them, so that workers change nothing
-HERE_UP_TO = 500  # runs that are not worth another process, nor tables
+HERE_UP_TO = 500  # runs that are not worth another process
 DRAWN = 200  # runs whose trajectories are kept, for the figures
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -362,7 +355,7 @@ def _flier(
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
     """Maps tasks to their results, in order."""
     if runs <= HERE_UP_TO:
-        crew = RunnerOfDesign(setups, many=False)
+        crew = RunnerOfDesign(setups)
         yield lambda tasks: map(crew.fly, tasks)
         return
     with _single_threaded(), TemporaryDirectory() as folder:
@@ -396,9 +389,9 @@ def _single_threaded() -> Iterator[None]:
 class RunnerOfDesign:
     """One pilot a design."""
 
-    def __init__(self, setups: Sequence[Setup], *, many: bool) -> None:
+    def __init__(self, setups: Sequence[Setup]) -> None:
         self._designs = [setup.design for setup in setups]
-        self._pilots = [ChunkRunner(setup, many=many) for setup in setups]
+        self._pilots = [ChunkRunner(setup) for setup in setups]
 
     def fly(self, task: ChunkTask) -> Flights:
         """The runs of one task; those of the first one are kept for the figures."""
@@ -411,7 +404,7 @@ _crew: list[RunnerOfDesign] = []  # of a worker process
 
 
 def _join(path: Path) -> None:
-    _crew.append(RunnerOfDesign(pickle.loads(path.read_bytes()), many=True))
+    _crew.append(RunnerOfDesign(pickle.loads(path.read_bytes())))
 
 
 def _fly(task: ChunkTask) -> Flights:
