@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -18,10 +17,10 @@ from rich.table import Table
 from uavctl.build.controller import build_conditioned, build_design, build_spec
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, located, messages
 from uavctl.config.types import Config
-from uavctl.errors import DesignError, UsageError
+from uavctl.errors import DesignError
 from uavctl.lab.bench.decisions import DecisionBench, time_decisions, time_flight
 from uavctl.lab.bench.loop import LoopBench, LoopRun, TimeQuantiles, run_loop_bench
-from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, bench_svg, run_bench
+from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, run_bench
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 
@@ -100,7 +99,6 @@ def bench(
         ),
     ] = DEFAULT_SIZES.states,
     seed: Annotated[int, Parameter(help="seed of states and policies", validator=SEED)] = 0,
-    plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
     loop: Annotated[
         bool, Parameter(negative=(), help="measure the whole control loop on real UDP instead, beside an empty one")
     ] = False,
@@ -119,8 +117,6 @@ def bench(
         return bench_loop(common, seconds, runs)
     loaded = common.load()
     if loaded.config.conditioned:
-        if plot is not None:
-            raise UsageError("--plot draws the methods of smpc.scheme `hahn-stursberg`; leave it out")
         with located(loaded):
             solver = build_conditioned(loaded.config).solver
         with _progress() as advance:
@@ -130,16 +126,12 @@ def bench(
         decided = msgspec.structs.replace(decided, flight=flight)
         common.show(decided, lambda: _decisions(decided, loaded.config.name))
         return 0
-    if plot is not None:
-        _check_plot(plot)
     with located(loaded):
         design = build_design(loaded.config)
         loss = build_spec(loaded.config).link.outage(1)
         with _progress() as advance:
             sizes = replace(DEFAULT_SIZES, states=states)
             result = run_bench(design, loss, seed, advance, sizes, _conditioned_solver(loaded.config))
-    if plot is not None:
-        plot.write_text(bench_svg(result, loaded.config.name), encoding="utf-8")
     common.show(result, lambda: bench_picture(result, loaded.config.name))
     return 0
 
@@ -173,22 +165,6 @@ def _decisions(found: DecisionBench, name: str) -> str:
     )
 
 
-def _check_plot(plot: Path) -> None:
-    """Refuse a file that cannot be written, before minutes of measuring.
-
-    Raises:
-        UsageError: There is no such folder, or the name is that of something else.
-    """
-    try:
-        there, taken = plot.parent.is_dir(), plot.exists() and not plot.is_file()
-    except OSError as error:
-        raise UsageError(f"--plot: {error.strerror}; give another name") from error
-    if not there:
-        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
-    if taken:
-        raise UsageError(f"--plot: {plot} is not a file; give another name")
-
-
 @contextmanager
 def _progress() -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -217,7 +193,7 @@ def bench_picture(result: BenchResult, name: str) -> RenderableType:
     )
     methods = (_methods(result), _conditioned(result.conditioned), _axis(result))
     answers = (*methods, _certificates(result), _gaps(result))
-    return Group(head, "", *answers, _growth(result), _resources(result))
+    return Group(head, "", *answers, _resources(result))
 
 
 def _methods(result: BenchResult) -> Table:
@@ -269,10 +245,7 @@ def _conditioned(ours: ConditionedTimes | None) -> str:
 
 
 def _axis(result: BenchResult) -> str:
-    return (
-        f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}. "
-        f"The frozen policy's QP: DAQP {_us(result.qp_us.daqp)}, Clarabel {_us(result.qp_us.clarabel)}.\n"
-    )
+    return f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}.\n"
 
 
 def _certificates(result: BenchResult) -> Table:
@@ -297,25 +270,6 @@ def _gaps(result: BenchResult) -> str:
     )
 
 
-def _growth(result: BenchResult) -> Table:
-    table = Table(title="Growth", title_justify="left")
-    for heading in ("", "frozen", "mixture"):
-        table.add_column(heading, justify="right" if heading else "left")
-    longer, more = result.growth_h, result.growth_axes
-    for steps, frozen, mixture in zip(longer.horizon, longer.frozen_us, longer.mixture_us, strict=True):
-        table.add_row(f"one axis, H = {steps}", _us(frozen), _us(mixture))
-    table.add_row(
-        "exponent of H (the longest three)",
-        _number(longer.frozen_exponent),
-        f"{_number(longer.mixture_exponent)} ({_number(longer.mixture_exponent_last)})",
-        end_section=True,
-    )
-    for count, frozen, mixture in zip(more.axes, more.frozen_us, more.mixture_us, strict=True):
-        table.add_row("1 axis" if count == 1 else f"{count} axes", _us(frozen), _us(mixture))
-    table.add_row("exponent of their number", _number(more.frozen_exponent), _number(more.mixture_exponent))
-    return table
-
-
 def _resources(result: BenchResult) -> str:
     memory = result.memory_mb
     return (
@@ -335,7 +289,3 @@ def _ms(milliseconds: float) -> str:
 
 def _us(microseconds: float | None) -> str:
     return "-" if microseconds is None else f"{microseconds:.0f} µs"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

@@ -286,8 +286,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     if design is None:
         raise ValueError("an SMPC without a design")
     library = None if recipe.library is None else decode(recipe.library).library
-    solver = build_solver(design, config, library)
-    decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+    decider = OneByOne(build_solver(design, config, library), design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 
