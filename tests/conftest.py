@@ -22,7 +22,7 @@ LONGEST = (
     "test_library_solver", "test_fly", "test_check_cmd", "test_sources", "test_policies", "test_paper_cmd",
     "test_scaling", "test_bench", "test_whatif_cmd", "test_faults_storage", "test_hand_over_restart",
     "test_foreign_stream", "test_bench_loop", "test_natnet_flight", "test_engagement", "test_outlook", "test_viewers",
-    "test_loopback", "test_relay", "test_take_off", "test_campaign_refly", "test_check_axes", "test_synthesis",
+    "test_loopback", "test_relay", "test_take_off", "test_linear_world_flight", "test_check_axes", "test_synthesis",
 )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,21 +18,15 @@ from rich.console import Group, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
-from rich.text import Text
 
-from logs.recording.reader import records
-from logs.recording.summary import FlightSummary, count, render
-from uavctl.build.controller import design_of
 from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import WORKERS, Common, messages
-from uavctl.cli.flying import Engagement, new_recording, stop_on_signals
-from uavctl.cli.loopback import lockstep
-from uavctl.cli.prepare import prepare, ready_library
+from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
 from uavctl.lab.campaign.pool import Workers, cluster, fly_tasks, processes
-from uavctl.lab.campaign.rerun import Agreement, Reflight, again, agreement, reflight
-from uavctl.lab.campaign.results import SMPC, CellSummary, read_cells, summarise
+from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import MOST_RUNS, read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
 from uavctl.lab.campaign.tasks import Columns, Work, cells_of, document, tasks_of
@@ -44,78 +37,10 @@ from uavctl.lab.campaign.trials import (
     places_of,
     read_trial,
     summarise_trial,
-    told_trial,
     trial_document,
     trial_tasks,
 )
 from uavctl.lab.trial import COUNTS, MEANING, SHOWN
-from uavctl.records import Truth
-
-# One run of a campaign flown again in virtual time, recorded and reported like any flight.
-
-
-class Reflown(msgspec.Struct, frozen=True, kw_only=True):
-    """A run of a campaign as a flight."""
-
-    summary: FlightSummary
-    agreement: Agreement
-
-
-def refly_of(folder: Path, which: str, out: Path | None) -> Reflown:
-    """Fly a run of a campaign again; the recording and its page go to `out`.
-
-    Args:
-        out: Folder; a new one below `flights/` if it is not given.
-
-    Raises:
-        UsageError: There is no such run, or it is a baseline's.
-        UavctlError: The campaign cannot be read, or this version would make another design of it.
-    """
-    cell, run = _numbers(which)
-    if told_trial(folder) is not None:
-        raise UsageError(
-            f"{folder} holds flights of the quadrotor; fly one again by `uavctl loopback` with its configuration, "
-            "sim.plant = quadrotor and sim.seed as in runs.parquet"
-        )
-    _check_kind(folder, cell)
-    found = again(folder, cell, run, ready_library)
-    return fly_again(reflight(found, f"{found.campaign}, cell {cell}, run {run}"), out)
-
-
-def fly_again(flight: Reflight, out: Path | None) -> Reflown:
-    """Fly a run, record it and compare it with what the campaign flew."""
-    config = flight.config
-    as_flown = Engagement(config, take_off_m=None, goto=False)
-    with new_recording(out, "refly", config.log.free_bytes) as path:
-        summary = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
-        return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
-
-
-def refly_picture(reflown: Reflown) -> RenderableType:
-    """The flight's summary, and how well it agrees."""
-    one = reflown.agreement
-    text = (
-        f"Beside the campaign, over {count(one.steps, 'step')} of plans: states within {one.largest_state:.1e}, "
-        f"inputs within {one.largest_input:.1e}; {'agrees' if one.agrees else 'differs'} (to {one.tolerance:g})"
-    )
-    return Group(render(reflown.summary), Text(f"{text}{': ' if one.reason else ''}{one.reason}"))
-
-
-def _numbers(which: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+):(\d+)", which)
-    if found is None:
-        raise UsageError(f"--refly {which}: names no run; give CELL:RUN, as in 0:17")
-    return int(found[1]), int(found[2])
-
-
-def _check_kind(folder: Path, index: int) -> None:
-    cells = [cell for cell in read_cells(folder) if cell.index == index]
-    if cells and cells[0].kind != SMPC:
-        raise UsageError(
-            f"cell {index} is flown by {cells[0].controller} ({cells[0].kind}), a baseline without a flight "
-            "controller; runs of an SMPC can be flown again"
-        )
-
 
 # A campaign of flights of the quadrotor, as tables for the terminal.
 
@@ -193,7 +118,7 @@ class CampaignResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def campaign(
-    spec: Annotated[Path, Parameter(help="TOML file of the campaign; with --refly its folder", show_default=False)],
+    spec: Annotated[Path, Parameter(help="TOML file of the campaign", show_default=False)],
     *,
     runs: Annotated[
         int | None,
@@ -207,9 +132,6 @@ def campaign(
     resume: Annotated[
         bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
     ] = False,
-    refly: Annotated[
-        str | None, Parameter(metavar="CELL:RUN", help="fly one run of a campaign once more, into a recording in --out")
-    ] = None,
     json: Annotated[
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
     ] = False,
@@ -221,16 +143,10 @@ def campaign(
     The results do not depend on the number of workers, nor on where they are. Every finished task is kept at once: a
     campaign that was interrupted or killed goes on with --resume.
     """
-    if refly is not None and (resume or (runs, workers, dask) != (None, None, None)):
-        raise UsageError("--refly flies one run by itself; it goes with --out and --json only")
     if dask is not None and workers is not None:
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    if refly is not None:
-        flight = refly_of(spec, refly, out)
-        Common(json=json).show(flight, lambda: refly_picture(flight))
-        return 0 if flight.summary.steps else 1
     given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
     begun = time.perf_counter()
     store = Store(out or _new_folder(given.name), given.schema)

@@ -213,7 +213,6 @@ def _sections(view: CampaignView) -> Iterator[PageSection]:
     yield _age_section(view)
     yield _cells_section(view)
     yield _failures_section(view)
-    yield _again_section(view)
 
 
 def _compared_section(view: CampaignView) -> PageSection:
@@ -413,23 +412,6 @@ def _table(
     text = page.table(columns, rows, numbers).replace('class="many"', 'class="many dense"', 1)
     below = "".join(f'<tr><td colspan="{len(columns)}">{escape(remark)}</td></tr>' for remark in remarks)
     return text.replace("</tbody>", f"{below}</tbody>", 1)
-
-
-def _again_section(view: CampaignView) -> PageSection:
-    """How to look at one run, by the example of the costliest of an SMPC."""
-    flown = [cell for cell in view.cells if cell.kind == SMPC and cell.cost is not None]
-    if not flown:
-        return PageSection("A run again", "", page.paragraph("Runs of an SMPC can be flown again; there are none."))
-    cell = max(flown, key=lambda one: one.cost or 0.0)
-    runs = view.results.runs[cell.index]
-    worst = int(runs.index[runs["cost"].argmax()])
-    note = (
-        "Any run of an SMPC can be flown again by its number, through the flight controller, MAVLink and the recorder, "
-        f"with its disturbances and losses. The costliest run of cell {cell.index} ({cell.controller}, "
-        f"{view.place(group_of(cell))}):"
-    )
-    command = f"uavctl campaign --refly {cell.index}:{worst} --out flights/cell-{cell.index}-run-{worst} FOLDER"
-    return PageSection("A run again", note, f'<div class="card"><pre>{escape(command)}</pre></div>')
 
 
 # The page of a campaign in the world of the quadrotor: one HTML file, complete in itself.

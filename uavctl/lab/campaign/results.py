@@ -129,15 +129,6 @@ def read_results(folder: Path) -> Results:
     )
 
 
-def read_cells(folder: Path) -> list[CellFigures]:
-    """The cells of a campaign, finished or not.
-
-    Raises:
-        UavctlError: `campaign.json` is missing or damaged.
-    """
-    return _told(folder).cells
-
-
 def _told(folder: Path) -> _Document:
     try:
         return msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=_Document)

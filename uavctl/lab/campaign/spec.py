@@ -289,20 +289,6 @@ def compose(spec: CampaignSpec, configuration: str, told: SpecProblems | None = 
     )
 
 
-def campaign_of(document: Mapping[str, object]) -> Campaign:
-    """The campaign of its `campaign.json`.
-
-    Raises:
-        ConfigError: It is not one that this version understands.
-    """
-    try:
-        spec = msgspec.convert(document.get("spec"), CampaignSpec)
-        configuration = msgspec.convert(document.get("configuration"), str)
-    except msgspec.ValidationError as error:
-        raise ConfigError((f"campaign.json: {error}; use the version that flew the campaign",)) from error
-    return compose(spec, configuration)
-
-
 def _one_a_step(believed: Config) -> Config:
     """A campaign's links carry one position a step: a scheme that counts on all there are has to know."""
     if not believed.conditioned:

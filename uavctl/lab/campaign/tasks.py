@@ -55,13 +55,6 @@ def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
     )
 
 
-def cell_of(campaign: Campaign, index: int, library_for: LibraryFor) -> Cell:
-    """One cell alone; see `cells_of`."""
-    which = _product(campaign)[index]
-    recipe = _recipe(campaign, (which[0], campaign.believed_link(*which[:2])), library_for)
-    return _cell(campaign, index, which, recipe)
-
-
 Which = tuple[int, int, int, int]  # indices of controller, link, disturbance and plant
 
 
