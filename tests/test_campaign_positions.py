@@ -18,7 +18,8 @@ from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.controllers import met, sight_of
 from uavctl.lab.campaign.intervals import worst_step
-from uavctl.lab.campaign.tasks import Cell, Columns, flown, fly_task, tasks_of
+from uavctl.lab.campaign.pool import Columns
+from uavctl.lab.campaign.tasks import Cell, flown, fly_task, tasks_of
 from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp

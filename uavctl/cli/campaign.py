@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -25,11 +25,11 @@ from uavctl.cli.flying import stop_on_signals
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
-from uavctl.lab.campaign.pool import Workers, cluster, fly_tasks, processes
+from uavctl.lab.campaign.pool import Columns, Work, Workers, cluster, fly_tasks, processes
 from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import MOST_RUNS, read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
-from uavctl.lab.campaign.tasks import Columns, Work, cells_of, document, tasks_of
+from uavctl.lab.campaign.tasks import cells_of, document, tasks_of
 from uavctl.lab.campaign.trials import SCHEMA as TRIALS
 from uavctl.lab.campaign.trials import (
     TrialSummary,
@@ -45,20 +45,30 @@ from uavctl.lab.trial import COUNTS, MEANING, SHOWN
 # A campaign of flights of the quadrotor, as tables for the terminal.
 
 
-_TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
+S = TypeVar("S", CellSummary, TrialSummary)
 
 
-class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a campaign of flights came to."""
+class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
+    """What a campaign came to."""
 
     name: str
     runs_file: str
     report: str
     wall_s: float
-    cells: list[TrialSummary]
+    cells: list[S]
 
 
-def trial_picture(result: TrialResult) -> RenderableType:
+def _closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Sequence[str]) -> Iterator[str]:
+    """What stands below the tables: who was refused, remarks, and where the files are."""
+    yield from (f"Refused: {escape(text)}" for text in dict.fromkeys(refused))
+    yield from remarks
+    yield f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
+
+
+_TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
+
+
+def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
     """A table for each scenario."""
     # What is the same in all cells needs no column, and of what only tells of ours the page has more.
     lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
@@ -78,17 +88,11 @@ def trial_picture(result: TrialResult) -> RenderableType:
             told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
             table.add_row(*map(escape, names), *told)
         tables.append(table)
-    refusals = dict.fromkeys(
-        f"{cell.place.controller}, {cell.place.link}: {cell.place.refused}"
-        for cell in result.cells
-        if cell.place.refused
-    )
-    remarks = [f"Refused: {escape(text)}" for text in refusals]
+    places = [cell.place for cell in result.cells]
+    refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
-    if failed:
-        remarks.append(f"{failed} flights failed; runs.parquet says why")
-    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
-    return Group(*tables, *remarks, MEANING, files)
+    remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
+    return Group(*tables, *_closing(result, refused, [*remarks, MEANING]))
 
 
 def _text(value: object) -> str:
@@ -105,16 +109,6 @@ except ImportError as missing:
 
 
 _NAMES = ("controller", "link", "disturbance", "plant")
-
-
-class CampaignResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a campaign came to."""
-
-    name: str
-    runs_file: str
-    report: str
-    wall_s: float
-    cells: list[CellSummary]
 
 
 def campaign(
@@ -162,12 +156,11 @@ def campaign(
     except KeyboardInterrupt:
         _tell(_interrupted(store, spec, runs))
         return INTERRUPTED
-    shared = {"name": given.name, "runs_file": str(runs_file), "report": str(report)}
-    return given.conclude(store.folder, shared, time.perf_counter() - begun, json)
+    return given.conclude(store, runs_file, report, time.perf_counter() - begun, json)
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Given(Generic[S]):
     """A campaign of either world."""
 
     name: str  # its name
@@ -176,10 +169,23 @@ class _Given:
     # Makes what `campaign.json` holds, and all tasks
     prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
     write: Callable[[Path], Path]  # writes the page into a folder
-    conclude: Callable[[Path, dict[str, str], float, bool], int]  # shows what came of a folder; gives the exit code
+    summarise: Callable[[Path], list[S]]  # the figures of a folder's cells
+    picture: Callable[[CampaignResult[S]], RenderableType]
+
+    def conclude(self, store: Store, runs_file: Path, report: Path, wall_s: float, json: bool) -> int:
+        """Show what came of it; the exit code."""
+        result = CampaignResult(
+            name=self.name,
+            runs_file=str(runs_file),
+            report=str(report),
+            wall_s=wall_s,
+            cells=self.summarise(store.folder),
+        )
+        Common(json=json).show(result, lambda: self.picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
 
 
-def _of_runs(spec: Path, runs: int | None) -> _Given:
+def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
     """A campaign in the linear world."""
     read, text = read_campaign(spec, runs)
 
@@ -187,15 +193,10 @@ def _of_runs(spec: Path, runs: int | None) -> _Given:
         cells = cells_of(read, ready_library)
         return document(read, cells), list(tasks_of(cells))
 
-    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
-        result = CampaignResult(**shared, wall_s=wall_s, cells=summarise(folder))
-        Common(json=json).show(result, lambda: _picture(result))
-        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
-
-    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, conclude)
+    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, summarise, _picture)
 
 
-def _of_trials(path: Path, runs: int | None) -> _Given:
+def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
     """A campaign in the world of the quadrotor."""
     spec, text = read_trial(path, runs)
 
@@ -203,13 +204,10 @@ def _of_trials(path: Path, runs: int | None) -> _Given:
         places = places_of(spec, ready_library)
         return trial_document(spec, places), list(trial_tasks(spec, places))
 
-    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
-        _, cells = summarise_trial(folder)
-        result = TrialResult(**shared, wall_s=wall_s, cells=cells)
-        Common(json=json).show(result, lambda: trial_picture(result))
-        return 0 if any(cell.runs > cell.failed for cell in cells) else 1
+    def summaries(folder: Path) -> list[TrialSummary]:
+        return summarise_trial(folder)[1]
 
-    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, conclude)
+    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, summaries, trial_picture)
 
 
 def _new_folder(name: str) -> Path:
@@ -260,7 +258,7 @@ def _tell(text: str) -> None:
     messages().print(escape(text), soft_wrap=True)
 
 
-def _picture(result: CampaignResult) -> RenderableType:
+def _picture(result: CampaignResult[CellSummary]) -> RenderableType:
     # What is the same in all cells needs no column.
     lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
     table = Table(title=f"Campaign {result.name}", title_justify="left")
@@ -277,13 +275,11 @@ def _picture(result: CampaignResult) -> RenderableType:
             _cost(cell.cost, cell.cost_ci),
         )
         table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
-    refusals = dict.fromkeys(f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused)
-    told = [f"Refused: {escape(text)}" for text in refusals]
+    refused = [f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused]
     note = (
         "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
     )
-    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
-    return Group(table, *told, note, files)
+    return Group(table, *_closing(result, refused, [note]))
 
 
 def _percent(rate: float | None, interval: tuple[float, float] | None) -> str:

@@ -155,7 +155,6 @@ def _promise(view: CampaignView) -> Iterator[str]:
 
 
 PAGE = "report.html"
-_SPECIFICATION = "campaign.toml"
 _SHOWN_FAILURES = 50
 _PROMISED = "allowed by the SMPC's design"
 _HOW_SURE = (
@@ -187,13 +186,24 @@ def write_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
+    return _write(folder, report_html(read_results(folder)))
+
+
+def _write(folder: Path, text: str) -> Path:
     path = folder / PAGE
-    text = report_html(read_results(folder))
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UavctlError(f"{path}: cannot be written ({error.strerror}); make room or choose another place") from error
     return path
+
+
+def _specification(folder: Path) -> str:
+    """The campaign's file, folded; nothing where it is not there."""
+    try:
+        return page.folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
+    except OSError:
+        return ""
 
 
 def report_html(results: Results) -> str:
@@ -229,11 +239,7 @@ def _compared_section(view: CampaignView) -> PageSection:
         ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
         ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
     ]
-    try:
-        specification = page.folded("Specification", (results.folder / _SPECIFICATION).read_text(encoding="utf-8"))
-    except OSError:
-        specification = ""
-    return PageSection("What was compared", "", page.facts(rows) + specification)
+    return PageSection("What was compared", "", page.facts(rows) + _specification(results.folder))
 
 
 def _verdict_section(view: CampaignView) -> PageSection:
@@ -439,14 +445,7 @@ def write_trial_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    path = folder / PAGE
-    told, cells = summarise_trial(folder)
-    try:
-        specification = (folder / SPECIFICATION).read_text(encoding="utf-8")
-        path.write_text(trial_html(told, cells, specification), encoding="utf-8")
-    except OSError as error:
-        raise UavctlError(f"{path}: cannot be written ({error.strerror}); make room or choose another place") from error
-    return path
+    return _write(folder, trial_html(*summarise_trial(folder), _specification(folder)))
 
 
 def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: str = "") -> str:
@@ -495,8 +494,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
     rows += [
         (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
     ]
-    folded = page.folded("Specification", specification) if specification else ""
-    yield PageSection("What was compared", _OWN, page.facts(rows) + folded)
+    yield PageSection("What was compared", _OWN, page.facts(rows) + specification)
     for number, (scenario, shown) in enumerate(SHOWN.items()):
         mine = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
         if not mine:
@@ -506,8 +504,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
             (*_where(cell), cell.place.controller, *(one.told(cell.values[one.key]) for one in shown), _modes(cell))
             for cell in mine
         ]
-        numbers = frozenset(range(5, 5 + len(shown)))
-        body = page.table(columns, table, numbers).replace('class="many"', 'class="many dense"', 1)
+        body = _table(columns, table, frozenset(range(5, 5 + len(shown))))
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -17,6 +16,7 @@ from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
+from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import SMPC
 from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, fly
@@ -198,8 +198,6 @@ def _first_s(near: NDArray[np.bool_], dt_s: float) -> Array:
 # A task of a campaign: some runs of one cell, in; a row of figures for each, out. The same wherever it is done.
 
 
-Columns = dict[str, NDArray[np.generic]]
-
 _MET = ("decisions", "infeasible", "slack_used", "fallbacks")
 _WHOLE = ("steps", "state_violations", "input_violations", "saturated", "max_age", *_MET)
 _WAYS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")
@@ -207,60 +205,20 @@ _REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap", *_WAYS)
 _AT_LIMIT = 1e-9
 
 
-class Work(Protocol):
-    """What a worker is given: some runs of a cell, in any world."""
-
-    @property
-    def cell(self) -> int:
-        """Index of the cell."""
-        ...
-
-    @property
-    def runs(self) -> int:
-        """How many."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
-        ...
-
-    def fly(self) -> Columns:
-        """Fly the runs; what raises is told in a row, and stops nothing."""
-        ...
-
-    def lost(self, error: str) -> Columns:
-        """The rows of runs that all ended without figures."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class Task:
+class Task(Work):
     """Runs `first` … `first` + `runs` - 1 of a cell."""
 
-    cell: int
-    first: int
-    runs: int
     setting: Setting
     recipe: Recipe
-
-    @property
-    def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
-        return name_of(self.cell, self.first)
 
     def fly(self) -> Columns:
         """See `fly_task`."""
         return fly_task(self)
 
     def lost(self, error: str) -> Columns:
-        """The rows of a task whose runs all ended without figures."""
+        """See `Work`."""
         return _without_figures(self, self.first, self.runs, error)
-
-
-def name_of(cell: int, first: int) -> str:
-    """Name of a task that begins with a run of a cell; sorts as the rows do."""
-    return f"{cell:05d}-{first:08d}"
 
 
 def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:

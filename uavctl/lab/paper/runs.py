@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import reduce
-from multiprocessing import get_context
+from functools import cache, partial, reduce
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,6 +19,7 @@ from scipy.special import gammaincinv
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
+from uavctl.lab.campaign.pool import processes
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions, OneByOne
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -299,7 +297,6 @@ Advance = Callable[[int], None]
 CHUNK = 1000  # runs flown together; the same whoever flies them, so that workers change nothing
 HERE_UP_TO = 500  # runs that are not worth another process
 DRAWN = 200  # runs whose trajectories are kept, for the figures
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,32 +355,14 @@ def _flier(
         crew = RunnerOfDesign(setups)
         yield lambda tasks: map(crew.fly, tasks)
         return
-    with _single_threaded(), TemporaryDirectory() as folder:
-        # Not as an argument: a process that ends while it is being sent more than a pipe holds would be waited for.
+    with processes(workers) as pool, TemporaryDirectory() as folder:
+        # Not with each task: designs and libraries are larger than what a pipe holds.
         path = Path(folder) / "setups"
         path.write_bytes(pickle.dumps(list(setups)))
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _join, (path,))
         try:
-            yield lambda tasks: pool.map(_fly, tasks)
+            yield lambda tasks: pool.each(partial(_fly, path), tasks)
         except BrokenProcessPool as error:
             raise UavctlError("a worker process ended before its runs; take fewer --workers, or free memory") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Processes started here calculate in one thread: as many would only wait for each other, and round differently."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class RunnerOfDesign:
@@ -400,12 +379,11 @@ class RunnerOfDesign:
         return Flights(total(chunk, self._designs[task.which]), chunk.flown.states[:kept].copy())
 
 
-_crew: list[RunnerOfDesign] = []  # of a worker process
+@cache
+def _crew(path: Path) -> RunnerOfDesign:
+    """Of a worker process; made for its first task."""
+    return RunnerOfDesign(pickle.loads(path.read_bytes()))
 
 
-def _join(path: Path) -> None:
-    _crew.append(RunnerOfDesign(pickle.loads(path.read_bytes())))
-
-
-def _fly(task: ChunkTask) -> Flights:
-    return _crew[0].fly(task)
+def _fly(path: Path, task: ChunkTask) -> Flights:
+    return _crew(path).fly(task)
