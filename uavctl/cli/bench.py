@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Annotated
@@ -52,7 +52,7 @@ def loop_picture(result: LoopBench) -> RenderableType:
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
         table.add_row(f"[bold]{name}")
         for label, spread in _spreads(run):
-            table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in _values(spread)))
+            table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in msgspec.structs.astuple(spread)))
     head = (
         f"Median of {result.runs} runs of {result.seconds:g} s each, a position in every tick of {result.tick_s:g} s."
     )
@@ -69,10 +69,6 @@ def _spreads(run: LoopRun) -> tuple[tuple[str, TimeQuantiles], ...]:
         ("tick of an empty loop late by", run.empty_lateness_us),
         ("in the control core", run.step_us),
     )
-
-
-def _values(spread: TimeQuantiles) -> tuple[float, float, float, float]:
-    return spread.p50, spread.p99, spread.p999, spread.max
 
 
 def _rest(name: str, run: LoopRun) -> str:
@@ -273,14 +269,10 @@ def _gaps(result: BenchResult) -> str:
 def _resources(result: BenchResult) -> str:
     memory = result.memory_mb
     return (
-        f"Library made in {result.library_s:.1f} s ({_sum(result.library_policies)} policies, "
+        f"Library made in {result.library_s:.1f} s ({' + '.join(map(str, result.library_policies))} policies, "
         f"{result.library_bytes / 1e3:.0f} kB), ready in {result.ready_s:.2f} s. "
         f"Peak memory: {memory.before:.0f} MB before, {memory.library:.0f} with it, {memory.after:.0f} at the end."
     )
-
-
-def _sum(policies: Sequence[int]) -> str:
-    return " + ".join(map(str, policies))
 
 
 def _ms(milliseconds: float) -> str:

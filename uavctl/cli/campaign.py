@@ -148,7 +148,8 @@ def campaign(
     try:
         described, tasks = given.prepare()
         with store.opened(described, given.text, resume):
-            if not store.complete() and not _fly(store, tasks, _crew(dask, workers)):
+            crew = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
+            if not store.complete() and not _fly(store, tasks, crew):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
             _tell("writing the page")
@@ -213,10 +214,6 @@ def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
 def _new_folder(name: str) -> Path:
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
     return Path("flights") / f"{stamp}-{name.replace(' ', '-')}"
-
-
-def _crew(dask: str | None, workers: int | None) -> AbstractContextManager[Workers]:
-    return processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
 
 
 def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:

@@ -192,7 +192,7 @@ class BatchSmpc:
         (who,) = np.nonzero(playing)
         asked[who] = self._plans[who, index[who]]
         (lost,) = np.nonzero(~playing)
-        asked[lost] = self._braking(x[lost])
+        asked[lost] = -self._brake * x[lost][:, list(self._plant.velocity_index)] @ self._input_of_accel.T
         self.tally.fallbacks[lost] += 1
         return asked
 
@@ -207,7 +207,3 @@ class BatchSmpc:
         tally.infeasible[who] += ~answers.solved
         tally.slack_used[who] += answers.solved & (answers.slack > KEPT)
         tally.largest_gap[found] = np.maximum(tally.largest_gap[found], answers.gap[answers.solved])
-
-    def _braking(self, x: Array) -> Array:
-        """Inputs that brake the predicted velocities (M, n_x)."""
-        return -self._brake * x[:, list(self._plant.velocity_index)] @ self._input_of_accel.T

@@ -65,7 +65,9 @@ def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
         w: W (n_w, n_w).
         normal: Standard normal draws (N, T, n_w), see `Chances.normal`.
     """
-    shaped = spec.scale * _shaped(spec, normal) @ _root(w)
+    values, vectors = np.linalg.eigh(w)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # the symmetric one, which is unique
+    shaped = spec.scale * _shaped(spec, normal) @ root
     return np.asarray(shaped + spec.bias * np.sqrt(np.diag(w)), dtype=np.float64)
 
 
@@ -83,12 +85,6 @@ def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
             gusts[:, k] = spec.memory * gusts[:, k - 1] + np.sqrt(1.0 - spec.memory**2) * normal[:, k]
         return gusts
     return normal
-
-
-def _root(w: Array) -> Array:
-    """The symmetric root of W: there is one, and it is unique, for every covariance."""
-    values, vectors = np.linalg.eigh(w)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)
 
 
 # What a cell's runs meet, whoever flies them: plant, limits, costs, start, link, disturbance.

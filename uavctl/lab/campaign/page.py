@@ -501,16 +501,16 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
             continue
         columns = ("vehicle", "cameras", "link", "air", "controller", *(one.heading for one in shown), "ended in")
         table = [
-            (*_where(cell), cell.place.controller, *(one.told(cell.values[one.key]) for one in shown), _modes(cell))
+            (
+                *(*_where(cell), cell.place.controller),
+                *(one.told(cell.values[one.key]) for one in shown),
+                ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
+            )
             for cell in mine
         ]
         body = _table(columns, table, frozenset(range(5, 5 + len(shown))))
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
-
-
-def _modes(cell: TrialSummary) -> str:
-    return ", ".join(f"{mode} {number}" for mode, number in cell.modes.items())
 
 
 def _amiss(cells: Sequence[TrialSummary]) -> PageSection:

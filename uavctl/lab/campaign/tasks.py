@@ -21,7 +21,6 @@ from uavctl.lab.campaign.results import SMPC
 from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, fly
 from uavctl.lab.trial import NEAR_M, NEARER_M, room_of, usable_seen
-from uavctl.smpc.baselines import PidGains
 from uavctl.smpc.batch import Tally
 
 # The cells of a campaign: the product of its controllers, links, disturbances and plants, in the order given.
@@ -90,7 +89,7 @@ def _cell(campaign: Campaign, index: int, which: Which, recipe: Recipe | str) ->
 
 
 def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
-    """What `campaign.json` holds: enough to fly every run again."""
+    """What `campaign.json` holds."""
     spec = campaign.spec
     return {
         "version": VERSION,
@@ -108,7 +107,7 @@ def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
 def told(cell: Cell) -> dict[str, object]:
     """What `campaign.json` holds of a cell."""
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
-    design = None if recipe is None else recipe.design
+    design, gains = (None, None) if recipe is None else (recipe.design, recipe.gains)
     smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
     delta_u = None if smpc is None else smpc.delta_u
     return {
@@ -122,7 +121,7 @@ def told(cell: Cell) -> dict[str, object]:
         "library_id": None if recipe is None else recipe.library_id,
         "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
         "promised_u": None if delta_u is None else 1.0 - delta_u,
-        "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
+        "gains": None if gains is None else {one.name: getattr(gains, one.name).tolist() for one in fields(gains)},
         "link_loss": _plain_loss(cell.setting.link),
         "usable_room": None if smpc is None or recipe is None else _usable(recipe),
         "refused": cell.refused,
@@ -136,10 +135,6 @@ def _usable(recipe: Recipe) -> float | None:
     except DesignError:
         return None
     return share if math.isfinite(share) else None
-
-
-def _gains(gains: PidGains) -> dict[str, list[float]]:
-    return {field.name: getattr(gains, field.name).tolist() for field in fields(gains)}
 
 
 def _plain_loss(link: LinkConfig) -> float | None:

@@ -94,7 +94,7 @@ def least_settled_cost(
     p, noise = lqr(plant, q_x, q_u).p, plant.e @ plant.w @ plant.e.T
     unknown = _growing(plant.a, noise)
     grid = _Grid(_REACH * np.sqrt(np.diagonal(noise)), fineness.states)
-    low, high = _sides(input_set)
+    ((low,), (high,)) = input_set.bounds
     inputs = np.linspace(low, high, fineness.inputs)
     ahead = (grid.points @ plant.a.T)[:, None] + inputs[:, None] * plant.b.T  # y (G, U, 2)
     known = _square(grid.points, q_x - p)
@@ -145,11 +145,6 @@ def _least(values: Array) -> Array:
 def _square(points: Array, weight: Array) -> Array:
     """x'W x of points (…, 2)."""
     return np.asarray(np.einsum("...i,ij,...j->...", points, weight, points), dtype=np.float64)
-
-
-def _sides(limits: Polytope) -> tuple[float, float]:
-    rows = limits.c[:, 0]
-    return float((limits.b[rows < 0] / rows[rows < 0]).max()), float((limits.b[rows > 0] / rows[rows > 0]).min())
 
 
 # What takes a minute or two: which schedules make a design, complexity over τ, and the least settled cost.

@@ -46,18 +46,14 @@ class Setup:
 
 
 class Watched:
-    """A decider whose plans are held against (19c): the last mean state is the target.
-
-    Attributes:
-        missed: Plans so far that end elsewhere.
-    """
+    """A decider whose plans are held against (19c): the last mean state is the target."""
 
     def __init__(self, decider: Decider, design: Design) -> None:
         a, b, steps = design.plant.a, design.plant.b, design.horizon
         self._decider, self._target = decider, design.target
         self._of_x = np.linalg.matrix_power(a, steps)
         self._of_inputs = np.hstack([np.linalg.matrix_power(a, steps - 1 - t) @ b for t in range(steps)])
-        self.missed = 0
+        self.missed = 0  # plans so far that end elsewhere
 
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
@@ -177,51 +173,30 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Totals of runs of T steps; *settled* is the second half of a run.
+    """Totals of runs of T steps; *settled* is the second half of a run."""
 
-    Attributes:
-        cost: Summed cost of a run.
-        settled_cost: Mean stage cost of a run's settled steps.
-        trend: Mean stage cost of a run's last quarter minus that of the quarter before.
-        runs_outside: Runs that left X.
-        runs_asking: Runs in which an input outside U was asked for.
-        failed: Runs that ended in numbers that are not finite.
-        decisions, infeasible, slack_used, missed, fallbacks: See `Chunk`.
-        outside: Runs outside X after each step (T,).
-        asking: Runs that ask for an input outside U, in each step (T,).
-        ages: Runs of each age in each step (T, T).
-        arrived: Runs by the first step in which they were in the ellipsoid (T+2,); the last entry: never.
-        ended_inside: Runs whose last state is in the ellipsoid.
-        settled_inside: Settled states in the ellipsoid.
-        settled: Number of settled states.
-        settled_sum: Their sum (n_x,).
-        settled_squares: Sum of their outer products (n_x, n_x).
-        largest_gap: Largest certified relative gap of a plan.
-        closest: Least room to each state limit (m_x,), negated so that the largest is the closest.
-    """
-
-    cost: Moments
-    settled_cost: Moments
-    trend: Moments
-    runs_outside: int
-    runs_asking: int
-    failed: int
-    decisions: int
+    cost: Moments  # summed cost of a run
+    settled_cost: Moments  # mean stage cost of a run's settled steps
+    trend: Moments  # mean stage cost of a run's last quarter minus that of the quarter before
+    runs_outside: int  # runs that left X
+    runs_asking: int  # runs in which an input outside U was asked for
+    failed: int  # runs that ended in numbers that are not finite
+    decisions: int  # this and the next four as in `Chunk`
     infeasible: int
     slack_used: int
     missed: int
     fallbacks: int
-    outside: Counts
-    asking: Counts
-    ages: Counts
-    arrived: Counts
-    ended_inside: int
-    settled_inside: int
-    settled: int
-    settled_sum: Array
-    settled_squares: Array
-    largest_gap: float
-    closest: Array
+    outside: Counts  # runs outside X after each step (T,)
+    asking: Counts  # runs that ask for an input outside U, in each step (T,)
+    ages: Counts  # runs of each age in each step (T, T)
+    arrived: Counts  # runs by the first step in which they were in the ellipsoid (T+2,); the last entry: never
+    ended_inside: int  # runs whose last state is in the ellipsoid
+    settled_inside: int  # settled states in the ellipsoid
+    settled: int  # number of settled states
+    settled_sum: Array  # their sum (n_x,)
+    settled_squares: Array  # sum of their outer products (n_x, n_x)
+    largest_gap: float  # largest certified relative gap of a plan
+    closest: Array  # least room to each state limit (m_x,), negated so that the largest is the closest
 
     def __add__(self, other: Totals) -> Totals:
         def joined(name: str) -> Any:
