@@ -50,36 +50,6 @@ class Counters:
     oversized: int = 0
 
 
-class UnderWay:
-    """The packets of a channel that have not arrived yet.
-
-    Attributes:
-        counters: What happened so far.
-    """
-
-    def __init__(self) -> None:
-        self.counters = Counters()
-        self._pending: list[tuple[int, int, int, bytes]] = []  # (arrival, unheld arrival, order, data)
-        self._order = 0
-
-    def _let_through(self, arrival_ns: int, unheld_ns: int, data: bytes) -> None:
-        self._order += 1
-        heapq.heappush(self._pending, (arrival_ns, unheld_ns, self._order, data))
-
-    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
-        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
-        due = []
-        while self._pending and self._pending[0][0] <= to_ns:
-            arrival_ns, *_, data = heapq.heappop(self._pending)
-            due.append((arrival_ns, data))
-        return due
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next arrival [ns], None if nothing is under way."""
-        return self._pending[0][0] if self._pending else None
-
-
 class _Fate(NamedTuple):
     """What becomes of a packet."""
 
@@ -91,7 +61,7 @@ class _Fate(NamedTuple):
     oversized: bool
 
 
-class Channel(UnderWay):
+class Channel:
     """One direction of a radio link.
 
     Loss is Bernoulli, Gilbert-Elliott (the chain starts in the good state and steps before each packet) or
@@ -100,6 +70,9 @@ class Channel(UnderWay):
     uniform draw up to `jitter_s`, or as the trace was, so packets may overtake each other. A duplicate has its own
     delay, but with a trace. A bit flip, a cut and padding act on a packet before it is doubled. What arrives in a span
     of `held` is kept until its end.
+
+    Attributes:
+        counters: What happened so far.
 
     Args:
         link: The section `[link]`.
@@ -115,7 +88,9 @@ class Channel(UnderWay):
     ) -> None:
         if link.probability and step_ns is None:
             raise ValueError("link.probability goes by steps, so their length is needed")
-        super().__init__()
+        self.counters = Counters()
+        self._pending: list[tuple[int, int, int, bytes]] = []  # (arrival, unheld arrival, order, data)
+        self._order = 0
         self._link = link
         self._start_ns = start_ns
         self._step_ns = step_ns or 0
@@ -140,11 +115,25 @@ class Channel(UnderWay):
         for delay_s in fate.delays_s:
             # A packet that a trace loses has no delay of its own, but may be a certain one.
             arrival_ns = at_ns + (round(delay_s * 1e9) if math.isfinite(delay_s) else 0)
-            self._let_through(self._released(arrival_ns), arrival_ns, fate.data)
+            self._order += 1
+            heapq.heappush(self._pending, (self._released(arrival_ns), arrival_ns, self._order, fate.data))
 
     def pass_over(self, at_ns: int) -> None:
         """Nothing is sent at `at_ns` where a packet was due; what comes after goes as if it had been."""
         self._draw(at_ns, b"")
+
+    def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
+        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
+        due = []
+        while self._pending and self._pending[0][0] <= to_ns:
+            arrival_ns, *_, data = heapq.heappop(self._pending)
+            due.append((arrival_ns, data))
+        return due
+
+    @property
+    def next_ns(self) -> int | None:
+        """Time of the next arrival [ns], None if nothing is under way."""
+        return self._pending[0][0] if self._pending else None
 
     def _draw(self, at_ns: int, data: bytes) -> _Fate:
         link = self._link

@@ -12,7 +12,7 @@ from sim.autopilot.autopilot import Autopilot
 from sim.cameras import Cameras
 from sim.channel import Channel, earliest, within
 from sim.faults import Faults, active, with_spans
-from sim.vehicle.linear import LinearVehicle, Script, ScriptedChannel, linear_model
+from sim.vehicle.linear import LinearVehicle, linear_model
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
 from uavctl.config.types import Config
@@ -59,9 +59,6 @@ class Peers:
     from there on. It is therefore called when time moves *past* the boundary: what arrives at the
     boundary's own instant is already in it, what arrives later (on real sockets, a fraction of a
     millisecond) is not.
-
-    With a `script`, plant, start, disturbances and the channel are its, not those of the configuration: what flies
-    is the linear plant.
     """
 
     def __init__(
@@ -72,21 +69,16 @@ class Peers:
         airborne: bool = True,
         shared_link: bool = False,
         on_truth: Callable[[Truth], None] | None = None,
-        script: Script | None = None,
     ) -> None:
         config = self._config = with_spans(config)
         for_vehicle, for_cameras, for_channel, for_inertial = np.random.SeedSequence(config.sim.seed).spawn(4)
         self.vehicle: LinearVehicle | Quadrotor
-        if config.sim.plant == "quadrotor" and script is None:
+        if config.sim.plant == "quadrotor":
             self.vehicle = quadrotor(config, for_vehicle, start_ns)
         else:
-            self.vehicle = LinearVehicle(config, for_vehicle, start_ns, script)
+            self.vehicle = LinearVehicle(config, for_vehicle, start_ns)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, for_inertial, airborne=airborne)
-        self.channel: Channel | ScriptedChannel
-        if script is None:
-            self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
-        else:
-            self.channel = ScriptedChannel(script.delays_ns)
+        self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
         self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
         self._faults = Faults(config, self.vehicle, self.autopilot, self._cameras, start_ns)
         self._airborne = airborne
@@ -187,13 +179,8 @@ class Peers:
             text=self.autopilot.text,
         )
 
-    def flush(self, to_ns: int | None = None) -> None:
-        """Tell the truth of a boundary that time has reached but not passed; for the end of a run.
-
-        With `to_ns`, of that one: the vehicle alone moves on to it, and nothing more is sent.
-        """
-        if to_ns is not None:
-            self._move(to_ns)
+    def flush(self) -> None:
+        """Tell the truth of a boundary that time has reached but not passed; for the end of a run."""
         if self._truth_ns == self.now_ns:
             self._tell()
 
@@ -264,7 +251,6 @@ class World:
         on_progress: gets the seconds flown so far, after every Δt.
         start_ns: time of tick 0.
         airborne: whether the vehicle begins in the air, armed and in its external mode; else on the floor, disarmed.
-        script: plant, start, disturbances and losses of a flight that is flown again; the `Truth` at its end is told.
     """
 
     def __init__(
@@ -276,7 +262,6 @@ class World:
         *,
         start_ns: int = 0,
         airborne: bool = True,
-        script: Script | None = None,
     ) -> None:
         self._flyer = flyer
         self._on_progress = on_progress
@@ -284,9 +269,8 @@ class World:
         self._tick_ns = round(config.daemon.tick_s * 1e9)
         self._ticks_per_step = round(config.plant.dt_s / config.daemon.tick_s)
         shared = config.daemon.vehicle == config.daemon.mocap
-        self._again = script is not None
         self._ticks = 0
-        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth, script=script)
+        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth)
 
     def run(self, duration_s: float, over: Callable[[], bool] = lambda: False) -> None:
         """Fly on, all the ticks that begin within `duration_s` from the start, or until it is over."""
@@ -297,7 +281,7 @@ class World:
             self._ticks = tick + 1
             if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
                 self._on_progress((tick + 1) * self._tick_ns * 1e-9)
-        self.peers.flush(self._start_ns + round(duration_s * 1e9) if self._again else None)
+        self.peers.flush()
 
     def _tick(self, tick: int) -> None:
         at_ns = self._start_ns + tick * self._tick_ns

@@ -20,9 +20,9 @@ LONGEST = (
     "test_closed_loop", "test_operation", "test_campaign_cmd", "test_properties", "test_soak", "test_general_plants",
     "test_report", "test_sim_quadrotor_peers", "test_identify", "test_whatif", "test_late", "test_conic",
     "test_library_solver", "test_fly", "test_check_cmd", "test_sources", "test_policies", "test_paper_cmd",
-    "test_scaling", "test_bench", "test_explicit", "test_whatif_cmd", "test_faults_storage", "test_hand_over_restart",
+    "test_scaling", "test_bench", "test_whatif_cmd", "test_faults_storage", "test_hand_over_restart",
     "test_foreign_stream", "test_bench_loop", "test_natnet_flight", "test_engagement", "test_outlook", "test_viewers",
-    "test_loopback", "test_relay", "test_take_off", "test_campaign_refly", "test_check_axes", "test_synthesis",
+    "test_loopback", "test_relay", "test_take_off", "test_linear_world_flight", "test_check_axes", "test_synthesis",
 )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from matplotlib import style
@@ -40,8 +41,6 @@ FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu S
 
 _CURVES = re.compile(r"[CcQqSsTtAaHhVvlm]|e")
 _COMMANDS = re.compile(r"([MLz])(?: (\S+) (\S+))?")
-# Spaces around letters, and before a minus.
-_NEEDLESS = re.compile(r" ?([mz]) ?| (?=-)")
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -217,9 +216,13 @@ def compact(path: str) -> str:
             begun = to
         parts += [_tenths(to[0] - at[0]), _tenths(to[1] - at[1])]
         at = to
-    return _NEEDLESS.sub(r"\1", " ".join(parts))
+    text = " ".join(parts)
+    for needless in (" m ", "m ", " z", "z ", " -"):
+        text = text.replace(needless, needless.strip())
+    return text
 
 
+@cache
 def _tenths(value: int) -> str:
     """A tenth of a whole number, as short as SVG allows."""
     return f"{value / 10:.1f}".removesuffix(".0").replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}"

@@ -13,57 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, logm
 
-from sim.channel import UnderWay
 from uavctl.config.types import Config, PlantConfig
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
 
-# A flight with everything given that is drawn otherwise: for flying one run of a campaign again.
-
-
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Script:
-    """What the simulated vehicle and the radio channel do, in place of the configuration's plant, link and draws."""
-
-    plant: PlantConfig  # the plant that flies; the controller may believe in another one
-    start: Array  # its state at the start (n_x,)
-    disturbances: Array  # w of each step (T, n_w); zero after the last one
-    # Delay of each position sent [ns], None for one that is lost; those after the last one are lost
-    delays_ns: tuple[int | None, ...]
-
-
-class ScriptedChannel(UnderWay):
-    """One direction of a radio link that loses and delays the packets that it is told to.
-
-    Args:
-        delays_ns: Of each packet [ns], None for one that is lost; those after the last one are lost.
-    """
-
-    def __init__(self, delays_ns: tuple[int | None, ...]) -> None:
-        super().__init__()
-        self._delays_ns = delays_ns
-        self._number = 0  # of the next packet
-
-    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
-        """Send a packet at `at_ns`; a `certain` one is not lost, and not late if it was to be lost."""
-        number = self._number
-        self._number += 1
-        self.counters.sent += 1
-        delay_ns = self._delays_ns[number] if number < len(self._delays_ns) else None
-        if delay_ns is None and not certain:
-            self.counters.lost += 1
-            return
-        arrival_ns = at_ns + (delay_ns or 0)
-        self._let_through(arrival_ns, arrival_ns, data)
-
-    def pass_over(self, at_ns: int) -> None:
-        """Nothing is sent where a packet was due: the next one is told what goes for the packet after."""
-        del at_ns
-        self._number += 1
-
 
 NED_AXES = ("north", "east", "down")
 # A setpoint beyond ten g is no acceleration that a multicopter can try; it is limited there, and
@@ -213,7 +167,7 @@ class LinearVehicle:
     """State of the plant at one moment, moved forward by `advance`.
 
     w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
-    changed. Axes that the plant has not stay at their start position. With a `script`, plant, start and w are its.
+    changed. Axes that the plant has not stay at their start position.
 
     Attributes:
         attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
@@ -221,21 +175,16 @@ class LinearVehicle:
 
     attitude = (1.0, 0.0, 0.0, 0.0)
 
-    def __init__(
-        self, config: Config, seed: np.random.SeedSequence, start_ns: int, script: Script | None = None
-    ) -> None:
-        self.model = linear_model(config.plant if script is None else script.plant)
+    def __init__(self, config: Config, seed: np.random.SeedSequence, start_ns: int) -> None:
+        self.model = linear_model(config.plant)
         self._speeding = self.model.flow[list(self.model.velocity_index)]  # rows of v'
         self._rng = np.random.default_rng(seed)
-        self._given = None if script is None else iter(script.disturbances)
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
         self._offset_m = config.sim.start_position_m
         x = np.zeros(self.model.a.shape[0])
         for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
             x[p] = config.sim.start_position_m[axis]
             x[v] = config.sim.start_velocity_mps[axis]
-        if script is not None:
-            x = script.start.copy()
         self._anchor_x: Array = x  # state at the last change of u or w
         self._anchor_ns = start_ns
         self._x: Array | None = x  # state now, once asked for
@@ -246,8 +195,6 @@ class LinearVehicle:
         self.grounded = False
 
     def _draw(self) -> Array:
-        if self._given is not None:
-            return next(self._given, np.zeros(self.model.e.shape[1]))
         return self.model.w_root @ self._rng.standard_normal(self.model.w_root.shape[0])
 
     @property

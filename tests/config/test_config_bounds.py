@@ -229,7 +229,6 @@ def test_a_horizon_whose_library_would_take_minutes_is_refused() -> None:
         ["paper", "--runs", "9" * 20],
         ["paper", "--steps", "9" * 20],
         ["bench", "--states", "9" * 20],
-        ["bench", "--plot", "a" * 5000],
         ["design", "--synthesize", "--states", "9" * 20],
         ["design", "--config", "a" * 5000],
         ["design", "--set", "a=" + "b" * 100_000],

@@ -16,7 +16,6 @@ from udp_rig import assert_in_order, fly_over_udp
 from logs.recording.reader import records
 from logs.recording.summary import summarise
 from sim.simulation import Peers
-from sim.vehicle.linear import LinearVehicle, Script
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
@@ -117,12 +116,6 @@ def test_it_takes_off_and_lands(autopilot: Literal["px4", "ardupilot"]) -> None:
     one.wait(15.0)
     assert one.peers.truth().position_m[2] == 0.0
     assert not one.peers.autopilot.pilot.armed
-
-
-def test_a_script_flies_the_linear_plant() -> None:
-    config = load_config("room-hahn-stursberg", [QUADROTOR])
-    script = Script(config.plant, np.zeros(9), np.zeros((0, 3)), ())
-    assert isinstance(Peers(config, 0, script=script).vehicle, LinearVehicle)
 
 
 @pytest.mark.parametrize(

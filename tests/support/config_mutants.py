@@ -504,7 +504,7 @@ class Mutants:
                 self._check,
                 self._fly,
                 lambda: [*self._fly(), "--goto", "1,1,-1", "--live", "--live-port", "18765"],
-                lambda: ["bench", "--config", CONFIG, "--states", "1", "--seed", "1", "--plot", "no/such/dir/plot.svg"],
+                lambda: ["bench", "--config", CONFIG, "--states", "1", "--seed", "1"],
                 lambda: [
                     "paper",
                     "--runs",

@@ -39,10 +39,6 @@ class Guide:
 
     Args:
         limit_ns: time for each prompt; one that is not followed is passed over.
-
-    Attributes:
-        moves: (asked for, seen), local NED [m].
-        missed: names of prompts that were not followed.
     """
 
     def __init__(self, limit_ns: int) -> None:
@@ -51,8 +47,8 @@ class Guide:
         self._begun_ns: int | None = None
         self._recent: deque[tuple[int, Vec3]] = deque()
         self._start: Vec3 | None = None
-        self.moves: list[tuple[Vec3, Vec3]] = []
-        self.missed: list[str] = []
+        self.moves: list[tuple[Vec3, Vec3]] = []  # (asked for, seen), local NED [m]
+        self.missed: list[str] = []  # names of prompts that were not followed
 
     @property
     def over(self) -> bool:
@@ -152,9 +148,6 @@ class Preflight:
     Args:
         make_links: makes the links (`uavctl.loop.make_links`).
         take_off_m: height of the climb that is planned [m].
-
-    Attributes:
-        guide: the prompts, if they were asked for.
     """
 
     def __init__(
@@ -173,7 +166,7 @@ class Preflight:
         self._asked_ns: int | None = None
         self._rounds = 0
         self._autopilot = ""
-        self.guide = Guide(PROMPT_NS) if move else None
+        self.guide = Guide(PROMPT_NS) if move else None  # the prompts, if they were asked for
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
@@ -185,7 +178,8 @@ class Preflight:
                 self._seen.add(one, attitude)
                 self._relay.take(one, attitude)
                 if self.guide is not None and self._is_safe:
-                    self.guide.take(at_ns, one.position_m, self._heading_rad())
+                    angles_rad = self._seen.angles_rad
+                    self.guide.take(at_ns, one.position_m, angles_rad[-1][1][2] if angles_rad else None)
             elif isinstance(one, VehicleStatus):
                 from_vehicle, self._autopilot = True, one.autopilot
         answers = tuple(Outgoing(link=link, data=answer) for answer in self._links[link].answers())
@@ -269,9 +263,6 @@ class Preflight:
     def _is_safe(self) -> bool:
         """Nobody is sent near propellers that turn, or might."""
         return self._seen.heartbeat is not None and not is_armed(self._seen)
-
-    def _heading_rad(self) -> float | None:
-        return self._seen.angles_rad[-1][1][2] if self._seen.angles_rad else None
 
     def _hear(self, message: Message, at_ns: int) -> None:
         link = self._links[VEHICLE]

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -18,10 +17,10 @@ from rich.table import Table
 from uavctl.build.controller import build_conditioned, build_design, build_spec
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, located, messages
 from uavctl.config.types import Config
-from uavctl.errors import DesignError, UsageError
+from uavctl.errors import DesignError
 from uavctl.lab.bench.decisions import DecisionBench, time_decisions, time_flight
 from uavctl.lab.bench.loop import LoopBench, LoopRun, TimeQuantiles, run_loop_bench
-from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, bench_svg, run_bench
+from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, run_bench
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 
@@ -53,7 +52,7 @@ def loop_picture(result: LoopBench) -> RenderableType:
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
         table.add_row(f"[bold]{name}")
         for label, spread in _spreads(run):
-            table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in _values(spread)))
+            table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in msgspec.structs.astuple(spread)))
     head = (
         f"Median of {result.runs} runs of {result.seconds:g} s each, a position in every tick of {result.tick_s:g} s."
     )
@@ -70,10 +69,6 @@ def _spreads(run: LoopRun) -> tuple[tuple[str, TimeQuantiles], ...]:
         ("tick of an empty loop late by", run.empty_lateness_us),
         ("in the control core", run.step_us),
     )
-
-
-def _values(spread: TimeQuantiles) -> tuple[float, float, float, float]:
-    return spread.p50, spread.p99, spread.p999, spread.max
 
 
 def _rest(name: str, run: LoopRun) -> str:
@@ -100,7 +95,6 @@ def bench(
         ),
     ] = DEFAULT_SIZES.states,
     seed: Annotated[int, Parameter(help="seed of states and policies", validator=SEED)] = 0,
-    plot: Annotated[Path | None, Parameter(help="also draw the result into this SVG file", show_default=False)] = None,
     loop: Annotated[
         bool, Parameter(negative=(), help="measure the whole control loop on real UDP instead, beside an empty one")
     ] = False,
@@ -119,8 +113,6 @@ def bench(
         return bench_loop(common, seconds, runs)
     loaded = common.load()
     if loaded.config.conditioned:
-        if plot is not None:
-            raise UsageError("--plot draws the methods of smpc.scheme `hahn-stursberg`; leave it out")
         with located(loaded):
             solver = build_conditioned(loaded.config).solver
         with _progress() as advance:
@@ -130,16 +122,12 @@ def bench(
         decided = msgspec.structs.replace(decided, flight=flight)
         common.show(decided, lambda: _decisions(decided, loaded.config.name))
         return 0
-    if plot is not None:
-        _check_plot(plot)
     with located(loaded):
         design = build_design(loaded.config)
         loss = build_spec(loaded.config).link.outage(1)
         with _progress() as advance:
             sizes = replace(DEFAULT_SIZES, states=states)
             result = run_bench(design, loss, seed, advance, sizes, _conditioned_solver(loaded.config))
-    if plot is not None:
-        plot.write_text(bench_svg(result, loaded.config.name), encoding="utf-8")
     common.show(result, lambda: bench_picture(result, loaded.config.name))
     return 0
 
@@ -173,22 +161,6 @@ def _decisions(found: DecisionBench, name: str) -> str:
     )
 
 
-def _check_plot(plot: Path) -> None:
-    """Refuse a file that cannot be written, before minutes of measuring.
-
-    Raises:
-        UsageError: There is no such folder, or the name is that of something else.
-    """
-    try:
-        there, taken = plot.parent.is_dir(), plot.exists() and not plot.is_file()
-    except OSError as error:
-        raise UsageError(f"--plot: {error.strerror}; give another name") from error
-    if not there:
-        raise UsageError(f"--plot: there is no directory {plot.parent}; make it first")
-    if taken:
-        raise UsageError(f"--plot: {plot} is not a file; give another name")
-
-
 @contextmanager
 def _progress() -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -217,7 +189,7 @@ def bench_picture(result: BenchResult, name: str) -> RenderableType:
     )
     methods = (_methods(result), _conditioned(result.conditioned), _axis(result))
     answers = (*methods, _certificates(result), _gaps(result))
-    return Group(head, "", *answers, _growth(result), _resources(result))
+    return Group(head, "", *answers, _resources(result))
 
 
 def _methods(result: BenchResult) -> Table:
@@ -269,10 +241,7 @@ def _conditioned(ours: ConditionedTimes | None) -> str:
 
 
 def _axis(result: BenchResult) -> str:
-    return (
-        f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}. "
-        f"The frozen policy's QP: DAQP {_us(result.qp_us.daqp)}, Clarabel {_us(result.qp_us.clarabel)}.\n"
-    )
+    return f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}.\n"
 
 
 def _certificates(result: BenchResult) -> Table:
@@ -297,36 +266,13 @@ def _gaps(result: BenchResult) -> str:
     )
 
 
-def _growth(result: BenchResult) -> Table:
-    table = Table(title="Growth", title_justify="left")
-    for heading in ("", "frozen", "mixture"):
-        table.add_column(heading, justify="right" if heading else "left")
-    longer, more = result.growth_h, result.growth_axes
-    for steps, frozen, mixture in zip(longer.horizon, longer.frozen_us, longer.mixture_us, strict=True):
-        table.add_row(f"one axis, H = {steps}", _us(frozen), _us(mixture))
-    table.add_row(
-        "exponent of H (the longest three)",
-        _number(longer.frozen_exponent),
-        f"{_number(longer.mixture_exponent)} ({_number(longer.mixture_exponent_last)})",
-        end_section=True,
-    )
-    for count, frozen, mixture in zip(more.axes, more.frozen_us, more.mixture_us, strict=True):
-        table.add_row("1 axis" if count == 1 else f"{count} axes", _us(frozen), _us(mixture))
-    table.add_row("exponent of their number", _number(more.frozen_exponent), _number(more.mixture_exponent))
-    return table
-
-
 def _resources(result: BenchResult) -> str:
     memory = result.memory_mb
     return (
-        f"Library made in {result.library_s:.1f} s ({_sum(result.library_policies)} policies, "
+        f"Library made in {result.library_s:.1f} s ({' + '.join(map(str, result.library_policies))} policies, "
         f"{result.library_bytes / 1e3:.0f} kB), ready in {result.ready_s:.2f} s. "
         f"Peak memory: {memory.before:.0f} MB before, {memory.library:.0f} with it, {memory.after:.0f} at the end."
     )
-
-
-def _sum(policies: Sequence[int]) -> str:
-    return " + ".join(map(str, policies))
 
 
 def _ms(milliseconds: float) -> str:
@@ -335,7 +281,3 @@ def _ms(milliseconds: float) -> str:
 
 def _us(microseconds: float | None) -> str:
     return "-" if microseconds is None else f"{microseconds:.0f} µs"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -19,24 +18,18 @@ from rich.console import Group, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
-from rich.text import Text
 
-from logs.recording.reader import records
-from logs.recording.summary import FlightSummary, count, render
-from uavctl.build.controller import design_of
 from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import WORKERS, Common, messages
-from uavctl.cli.flying import Engagement, new_recording, stop_on_signals
-from uavctl.cli.loopback import lockstep
-from uavctl.cli.prepare import prepare, ready_library
+from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
-from uavctl.lab.campaign.pool import Workers, cluster, fly_tasks, processes
-from uavctl.lab.campaign.rerun import Agreement, Reflight, again, agreement, reflight
-from uavctl.lab.campaign.results import SMPC, CellSummary, read_cells, summarise
+from uavctl.lab.campaign.pool import Columns, Work, Workers, cluster, fly_tasks, processes
+from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import MOST_RUNS, read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
-from uavctl.lab.campaign.tasks import Columns, Work, cells_of, document, tasks_of
+from uavctl.lab.campaign.tasks import cells_of, document, tasks_of
 from uavctl.lab.campaign.trials import SCHEMA as TRIALS
 from uavctl.lab.campaign.trials import (
     TrialSummary,
@@ -44,96 +37,38 @@ from uavctl.lab.campaign.trials import (
     places_of,
     read_trial,
     summarise_trial,
-    told_trial,
     trial_document,
     trial_tasks,
 )
 from uavctl.lab.trial import COUNTS, MEANING, SHOWN
-from uavctl.records import Truth
-
-# One run of a campaign flown again in virtual time, recorded and reported like any flight.
-
-
-class Reflown(msgspec.Struct, frozen=True, kw_only=True):
-    """A run of a campaign as a flight."""
-
-    summary: FlightSummary
-    agreement: Agreement
-
-
-def refly_of(folder: Path, which: str, out: Path | None) -> Reflown:
-    """Fly a run of a campaign again; the recording and its page go to `out`.
-
-    Args:
-        out: Folder; a new one below `flights/` if it is not given.
-
-    Raises:
-        UsageError: There is no such run, or it is a baseline's.
-        UavctlError: The campaign cannot be read, or this version would make another design of it.
-    """
-    cell, run = _numbers(which)
-    if told_trial(folder) is not None:
-        raise UsageError(
-            f"{folder} holds flights of the quadrotor; fly one again by `uavctl loopback` with its configuration, "
-            "sim.plant = quadrotor and sim.seed as in runs.parquet"
-        )
-    _check_kind(folder, cell)
-    found = again(folder, cell, run, ready_library)
-    return fly_again(reflight(found, f"{found.campaign}, cell {cell}, run {run}"), out)
-
-
-def fly_again(flight: Reflight, out: Path | None) -> Reflown:
-    """Fly a run, record it and compare it with what the campaign flew."""
-    config = flight.config
-    as_flown = Engagement(config, take_off_m=None, goto=False)
-    with new_recording(out, "refly", config.log.free_bytes) as path:
-        summary = lockstep(prepare(config, design_of(config)), path, as_flown, flight.script)
-        return Reflown(summary=summary, agreement=agreement(flight, list(records(path, Truth))))
-
-
-def refly_picture(reflown: Reflown) -> RenderableType:
-    """The flight's summary, and how well it agrees."""
-    one = reflown.agreement
-    text = (
-        f"Beside the campaign, over {count(one.steps, 'step')} of plans: states within {one.largest_state:.1e}, "
-        f"inputs within {one.largest_input:.1e}; {'agrees' if one.agrees else 'differs'} (to {one.tolerance:g})"
-    )
-    return Group(render(reflown.summary), Text(f"{text}{': ' if one.reason else ''}{one.reason}"))
-
-
-def _numbers(which: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+):(\d+)", which)
-    if found is None:
-        raise UsageError(f"--refly {which}: names no run; give CELL:RUN, as in 0:17")
-    return int(found[1]), int(found[2])
-
-
-def _check_kind(folder: Path, index: int) -> None:
-    cells = [cell for cell in read_cells(folder) if cell.index == index]
-    if cells and cells[0].kind != SMPC:
-        raise UsageError(
-            f"cell {index} is flown by {cells[0].controller} ({cells[0].kind}), a baseline without a flight "
-            "controller; runs of an SMPC can be flown again"
-        )
-
 
 # A campaign of flights of the quadrotor, as tables for the terminal.
 
 
-_TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
+S = TypeVar("S", CellSummary, TrialSummary)
 
 
-class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a campaign of flights came to."""
+class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
+    """What a campaign came to."""
 
     name: str
     runs_file: str
     report: str
     wall_s: float
-    cells: list[TrialSummary]
+    cells: list[S]
 
 
-def trial_picture(result: TrialResult) -> RenderableType:
+def _closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Sequence[str]) -> Iterator[str]:
+    """What stands below the tables: who was refused, remarks, and where the files are."""
+    yield from (f"Refused: {escape(text)}" for text in dict.fromkeys(refused))
+    yield from remarks
+    yield f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
+
+
+_TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
+
+
+def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
     """A table for each scenario."""
     # What is the same in all cells needs no column, and of what only tells of ours the page has more.
     lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
@@ -153,17 +88,11 @@ def trial_picture(result: TrialResult) -> RenderableType:
             told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
             table.add_row(*map(escape, names), *told)
         tables.append(table)
-    refusals = dict.fromkeys(
-        f"{cell.place.controller}, {cell.place.link}: {cell.place.refused}"
-        for cell in result.cells
-        if cell.place.refused
-    )
-    remarks = [f"Refused: {escape(text)}" for text in refusals]
+    places = [cell.place for cell in result.cells]
+    refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
-    if failed:
-        remarks.append(f"{failed} flights failed; runs.parquet says why")
-    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
-    return Group(*tables, *remarks, MEANING, files)
+    remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
+    return Group(*tables, *_closing(result, refused, [*remarks, MEANING]))
 
 
 def _text(value: object) -> str:
@@ -182,18 +111,8 @@ except ImportError as missing:
 _NAMES = ("controller", "link", "disturbance", "plant")
 
 
-class CampaignResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a campaign came to."""
-
-    name: str
-    runs_file: str
-    report: str
-    wall_s: float
-    cells: list[CellSummary]
-
-
 def campaign(
-    spec: Annotated[Path, Parameter(help="TOML file of the campaign; with --refly its folder", show_default=False)],
+    spec: Annotated[Path, Parameter(help="TOML file of the campaign", show_default=False)],
     *,
     runs: Annotated[
         int | None,
@@ -207,9 +126,6 @@ def campaign(
     resume: Annotated[
         bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
     ] = False,
-    refly: Annotated[
-        str | None, Parameter(metavar="CELL:RUN", help="fly one run of a campaign once more, into a recording in --out")
-    ] = None,
     json: Annotated[
         bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
     ] = False,
@@ -221,16 +137,10 @@ def campaign(
     The results do not depend on the number of workers, nor on where they are. Every finished task is kept at once: a
     campaign that was interrupted or killed goes on with --resume.
     """
-    if refly is not None and (resume or (runs, workers, dask) != (None, None, None)):
-        raise UsageError("--refly flies one run by itself; it goes with --out and --json only")
     if dask is not None and workers is not None:
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    if refly is not None:
-        flight = refly_of(spec, refly, out)
-        Common(json=json).show(flight, lambda: refly_picture(flight))
-        return 0 if flight.summary.steps else 1
     given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
     begun = time.perf_counter()
     store = Store(out or _new_folder(given.name), given.schema)
@@ -238,7 +148,8 @@ def campaign(
     try:
         described, tasks = given.prepare()
         with store.opened(described, given.text, resume):
-            if not store.complete() and not _fly(store, tasks, _crew(dask, workers)):
+            crew = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
+            if not store.complete() and not _fly(store, tasks, crew):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
             _tell("writing the page")
@@ -246,12 +157,11 @@ def campaign(
     except KeyboardInterrupt:
         _tell(_interrupted(store, spec, runs))
         return INTERRUPTED
-    shared = {"name": given.name, "runs_file": str(runs_file), "report": str(report)}
-    return given.conclude(store.folder, shared, time.perf_counter() - begun, json)
+    return given.conclude(store, runs_file, report, time.perf_counter() - begun, json)
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Given(Generic[S]):
     """A campaign of either world."""
 
     name: str  # its name
@@ -260,10 +170,23 @@ class _Given:
     # Makes what `campaign.json` holds, and all tasks
     prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
     write: Callable[[Path], Path]  # writes the page into a folder
-    conclude: Callable[[Path, dict[str, str], float, bool], int]  # shows what came of a folder; gives the exit code
+    summarise: Callable[[Path], list[S]]  # the figures of a folder's cells
+    picture: Callable[[CampaignResult[S]], RenderableType]
+
+    def conclude(self, store: Store, runs_file: Path, report: Path, wall_s: float, json: bool) -> int:
+        """Show what came of it; the exit code."""
+        result = CampaignResult(
+            name=self.name,
+            runs_file=str(runs_file),
+            report=str(report),
+            wall_s=wall_s,
+            cells=self.summarise(store.folder),
+        )
+        Common(json=json).show(result, lambda: self.picture(result))
+        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
 
 
-def _of_runs(spec: Path, runs: int | None) -> _Given:
+def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
     """A campaign in the linear world."""
     read, text = read_campaign(spec, runs)
 
@@ -271,15 +194,10 @@ def _of_runs(spec: Path, runs: int | None) -> _Given:
         cells = cells_of(read, ready_library)
         return document(read, cells), list(tasks_of(cells))
 
-    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
-        result = CampaignResult(**shared, wall_s=wall_s, cells=summarise(folder))
-        Common(json=json).show(result, lambda: _picture(result))
-        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
-
-    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, conclude)
+    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, summarise, _picture)
 
 
-def _of_trials(path: Path, runs: int | None) -> _Given:
+def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
     """A campaign in the world of the quadrotor."""
     spec, text = read_trial(path, runs)
 
@@ -287,22 +205,15 @@ def _of_trials(path: Path, runs: int | None) -> _Given:
         places = places_of(spec, ready_library)
         return trial_document(spec, places), list(trial_tasks(spec, places))
 
-    def conclude(folder: Path, shared: dict[str, str], wall_s: float, json: bool) -> int:
-        _, cells = summarise_trial(folder)
-        result = TrialResult(**shared, wall_s=wall_s, cells=cells)
-        Common(json=json).show(result, lambda: trial_picture(result))
-        return 0 if any(cell.runs > cell.failed for cell in cells) else 1
+    def summaries(folder: Path) -> list[TrialSummary]:
+        return summarise_trial(folder)[1]
 
-    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, conclude)
+    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, summaries, trial_picture)
 
 
 def _new_folder(name: str) -> Path:
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
     return Path("flights") / f"{stamp}-{name.replace(' ', '-')}"
-
-
-def _crew(dask: str | None, workers: int | None) -> AbstractContextManager[Workers]:
-    return processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
 
 
 def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:
@@ -344,7 +255,7 @@ def _tell(text: str) -> None:
     messages().print(escape(text), soft_wrap=True)
 
 
-def _picture(result: CampaignResult) -> RenderableType:
+def _picture(result: CampaignResult[CellSummary]) -> RenderableType:
     # What is the same in all cells needs no column.
     lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
     table = Table(title=f"Campaign {result.name}", title_justify="left")
@@ -361,13 +272,11 @@ def _picture(result: CampaignResult) -> RenderableType:
             _cost(cell.cost, cell.cost_ci),
         )
         table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
-    refusals = dict.fromkeys(f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused)
-    told = [f"Refused: {escape(text)}" for text in refusals]
+    refused = [f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused]
     note = (
         "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
     )
-    files = f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
-    return Group(table, *told, note, files)
+    return Group(table, *_closing(result, refused, [note]))
 
 
 def _percent(rate: float | None, interval: tuple[float, float] | None) -> str:

@@ -20,21 +20,12 @@ from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
 from uavctl.cli.common import DEFAULTS, Common, located, messages
 from uavctl.cli.prepare import ready_library
-from uavctl.errors import UsageError
-from uavctl.lab.compare_designs import (
-    RISK_OPTIONS,
-    Costs,
-    GainComparison,
-    GainReport,
-    RiskComparison,
-    compare_gains,
-    compare_risk,
-)
+from uavctl.lab.compare_designs import Costs, GainComparison, GainReport, compare_gains
 from uavctl.smpc.conditioned.planner import ConditionedDesign, conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 
-# `uavctl design --synthesize` and `--compare-risk`: designs beside one another.
+# `uavctl design --synthesize`: the configured terminal gain beside the best one.
 
 
 SEED = 0
@@ -51,19 +42,6 @@ def gains_report(common: Common, states: int) -> int:
     document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
     common.show(document, lambda: _gains_picture(found, loaded.config.name))
     return 0 if found.after.refused is None else 1
-
-
-def risk_report(common: Common, states: int) -> int:
-    """Compare the risk allocations."""
-    loaded = common.load()
-    begin = time.perf_counter()
-    with located(loaded):
-        spec = build_spec(loaded.config)
-        with _progress(1 + 2 * len(RISK_OPTIONS) * states) as advance:
-            found = compare_risk(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
-    document = {**msgspec.to_builtins(found), "wall_s": time.perf_counter() - begin}
-    common.show(document, lambda: _risk_picture(found, loaded.config.name))
-    return 0
 
 
 @contextmanager
@@ -92,43 +70,13 @@ def _gains_picture(found: GainComparison, name: str) -> RenderableType:
     return Group(table, *refusals, _basis(found), "To take the synthesised gain over:", "", Text(found.toml))
 
 
-def _risk_picture(found: RiskComparison, name: str) -> RenderableType:
-    table = Table(title=f"Risk allocation, {name}", title_justify="left")
-    for heading in (
-        "allocation", "κ_x last stage", "κ_u", "terminal back-off x", "back-off u", "cost at start", "mean cost",
-        "of the box",
-    ):  # fmt: skip
-        table.add_column(heading, justify="left" if heading == "allocation" else "right")
-    refusals = []
-    for each in found.allocations:
-        if each.costs is None or each.kappa_x_terminal is None or each.kappa_u_terminal is None:
-            refusals.append(Text(f"No design with {each.allocation}: {each.refused}"))
-            continue
-        table.add_row(
-            each.allocation,
-            f"{each.kappa_x_terminal:.3f}",
-            f"{each.kappa_u_terminal:.3f}",
-            _several(each.terminal_backoff_x),
-            _several(each.terminal_backoff_u),
-            _cost(each.costs.start),
-            _cost(each.costs.mean),
-            f"{each.costs.feasible:.1%}",
-        )
-    return Group(table, *refusals, _basis(found))
-
-
-def _basis(found: GainComparison | RiskComparison) -> str:
+def _basis(found: GainComparison) -> str:
     return (
         "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
         "way of nearer equilibria, or gives way where the limits are soft.\n"
         f"Means over {found.compared} states on the way to the target, feasible for every design; shares of "
         f"{found.states} states uniform in the box of the limits."
     )
-
-
-def _several(values: list[float]) -> str:
-    """Different values, in their order; the two sides of a box have the same."""
-    return " ".join(dict.fromkeys(f"{value:.3g}" for value in values))
 
 
 def _figure(value: float | None) -> str:
@@ -167,21 +115,15 @@ def design(
         bool,
         Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
     ] = False,
-    compare_risk: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="make the design under each risk allocation, and compare")
-    ] = False,
     states: Annotated[
-        int, Parameter(help="seeded states in either comparison", validator=validators.Number(gte=1, lte=10_000))
+        int,
+        Parameter(help="with --synthesize: seeded states to compare", validator=validators.Number(gte=1, lte=10_000)),
     ] = 60,
     common: Common = DEFAULTS,
 ) -> int:
     """Make a design and its policy library: schedule, terminal ingredients, Assumption 4 with figures."""
-    if synthesize and compare_risk:
-        raise UsageError("--synthesize and --compare-risk are two questions; ask one at a time")
     if synthesize:
         return gains_report(common, states)
-    if compare_risk:
-        return risk_report(common, states)
     loaded = common.load()
     start = time.perf_counter()
     if loaded.config.conditioned:

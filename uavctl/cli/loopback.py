@@ -22,7 +22,6 @@ from logs.recording.topics import ENDED
 from logs.recording.views import Views
 from sim.server import Ready, serve_in_child
 from sim.simulation import World
-from sim.vehicle.linear import Script
 from uavctl.build.controller import design_of
 from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
 from uavctl.cli.flying import (
@@ -158,8 +157,8 @@ class _InterruptedError(Exception):
     """The operator asked for the end of a flight in virtual time."""
 
 
-def lockstep(prepared: Prepared, path: Path, engagement: Engagement, script: Script | None = None) -> FlightSummary:
-    """Fly in virtual time, with a progress bar; what a script says of disturbances and the link is not drawn."""
+def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
+    """Fly in virtual time, with a progress bar."""
     config, takes_off = prepared.config, engagement.takes_off
     recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(Views()))
     begun = time.perf_counter()
@@ -186,7 +185,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement, script: Scr
             def record(truth: Truth) -> None:
                 recorder.put(TRUTH, truth.at_ns, truth)
 
-            world = World(config, timed, on_truth=record, on_progress=show, airborne=not takes_off, script=script)
+            world = World(config, timed, on_truth=record, on_progress=show, airborne=not takes_off)
             begun = time.perf_counter()
             world.run(config.duration_s, lambda: takes_off and loop.finished)
             if takes_off:

@@ -1,4 +1,4 @@
-"""Designs beside one another: what another terminal gain is worth, and what a risk allocation costs.
+"""Two designs beside one another: what another terminal gain is worth.
 
 Optimal costs are compared from the same states. One set is seeded and uniform in the box of the state limits: it tells
 from what share of the box the target can be reached with all constraints kept. The other is the same states, each drawn
@@ -10,24 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.hahn_stursberg.design import Allocation, Design, DesignSpec, component_kappa, make_design
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
-from uavctl.smpc.hahn_stursberg.terminal import check_assumptions, stationary_cost
-from uavctl.smpc.plant import digest
+from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]
-COMPONENT = "component"
-RISK_OPTIONS = (*get_args(Allocation), COMPONENT)
 _DIGITS = 6  # of a gain as it is printed: the figures are those of the printed one
 
 
@@ -62,28 +57,6 @@ class GainComparison(msgspec.Struct, frozen=True, kw_only=True):
     starts: int  # stable gains that the search began from
     states: int
     compared: int  # states that the mean costs are over
-
-
-class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
-    """A design with one risk allocation, or why there is none."""
-
-    allocation: str
-    refused: str | None
-    kappa_x: list[float] = []  # of the stages 1 … H
-    kappa_u: list[float] = []  # of the stages 0 … H-1
-    kappa_x_terminal: float | None = None
-    kappa_u_terminal: float | None = None
-    terminal_backoff_x: list[float] = []  # half-width of the terminal set, one a row of the state set
-    terminal_backoff_u: list[float] = []  # one a row of the input set
-    costs: Costs | None = None
-
-
-class RiskComparison(msgspec.Struct, frozen=True, kw_only=True):
-    """The same design under each way to allocate the risk."""
-
-    allocations: list[RiskReport]
-    states: int
-    compared: int
 
 
 def compare_gains(
@@ -144,38 +117,6 @@ def gain_toml(k: Array) -> str:
     return f"[smpc]\nk_tau = [\n{rows}]\n"
 
 
-def compare_risk(
-    spec: DesignSpec, start: Array, states: int, seed: int, advance: Callable[[str], None]
-) -> RiskComparison:
-    """Make the same design under each risk allocation, with the schedule of the configured one.
-
-    Beside the two of `risk.allocation` stands `component`: an ellipsoid for each independent part of the plant.
-
-    Args:
-        start: State (n_x,) whose cost is told.
-        states: Number of seeded states in each set.
-        advance: Told what is done next: once, and once for each of both sets' states and each design.
-
-    Raises:
-        DesignError: There is no design as configured.
-    """
-    advance("designs")
-    configured = make_design(spec, optimal_cost)
-    fixed = replace(spec, rule="fixed", delays=configured.schedule.delays)
-    made: dict[str, Design | str] = {name: _complete(replace(fixed, allocation=name)) for name in get_args(Allocation)}
-    made[COMPONENT] = _by_component(spec, configured)
-    designs = [design for design in made.values() if isinstance(design, Design)]
-    points, nearer = seeded_states(spec.state_set, configured.target, states, seed)
-    costs, compared = _costs(designs, start, points, nearer, advance)
-    reports = [
-        _risk_report(name, design, costs[designs.index(design)])
-        if isinstance(design, Design)
-        else RiskReport(allocation=name, refused=design)
-        for name, design in made.items()
-    ]
-    return RiskComparison(allocations=reports, states=states, compared=compared)
-
-
 def seeded_states(limits: Polytope, target: Array, count: int, seed: int) -> tuple[Array, Array]:
     """Seeded states (count, n_x), uniform in the box of the limits on single states; and the same nearer to the target.
 
@@ -197,44 +138,6 @@ def _complete(spec: DesignSpec) -> Design | str:
     except DesignError as error:
         return str(error)
     return design
-
-
-def _by_component(spec: DesignSpec, design: Design) -> Design | str:
-    """The design with an ellipsoid for each independent part, or why there is none."""
-    parts = decompose(design)
-    sizes_x, sizes_u = [len(part.states) for part in parts], [len(part.inputs) for part in parts]
-    schedule, terminal = design.schedule, design.terminal
-    kappa_x = np.array([0.0, *(component_kappa(gamma, sizes_x) for gamma in schedule.gamma_x[1:])])
-    kappa_u = np.array([component_kappa(gamma, sizes_u) for gamma in schedule.gamma_u])
-    kappa_x_terminal = max(component_kappa(spec.delta_x, sizes_x), float(kappa_x[-1]))
-    kappa_u_terminal = max(component_kappa(spec.delta_u, sizes_u), float(kappa_u[-terminal.tau :].max()))
-    age = design.assumptions[0]
-    try:
-        assumptions = check_assumptions(
-            plant=design.plant,
-            terminal=terminal,
-            state_set=design.state_set,
-            input_set=design.input_set,
-            q_u=design.q_u,
-            target=design.target,
-            estimate_cov=design.estimate_cov,
-            kappa_x=kappa_x_terminal,
-            kappa_u=kappa_u_terminal,
-            age_within_tau=age.value,
-            delta_tau=age.limit,
-        )
-    except DesignError as error:
-        return str(error)
-    changed = replace(
-        design,
-        kappa_x=kappa_x,
-        kappa_u=kappa_u,
-        kappa_x_terminal=kappa_x_terminal,
-        kappa_u_terminal=kappa_u_terminal,
-        assumptions=assumptions,
-        design_id="",
-    )
-    return replace(changed, design_id=digest(changed))
 
 
 def _costs(
@@ -278,26 +181,3 @@ def _gain_report(design: Design, costs: Costs) -> GainReport:
         margin=check_schedule(design),
         costs=costs,
     )
-
-
-def _risk_report(name: str, design: Design, costs: Costs) -> RiskReport:
-    sigma_x, k = design.terminal.sigma_x, design.terminal.k
-    backoff_x = design.kappa_x_terminal * _deviations(design.state_set.c, sigma_x + design.estimate_cov)
-    backoff_u = design.kappa_u_terminal * _deviations(design.input_set.c, k @ sigma_x @ k.T)
-    return RiskReport(
-        allocation=name,
-        refused=None,
-        kappa_x=design.kappa_x[1:].tolist(),
-        kappa_u=design.kappa_u.tolist(),
-        kappa_x_terminal=design.kappa_x_terminal,
-        kappa_u_terminal=design.kappa_u_terminal,
-        terminal_backoff_x=backoff_x.tolist(),
-        terminal_backoff_u=backoff_u.tolist(),
-        costs=costs,
-    )
-
-
-def _deviations(rows: Array, covariance: Array) -> Array:
-    """Standard deviation along each row (m,)."""
-    deviations: Array = np.sqrt(np.einsum("ij,jk,ik->i", rows, covariance, rows))
-    return deviations

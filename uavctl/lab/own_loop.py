@@ -93,21 +93,15 @@ class OwnLoop:
     """Has a vehicle fly by its own position loop; implements `uavctl.records.Flyer`.
 
     Attributes:
-        config: The configuration.
-        tuning: How the vehicle is set up.
-        place: Where it is to go.
-        path: What it is to follow instead; None for a place.
-        samples: The positions that arrived, in order.
         relay: What of them was passed on, and why others were not.
-        begun_ns: When it was first told where to go; None before.
     """
 
     config: Config
-    tuning: OwnTuning
-    place: Vec3
-    path: Path | None = None
-    samples: list[PositionSample] = field(default_factory=list)
-    begun_ns: int | None = None
+    tuning: OwnTuning  # how the vehicle is set up
+    place: Vec3  # where it is to go
+    path: Path | None = None  # what it is to follow instead; None for a place
+    samples: list[PositionSample] = field(default_factory=list)  # the positions that arrived, in order
+    begun_ns: int | None = None  # when it was first told where to go; None before
 
     def __post_init__(self) -> None:
         self._links = make_links(self.config)

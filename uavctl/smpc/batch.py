@@ -104,7 +104,7 @@ class Decider(Protocol):
 
 
 class OneByOne:
-    """Decisions by a solver, one after the other: what flies. The slow, exact side of every faster one."""
+    """Decisions by the solver that flies, one after the other; equal states are asked once."""
 
     def __init__(self, solver: Solver, target: Array, shape: tuple[int, int]) -> None:
         """Args: the solver; the target (n_x,); (H, n_u)."""
@@ -113,8 +113,9 @@ class OneByOne:
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
         outlook = Preview(late=late)
-        answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(x)]
-        return gathered(answers, self._shape)
+        states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
+        answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(states)]
+        return gathered([answers[i] for i in which.reshape(-1)], self._shape)
 
 
 def gathered(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
@@ -190,7 +191,7 @@ class BatchSmpc:
         (who,) = np.nonzero(playing)
         asked[who] = self._plans[who, index[who]]
         (lost,) = np.nonzero(~playing)
-        asked[lost] = self._braking(x[lost])
+        asked[lost] = -self._brake * x[lost][:, list(self._plant.velocity_index)] @ self._input_of_accel.T
         self.tally.fallbacks[lost] += 1
         return asked
 
@@ -205,7 +206,3 @@ class BatchSmpc:
         tally.infeasible[who] += ~answers.solved
         tally.slack_used[who] += answers.solved & (answers.slack > KEPT)
         tally.largest_gap[found] = np.maximum(tally.largest_gap[found], answers.gap[answers.solved])
-
-    def _braking(self, x: Array) -> Array:
-        """Inputs that brake the predicted velocities (M, n_x)."""
-        return -self._brake * x[:, list(self._plant.velocity_index)] @ self._input_of_accel.T

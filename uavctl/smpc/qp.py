@@ -38,10 +38,6 @@ _OPTIMAL = (1, 2)  # 2: soft rows were left
 class QuadraticProgram:
     """A program whose matrices are given once; f and the sides follow each question. Not for concurrent use.
 
-    Attributes:
-        sense: DAQP's state of each row (m,).
-        iterations: Of the last solve.
-
     Args:
         h: H (n, n), positive definite.
         a: A (m, n).
@@ -62,8 +58,8 @@ class QuadraticProgram:
         tolerance: float = TOLERANCE,
         most: int = _MOST_ITERATIONS,
     ) -> None:
-        self.sense = sense
-        self.iterations = 0
+        self.sense = sense  # DAQP's state of each row (m,)
+        self.iterations = 0  # of the last solve
         model = daqp.Model()
         sides = np.full(a.shape[0], OPEN)
         model.setup(h, np.zeros(h.shape[0]), a, sides, -sides, sense)  # the soft rows fix the workspace

@@ -4,15 +4,13 @@ import gc
 import json
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
 import pytest
 from baseline_rig import problem
 from numpy.typing import NDArray
-from optimisation_cases import PAPER_COST_X, PAPER_LOWER, PAPER_UPPER, START, paper
+from optimisation_cases import PAPER_LOWER, PAPER_UPPER, START, paper
 
 from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller
@@ -22,41 +20,27 @@ from uavctl.config import load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.bench import run
 from uavctl.lab.bench.decisions import ROUNDS, questions, time_decisions, time_flight
-from uavctl.lab.bench.run import LOOP_STEPS, BenchSizes, InFlight, bench_svg, closed_loops, draw_states, run_bench
-from uavctl.lab.bench.timing import (
-    FROZEN,
-    BenchResult,
-    Case,
-    FrozenProgram,
-    copies,
-    exponent,
-    few_policies,
-    growth_with_axes,
-    lengthened,
-    time_frozen_qp,
-    timed,
-)
+from uavctl.lab.bench.run import LOOP_STEPS, BenchSizes, InFlight, closed_loops, draw_states, run_bench
+from uavctl.lab.bench.timing import FROZEN, BenchResult, Case, timed
+from uavctl.lab.paper.depth import alone, few_policies
 from uavctl.loop import ControlLoop
 from uavctl.records import Plan, Record, SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
-from uavctl.smpc.hahn_stursberg.mean import MeanProblem
+from uavctl.smpc.hahn_stursberg.horizon import decompose
+from uavctl.smpc.hahn_stursberg.library import Library
 from uavctl.smpc.link import bernoulli
 
 Array = NDArray[np.float64]
 
 WANTED = {
     "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "library_us", "ratio_printed_library",
-    "ratio_exact_library", "growth_h", "growth_axes", "qp_us", "ratio_cvxpy_library", "shares", "gap", "library_s",
+    "ratio_exact_library", "ratio_cvxpy_library", "shares", "gap", "library_s",
     "library_bytes", "memory_mb", "ready_s", "frozen_us", "mixture_us", "conditioned",
 }  # fmt: skip
-SMALL = BenchSizes(
-    states=12, printed=1, cvxpy=3, exact=6, runs=2, horizons=(5, 8, 12), policies=3, growth_states=30, axes=3
-)
+SMALL = BenchSizes(states=12, printed=1, cvxpy=3, exact=6, runs=2)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +53,7 @@ def library(design: Design) -> Library:
     """A few policies for each axis."""
     parts = []
     for component in decompose(design):
-        made = few_policies(copies(design, component, 1), 6, np.random.default_rng(1))
+        made = few_policies(alone(design, component), 6, np.random.default_rng(1))
         assert made is not None
         parts.append(made[0].variants[0][0])
     return Library(design.design_id, (tuple(parts),))
@@ -92,7 +76,6 @@ def test_one_run_has_all_figures(result: BenchResult) -> None:
     found = msgspec.to_builtins(result)
     assert found.keys() >= WANTED
     assert found["library_us"].keys() == found["gap"].keys() == {"p50", "p99", "max"}
-    assert {"daqp", "clarabel"} <= found["qp_us"].keys()
     assert (result.states, result.components) == (12, 2)
     assert (result.printed_states, result.cvxpy_states, result.exact_states) == (1, 3, 6)
     assert json.loads(msgspec.json.encode(result)) == json.loads(json.dumps(found, allow_nan=False))
@@ -188,7 +171,6 @@ def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytes
     shown = capsys.readouterr().out
     assert f"at most {document['iterations']['max']:.0f}." in shown
     assert f"{document['flight']['questions']} of its own flight" in shown
-    assert command(["bench", *options, "--plot", "x.svg"]) == 2
 
 
 def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
@@ -203,17 +185,6 @@ def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
         assert (share > 0.0) == (median is not None)
 
 
-def test_growth_has_a_time_for_each_size(result: BenchResult) -> None:
-    # τ = 4 leaves no step of H = 5 that could feed anything back.
-    assert result.growth_h.horizon == [8, 12]
-    assert result.growth_h.gains == [7, 28]
-    assert result.growth_axes.axes == [1, 2, 3]
-    for growth in (result.growth_h, result.growth_axes):
-        assert all(us is not None and us > 0.0 for us in growth.frozen_us + growth.mixture_us)
-        assert growth.frozen_exponent is not None and np.isfinite(growth.frozen_exponent)
-        assert growth.mixture_exponent is not None and np.isfinite(growth.mixture_exponent)
-
-
 def test_the_library_is_weighed(result: BenchResult, library: Library) -> None:
     parts = library.variants[0]
     assert result.library_policies == [len(part.level) for part in parts] == [6, 6]
@@ -225,7 +196,7 @@ def test_the_library_is_weighed(result: BenchResult, library: Library) -> None:
 def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list[tuple[str, int, int | None]]) -> None:
     last = {what: (done, total) for what, done, total in told}
     assert last.pop("making the library") == (0, None)
-    assert {"states", "all methods in turns", "printed, jointly", "longer horizons", "more axes"} == last.keys()
+    assert {"states", "all methods in turns", "printed, jointly"} == last.keys()
     assert all(done == total for done, total in last.values())
     decisions = SMALL.runs * (2 * result.states + result.exact_states) + result.cvxpy_states
     assert last["all methods in turns"] == (decisions, decisions)
@@ -335,97 +306,7 @@ def test_garbage_is_collected_again_after_an_error() -> None:
     assert gc.isenabled()
 
 
-def test_the_exponent_of_a_power_law_is_its_power() -> None:
-    assert exponent([8, 16, 40], [3.0 * n**2 for n in (8, 16, 40)]) == pytest.approx(2.0)
-    assert exponent([8, 16, 40], [8.0, None, 40.0]) == pytest.approx(1.0)
-    assert exponent([8, 16], [8.0, None]) is None
-
-
-# --- sizes -----------------------------------------------------------------------------------------------------------
-
-
-def test_copies_cost_what_the_one_costs_times_their_number(design: Design) -> None:
-    component = decompose(design)[0]
-    for count in (1, 3, 6):
-        many = copies(design, component, count)
-        assert len(decompose(many)) == many.plant.n_u == count
-        answer = ConicSolver(many).solve(0, np.tile(START[component.states], count), many.target)
-        assert answer.cost == pytest.approx(count * PAPER_COST_X, rel=1e-6)
-
-
-def test_a_longer_horizon_keeps_the_conditions_on_its_delays(design: Design) -> None:
-    one, tau = copies(design, decompose(design)[0], 1), 4
-    for steps in (8, 12, 40):
-        longer = lengthened(one, steps)
-        assert longer is not None
-        delays, free = longer.schedule.delays, steps - tau
-        assert len(delays) == longer.horizon == steps
-        assert all(delay >= t - free + 1 for t, delay in enumerate(delays) if t >= free)
-        assert all(delay <= tau + 1 for delay in delays)
-        assert any(t >= delay for t, delay in enumerate(delays[:free]))
-        assert longer.kappa_x.shape == (steps + 1,) and longer.kappa_u.shape == (steps,)
-    assert lengthened(one, tau + 2) is None
-
-
-def test_more_axes_than_states_are_dealt_out(design: Design, library: Library) -> None:
-    found = growth_with_axes(design, library, [design.target], 3, 1, lambda: None)
-    assert found.frozen_us[2] is not None
-    assert found.mixture_us == [None] * 3
-    assert found.mixture_exponent is None
-
-
-# --- the frozen policy's QP ------------------------------------------------------------------------------------------
-
-
-def test_both_solvers_find_the_optimum_that_the_library_answers(design: Design, library: Library) -> None:
-    component, part = decompose(design)[0], library.variants[0][0]
-    one = copies(design, component, 1)
-    solver = LibrarySolver(one, Library(one.design_id, ((part,),)), exact=False)
-    problem = MeanProblem(design, horizon_of(design, component))
-    both = FrozenProgram(design, component, part)
-    frozen = 0
-    for x in ([0.0, 0.0], [4.0, 1.0], [-2.0, 0.5], START[:2]):
-        whole = np.array([*x, 0.0, 0.0])
-        question = both.question(whole, design.target)
-        solved = both.daqp.solve(*question)
-        assert solved is not None
-        cost = both.cost(solved[0], *question)
-        assert both.cost(both.clarabel.solve(*question), *question) == pytest.approx(cost, rel=1e-7, abs=1e-6)
-        answer = solver.solve(0, np.array(x), one.target)
-        if answer.method == FROZEN:
-            frozen += 1
-            constant = problem.question(np.array(x), one.target).constant
-            assert cost + constant + part.policies(problem)[0].cost == pytest.approx(answer.cost, rel=1e-9)
-    assert frozen >= 2
-
-
-def test_qp_times_count_the_same_program(design: Design, library: Library) -> None:
-    found = time_frozen_qp(design, decompose(design)[0], library.variants[0][0], [START], 2)
-    assert (found.variables, found.rows) == (7, 24)
-    assert found.cost_difference < 1e-6
-    assert found.daqp > 0.0 and found.clarabel > 0.0
-
-
 # --- what people see -------------------------------------------------------------------------------------------------
-
-
-def test_the_picture_is_an_svg_for_light_and_dark_pages(result: BenchResult) -> None:
-    svg = bench_svg(result, "paper")
-    root = ElementTree.fromstring(svg)
-    assert root.tag.endswith("svg")
-    assert "prefers-color-scheme:dark" in svg and "policy library" in svg
-    texts = {"".join(element.itertext()).strip() for element in root.iter() if element.tag.endswith("text")}
-    assert {"exact", "library", "mixture", "frozen", "H", "H²", "8", "12", "number of axes"} <= texts
-
-
-def test_the_picture_does_without_what_was_not_measured(result: BenchResult) -> None:
-    growth = msgspec.structs.replace(result.growth_h, mixture_us=[None, None], frozen_us=[None, 70.0])
-    nothing = msgspec.structs.replace(
-        growth, horizon=[], gains=[], mixture_us=[], frozen_us=[], mixture_exponent=None, mixture_exponent_last=None
-    )
-    for shown in (growth, nothing):
-        svg = bench_svg(msgspec.structs.replace(result, growth_h=shown), "paper")
-        assert svg.count("mixture") == 1  # of the axes
 
 
 @pytest.fixture
@@ -446,42 +327,24 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
     return given
 
 
-def test_the_command_writes_one_document_and_the_picture(
-    measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_the_command_writes_one_document(
+    measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plot = tmp_path / "bench.svg"
-    arguments = ["bench", "--config", "paper", "--states", "9", "--seed", "3", "--plot", str(plot), "--json"]
+    arguments = ["bench", "--config", "paper", "--states", "9", "--seed", "3", "--json"]
     assert command(arguments) == 0
     assert json.loads(capsys.readouterr().out).keys() >= WANTED
     ((loss, seed, states),) = measured
     assert loss == pytest.approx(0.3)
     assert (seed, states) == (3, 9)
-    assert plot.read_text(encoding="utf-8").startswith("<svg")
 
 
-def test_the_command_shows_ratios_shares_and_growth(
+def test_the_command_shows_ratios_and_shares(
     measured: list[tuple[float, int, int]], result: BenchResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(["bench", "--config", "paper"]) == 0
     out = capsys.readouterr().out
     assert f"{result.ratio_cvxpy_library:.0f} ×" in out
     assert f"{result.shares.frozen:.1%}" in out
-    for words in (
-        "as printed, jointly",
-        "policy library",
-        "conditioned on the age",
-        "H = 12",
-        "3 axes",
-        "Certified gap",
-        "Peak memory",
-    ):
+    for words in ("as printed, jointly", "policy library", "conditioned on the age", "Certified gap", "Peak memory"):
         assert words in out
     assert measured[0][2] == 1000
-
-
-def test_a_picture_that_cannot_be_written_is_refused_before_measuring(
-    measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert command(["bench", "--config", "paper", "--plot", str(tmp_path / "none" / "bench.svg")]) == 2
-    assert "there is no directory" in capsys.readouterr().err
-    assert measured == []

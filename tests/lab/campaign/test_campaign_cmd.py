@@ -198,7 +198,6 @@ def test_nothing_to_fly_is_told_with_exit_code_1(tmp_path: Path, capsys: pytest.
     [
         (["--dask", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
         (["--resume"], "with --out"),
-        (["--refly", "0:0", "--workers", "2"], "--refly"),
         (["--dask", "nonsense://127.0.0.1"], "no scheduler answers"),
     ],
 )

@@ -195,12 +195,10 @@ def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None
     assert "lqg <b>" in text
 
 
-def test_failed_runs_are_listed_and_a_run_can_be_flown_again(grid: Path) -> None:
+def test_failed_runs_are_listed(grid: Path) -> None:
     text = text_of(grid / "report.html")
     assert "1 run failed; they are listed below." in text
     assert "4 lqg <b> 30 % 7 it broke" in text
-    costliest = int(NOISE.argmax())
-    assert f"uavctl campaign --refly 9:{costliest} --out" in text
 
 
 def test_links_that_are_a_loss_make_a_line_and_others_dots(grid: Path) -> None:

@@ -14,9 +14,9 @@ from patience import LIMIT_S, until
 
 from uavctl.errors import UsageError
 from uavctl.lab.campaign import pool
-from uavctl.lab.campaign.pool import ONE_THREAD, fly_tasks, processes
+from uavctl.lab.campaign.pool import ONE_THREAD, Columns, Work, fly_tasks, processes
 from uavctl.lab.campaign.spec import CHUNK
-from uavctl.lab.campaign.tasks import Columns, Work, tasks_of
+from uavctl.lab.campaign.tasks import tasks_of
 
 ORPHAN = """
 import os, sys

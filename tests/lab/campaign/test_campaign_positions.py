@@ -14,13 +14,12 @@ from scipy.stats import binom
 
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
-from uavctl.errors import UsageError
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.controllers import met, sight_of
 from uavctl.lab.campaign.intervals import worst_step
-from uavctl.lab.campaign.rerun import again
-from uavctl.lab.campaign.tasks import Cell, Columns, document, flown, fly_task, tasks_of
+from uavctl.lab.campaign.pool import Columns
+from uavctl.lab.campaign.tasks import Cell, flown, fly_task, tasks_of
 from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
@@ -213,11 +212,3 @@ def test_every_kind_flies_on_positions_and_runs_do_not_depend_on_each_other(tmp_
         alone, _ = flown(task, 4, 1)
         assert not together.failed.any()
         assert together.states[4] == pytest.approx(alone.states[0], abs=1e-9)
-
-
-def test_a_run_on_positions_is_not_flown_again_as_a_flight(tmp_path: Path) -> None:
-    campaign = rig.read(tmp_path, f'{NOISY}]\nmeasured = "position"\nruns = 2\n', rig.controller("lqg"))
-    made = rig.cells(tmp_path, f'{NOISY}]\nmeasured = "position"\nruns = 2\n', rig.controller("lqg"))
-    (tmp_path / "campaign.json").write_bytes(msgspec.json.encode(document(campaign, made)))
-    with pytest.raises(UsageError, match="told positions"):
-        again(tmp_path, 0, 0, lambda *_: None)

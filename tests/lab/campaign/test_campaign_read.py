@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 from campaign_rig import HEAD, controller, read, table
 from places import ROOT
@@ -13,8 +12,7 @@ from places import ROOT
 from uavctl.config import load_config
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
-from uavctl.lab.campaign.spec import campaign_of, read_campaign
-from uavctl.lab.campaign.tasks import document
+from uavctl.lab.campaign.spec import read_campaign
 
 LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
 
@@ -66,15 +64,6 @@ def test_a_configuration_file_is_found_beside_the_campaign(tmp_path: Path) -> No
     file = tmp_path / "campaign.toml"
     file.write_text('name = "mine"\nconfig = "mine.toml"\n' + controller("lqg"))
     assert same(read_campaign(file)[0].base, load_config("paper"))
-
-
-def test_what_is_kept_gives_the_same_campaign_back(tmp_path: Path) -> None:
-    campaign = read(tmp_path, 'set = ["sets.state_lower=[-inf, -8, -25, -8]"]\n', controller("lqg"), LINKS)
-    kept = msgspec.json.decode(msgspec.json.encode(document(campaign, ())))
-    back = campaign_of(kept)
-    assert back.spec == campaign.spec and back.configuration == campaign.configuration
-    assert same(back.base, campaign.base) and back.base.sets.state_lower[0] == -np.inf
-    assert all(same(back.believed[key], one) for key, one in campaign.believed.items())
 
 
 def test_another_number_of_runs(tmp_path: Path) -> None:

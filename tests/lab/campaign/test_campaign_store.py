@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from campaign_rig import cells, controller, read, table
+from campaign_rig import cells, controller, table
 
-from uavctl.cli.prepare import ready_library
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.rerun import again
 from uavctl.lab.campaign.spec import CHUNK
 from uavctl.lab.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.lab.campaign.tasks import Task, cells_of, document, fly_task, tasks_of
+from uavctl.lab.campaign.tasks import Task, flown, fly_task, tasks_of
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
 DOCUMENT = {"name": "one", "runs": 3, "cells": [{"index": 0}]}
@@ -98,31 +96,10 @@ def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
         pass
 
 
-def test_one_run_can_be_flown_again(tmp_path: Path) -> None:
-    campaign = read(
-        tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO
-    )
-    made = cells_of(campaign, ready_library)
-    tasks = list(tasks_of(made))
-    store = Store(tmp_path / "one")
-    with store.opened(document(campaign, made), "text", resume=False):
-        rows = fly_task(tasks[3])
-        found = again(tmp_path / "one", 1, CHUNK + 2, ready_library)
-    assert found.flown.cost.shape == (1, 6) and found.campaign == "small" and found.master == 2
-    assert found.flown.cost.sum(axis=1)[0] == rows["cost"][2]
-    x = found.flown.states[0]
-    np.testing.assert_array_equal(x[0], found.start)
-    a, b, e = (np.array(getattr(found.plant, name)) for name in "abe")
-    np.testing.assert_allclose(x[3], a @ x[2] + b @ found.flown.inputs[0, 2] + e @ found.disturbances[2], atol=1e-9)
-    np.testing.assert_array_equal(found.flown.age[0], np.arange(6) - found.newest)
-    assert found.config.link.loss == 0.5
-    with pytest.raises(UsageError, match="cell 3 was not flown"):
-        again(tmp_path / "one", 3, 0, ready_library)
-    with pytest.raises(UsageError, match=f"the runs 0 to {CHUNK + 3}"):
-        again(tmp_path / "one", 1, CHUNK + 4, ready_library)
-    with pytest.raises(UavctlError, match="holds no campaign"):
-        again(tmp_path, 1, 0, ready_library)
-    file = tmp_path / "one" / "campaign.json"
-    file.write_text(file.read_text().replace('"link_loss": 0.5', '"link_loss": 0.4'))
-    with pytest.raises(UavctlError, match=r"flew another controller.*cells\[1\]\.link_loss is 0\.4 there"):
-        again(tmp_path / "one", 1, 0, ready_library)
+def test_a_run_alone_is_that_of_its_chunk(tmp_path: Path) -> None:
+    made = cells(tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO)
+    task = list(tasks_of(made))[3]
+    assert (task.cell, task.first, task.runs) == (1, CHUNK, 4)
+    found, _ = flown(task, CHUNK + 2, 1)
+    assert found.cost.shape == (1, 6)
+    assert found.cost.sum() == pytest.approx(fly_task(task)["cost"][2], rel=1e-12)

@@ -13,8 +13,8 @@ from campaign_rig import cells, controller, table
 
 from uavctl.lab.campaign import controllers, spec
 from uavctl.lab.campaign.controllers import build, met
-from uavctl.lab.campaign.pool import fly_tasks
-from uavctl.lab.campaign.tasks import Columns, Task, Work, fly_task, tasks_of
+from uavctl.lab.campaign.pool import Columns, Work, fly_tasks
+from uavctl.lab.campaign.tasks import Task, fly_task, tasks_of
 from uavctl.lab.campaign.world import fly
 from uavctl.smpc.batch import BatchSmpc, News
 

@@ -164,8 +164,6 @@ def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pyte
     assert run(["campaign", str(path), "--out", str(flown), "--resume", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [cell["place"]["controller"] for cell in document["cells"]] == ["own loop", "ours", "too sure"] * 2
-    assert run(["campaign", "--refly", "0:0", str(flown)]) == 2
-    assert "flights of the quadrotor" in capsys.readouterr().err
 
 
 def test_a_task_s_name_sorts_as_its_rows() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from uavctl.lab.identify.fit import (
     TRIES,
     AxisFit,
     choose_dead_time,
-    fit_axis,
+    fit_axes,
     is_worse,
     predict,
     predict_ahead,
@@ -36,7 +37,16 @@ from uavctl.lab.identify.history import (
     stretches,
     thinned,
 )
-from uavctl.lab.identify.response import INSTANT_S, DragLagAxis, LinearMotion, ReferenceAxis, advance, places, values
+from uavctl.lab.identify.response import (
+    INSTANT_S,
+    AxisModel,
+    DragLagAxis,
+    LinearMotion,
+    ReferenceAxis,
+    advance,
+    places,
+    values,
+)
 from uavctl.lab.identify.result import fit_link, identify
 from uavctl.smpc.plant import HeldAxis, Plant, drag_lag, velocity_reference
 
@@ -62,6 +72,10 @@ def fly(
         state = plant.a @ state + plant.b[:, 0] * acting[tick] + plant.e[:, 0] * wind[tick]
     inputs = np.column_stack([asked, np.zeros(count), np.zeros(count)])
     return Stretch(np.linspace(0.0, (count - 1) * TICK_S, count), inputs, np.array(times), np.array(places))
+
+
+def fit_axis(flown: Sequence[Stretch], axis: int, model: AxisModel, dead_time_s: float) -> AxisFit:
+    return fit_axes(flown, (axis,), (model,), dead_time_s, (None,))[0]
 
 
 def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> None:

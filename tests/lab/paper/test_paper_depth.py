@@ -10,10 +10,9 @@ import pytest
 from uavctl.build.controller import build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import UavctlError
-from uavctl.lab.bench.timing import copies
 from uavctl.lab.paper import depth as deep
 from uavctl.lab.paper.claims import Depth
-from uavctl.lab.paper.depth import Fineness, least_settled_cost
+from uavctl.lab.paper.depth import Fineness, alone, least_settled_cost
 from uavctl.smpc.bounds import lqr, stationary_bound
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import decompose
@@ -25,7 +24,7 @@ COARSE = Fineness(states=35, inputs=31)
 @pytest.fixture(scope="module")
 def axis() -> Design:
     design = build_design(load_config("paper"))
-    return copies(design, decompose(design)[0], 1)
+    return alone(design, decompose(design)[0])
 
 
 @pytest.fixture(scope="module")

@@ -144,34 +144,12 @@ def test_a_gain_without_a_complete_design_ends_with_1(capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--synthesize", "--compare-risk"), "one at a time"),
         (("--synthesize", "--states", "0"), "--states"),
         (("--synthesize", "--set", "smpc.delta_x=0.995"), "smpc.delta_x"),
         (("--synthesize", "--set", "sets.input_upper=[0.5, 0.5]"), "smpc.k_tau: no gain was found whose terminal set"),
-        (("--compare-risk", "--set", "target.position_m=[45.0, 0.0, 0.0]"), "Assumption 4.3"),
     ],
 )
 def test_what_cannot_be_ends_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], told: str) -> None:
     code, out, err = typed(capsys, "design", "--config", "paper", *arguments)
     assert (code, out) == (2, "")
     assert told in err
-
-
-def test_risk_as_typed(capsys: pytest.CaptureFixture[str]) -> None:
-    found = document(capsys, "design", "--config", "paper", "--compare-risk", "--states", "2")
-    assert [each["allocation"] for each in found["allocations"]] == ["ellipsoid", "halfspace", "component"]
-    assert {"kappa_x", "kappa_u", "terminal_backoff_x", "terminal_backoff_u", "costs"} <= found["allocations"][0].keys()
-    assert found["allocations"][0]["costs"]["start"] == pytest.approx(61669.93, abs=0.01)
-    code, out, _ = typed(capsys, "design", "--config", "paper", "--compare-risk", "--states", "1")
-    assert code == 0
-    for shown in ("component", "3.231", "16.4 5.38", "61669.93", "59952.53"):
-        assert shown in out
-
-
-def test_risk_shows_an_allocation_that_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = typed(
-        capsys, "design", "--config", "paper", "--compare-risk", "--states", "1", "--set", "risk.allocation=halfspace",
-        "--set", "sets.state_lower=[-30, -5, -25, -5]", "--set", "sets.state_upper=[50, 5, 20, 5]",
-    )  # fmt: skip
-    assert code == 0
-    assert "No design with ellipsoid" in out and "Assumption 4.3 fails" in out

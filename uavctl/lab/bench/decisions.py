@@ -39,17 +39,12 @@ class FlightBench(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class QuestionRecorder:
-    """A solver that keeps its questions.
-
-    Attributes:
-        questions: State (n_x,), target (n_x,) and outlook of each.
-        first_us: How long the first one took [µs].
-    """
+    """A solver that keeps its questions."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
-        self.questions: list[tuple[Array, Array, Preview]] = []
-        self.first_us = np.nan
+        self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and outlook of each
+        self.first_us = np.nan  # how long the first one took [µs]
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """See `Solver`."""

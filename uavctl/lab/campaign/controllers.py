@@ -31,7 +31,7 @@ from uavctl.lab.campaign.plugins import make_controller
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec
 from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.baselines import (
     CascadedPid,
     ControlProblem,
@@ -45,12 +45,10 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, News, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, News, OneByOne
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
-from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
-from uavctl.smpc.hahn_stursberg.library import Library
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
 
@@ -68,7 +66,9 @@ def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
         w: W (n_w, n_w).
         normal: Standard normal draws (N, T, n_w), see `Chances.normal`.
     """
-    shaped = spec.scale * _shaped(spec, normal) @ _root(w)
+    values, vectors = np.linalg.eigh(w)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # the symmetric one, which is unique
+    shaped = spec.scale * _shaped(spec, normal) @ root
     return np.asarray(shaped + spec.bias * np.sqrt(np.diag(w)), dtype=np.float64)
 
 
@@ -86,12 +86,6 @@ def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
             gusts[:, k] = spec.memory * gusts[:, k - 1] + np.sqrt(1.0 - spec.memory**2) * normal[:, k]
         return gusts
     return normal
-
-
-def _root(w: Array) -> Array:
-    """The symmetric root of W: there is one, and it is unique, for every covariance."""
-    values, vectors = np.linalg.eigh(w)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=np.float64)
 
 
 # What a cell's runs meet, whoever flies them: plant, limits, costs, start, link, disturbance.
@@ -289,14 +283,8 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     if design is None:
         raise ValueError("an SMPC without a design")
     library = None if recipe.library is None else decode(recipe.library).library
-    decider = _decider(design, library, build_solver(design, config, library))
+    decider = OneByOne(build_solver(design, config, library), design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
-
-
-def _decider(design: Design, library: Library | None, solver: Solver) -> Decider:
-    if library is None:
-        return OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
-    return ExplicitDecider(design, library, solver, design.target)
 
 
 def _tuned(config: Config, spec: CampaignSpec) -> PidGains:

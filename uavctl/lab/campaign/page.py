@@ -155,7 +155,6 @@ def _promise(view: CampaignView) -> Iterator[str]:
 
 
 PAGE = "report.html"
-_SPECIFICATION = "campaign.toml"
 _SHOWN_FAILURES = 50
 _PROMISED = "allowed by the SMPC's design"
 _HOW_SURE = (
@@ -187,13 +186,24 @@ def write_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
+    return _write(folder, report_html(read_results(folder)))
+
+
+def _write(folder: Path, text: str) -> Path:
     path = folder / PAGE
-    text = report_html(read_results(folder))
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UavctlError(f"{path}: cannot be written ({error.strerror}); make room or choose another place") from error
     return path
+
+
+def _specification(folder: Path) -> str:
+    """The campaign's file, folded; nothing where it is not there."""
+    try:
+        return page.folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
+    except OSError:
+        return ""
 
 
 def report_html(results: Results) -> str:
@@ -213,7 +223,6 @@ def _sections(view: CampaignView) -> Iterator[PageSection]:
     yield _age_section(view)
     yield _cells_section(view)
     yield _failures_section(view)
-    yield _again_section(view)
 
 
 def _compared_section(view: CampaignView) -> PageSection:
@@ -230,11 +239,7 @@ def _compared_section(view: CampaignView) -> PageSection:
         ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
         ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
     ]
-    try:
-        specification = page.folded("Specification", (results.folder / _SPECIFICATION).read_text(encoding="utf-8"))
-    except OSError:
-        specification = ""
-    return PageSection("What was compared", "", page.facts(rows) + specification)
+    return PageSection("What was compared", "", page.facts(rows) + _specification(results.folder))
 
 
 def _verdict_section(view: CampaignView) -> PageSection:
@@ -415,23 +420,6 @@ def _table(
     return text.replace("</tbody>", f"{below}</tbody>", 1)
 
 
-def _again_section(view: CampaignView) -> PageSection:
-    """How to look at one run, by the example of the costliest of an SMPC."""
-    flown = [cell for cell in view.cells if cell.kind == SMPC and cell.cost is not None]
-    if not flown:
-        return PageSection("A run again", "", page.paragraph("Runs of an SMPC can be flown again; there are none."))
-    cell = max(flown, key=lambda one: one.cost or 0.0)
-    runs = view.results.runs[cell.index]
-    worst = int(runs.index[runs["cost"].argmax()])
-    note = (
-        "Any run of an SMPC can be flown again by its number, through the flight controller, MAVLink and the recorder, "
-        f"with its disturbances and losses. The costliest run of cell {cell.index} ({cell.controller}, "
-        f"{view.place(group_of(cell))}):"
-    )
-    command = f"uavctl campaign --refly {cell.index}:{worst} --out flights/cell-{cell.index}-run-{worst} FOLDER"
-    return PageSection("A run again", note, f'<div class="card"><pre>{escape(command)}</pre></div>')
-
-
 # The page of a campaign in the world of the quadrotor: one HTML file, complete in itself.
 
 
@@ -457,14 +445,7 @@ def write_trial_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    path = folder / PAGE
-    told, cells = summarise_trial(folder)
-    try:
-        specification = (folder / SPECIFICATION).read_text(encoding="utf-8")
-        path.write_text(trial_html(told, cells, specification), encoding="utf-8")
-    except OSError as error:
-        raise UavctlError(f"{path}: cannot be written ({error.strerror}); make room or choose another place") from error
-    return path
+    return _write(folder, trial_html(*summarise_trial(folder), _specification(folder)))
 
 
 def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: str = "") -> str:
@@ -513,25 +494,23 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
     rows += [
         (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
     ]
-    folded = page.folded("Specification", specification) if specification else ""
-    yield PageSection("What was compared", _OWN, page.facts(rows) + folded)
+    yield PageSection("What was compared", _OWN, page.facts(rows) + specification)
     for number, (scenario, shown) in enumerate(SHOWN.items()):
         mine = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
         if not mine:
             continue
         columns = ("vehicle", "cameras", "link", "air", "controller", *(one.heading for one in shown), "ended in")
         table = [
-            (*_where(cell), cell.place.controller, *(one.told(cell.values[one.key]) for one in shown), _modes(cell))
+            (
+                *(*_where(cell), cell.place.controller),
+                *(one.told(cell.values[one.key]) for one in shown),
+                ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
+            )
             for cell in mine
         ]
-        numbers = frozenset(range(5, 5 + len(shown)))
-        body = page.table(columns, table, numbers).replace('class="many"', 'class="many dense"', 1)
+        body = _table(columns, table, frozenset(range(5, 5 + len(shown))))
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
-
-
-def _modes(cell: TrialSummary) -> str:
-    return ", ".join(f"{mode} {number}" for mode, number in cell.modes.items())
 
 
 def _amiss(cells: Sequence[TrialSummary]) -> PageSection:

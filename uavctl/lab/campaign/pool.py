@@ -11,20 +11,51 @@ import multiprocessing
 import os
 import signal
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import connection
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.tasks import Columns, Work
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CONNECT_S = 10.0
 _WORKERS_S = 60.0
+
+
+Columns = dict[str, NDArray[np.generic]]  # a row a run, by column of the results
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Work(ABC):
+    """What a worker is given: runs `first` … `first` + `runs` - 1 of a cell, in any world."""
+
+    cell: int
+    first: int
+    runs: int
+
+    @property
+    def name(self) -> str:
+        """Names it within its campaign; sorts as the rows do."""
+        return f"{self.cell:05d}-{self.first:08d}"
+
+    @abstractmethod
+    def fly(self) -> Columns:
+        """Fly the runs; what raises is told in a row, and stops nothing."""
+
+    @abstractmethod
+    def lost(self, error: str) -> Columns:
+        """The rows of runs that all ended without figures."""
 
 
 class Workers(Protocol):
@@ -60,6 +91,14 @@ class Processes:
             ended: Future[Columns] = Future()
             ended.set_exception(error)
             return ended
+
+    def each(self, done: Callable[[T], R], given: Iterable[T]) -> Iterator[R]:
+        """What is done with each of the given, in order.
+
+        Raises:
+            BrokenProcessPool: A process died.
+        """
+        return self._pool.map(done, given)
 
     def broken(self, error: BaseException) -> bool:
         """See `Workers`."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -47,20 +48,30 @@ _FIGURES = (
 _SINCE = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions have them not
 
 
-class CellFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """One combination of controller, link, disturbance and plant."""
+class ToldCell(msgspec.Struct, frozen=True, kw_only=True):
+    """One cell of a campaign in any world."""
 
     index: int
     controller: str
     link: str
-    disturbance: str
-    plant: str
     kind: str
     refused: str
-    promised_x: float | None = None  # 1 - δ_x
-    promised_u: float | None = None  # 1 - δ_u
     design_id: str | None = None
     usable_room: float | None = None  # share of it in which a plan may rest
+
+
+D = TypeVar("D")
+F = TypeVar("F")
+C = TypeVar("C", bound=ToldCell)
+
+
+class CellFigures(ToldCell, frozen=True, kw_only=True):
+    """One combination of controller, link, disturbance and plant."""
+
+    disturbance: str
+    plant: str
+    promised_x: float | None = None  # 1 - δ_x
+    promised_u: float | None = None  # 1 - δ_u
     link_loss: float | None = None  # of the flown link, where losses are independent and nothing else acts
 
 
@@ -109,14 +120,8 @@ def read_results(folder: Path) -> Results:
     Raises:
         UavctlError: One of them is missing or damaged.
     """
-    told = _told(folder)
-    try:
-        table = pq.read_table(folder / RUNS)
-        runs = {cell.index: _of_cell(table, cell.index) for cell in told.cells}
-    except (OSError, pa.ArrowException, KeyError) as error:
-        raise UavctlError(
-            f"{folder / RUNS}: cannot be read ({error}); if the campaign was interrupted, go on with --resume"
-        ) from error
+    told = read_document(folder, _Document)
+    runs = {cell.index: found for cell, found in zip(told.cells, read_cells(folder, told.cells, _of_cell), strict=True)}
     return Results(
         folder=folder,
         name=told.name,
@@ -129,26 +134,36 @@ def read_results(folder: Path) -> Results:
     )
 
 
-def read_cells(folder: Path) -> list[CellFigures]:
-    """The cells of a campaign, finished or not.
+def read_document(folder: Path, kind: type[D]) -> D:
+    """What was compared, by `campaign.json`.
 
     Raises:
-        UavctlError: `campaign.json` is missing or damaged.
+        UavctlError: It is missing, damaged, or of another kind.
     """
-    return _told(folder).cells
-
-
-def _told(folder: Path) -> _Document:
     try:
-        return msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=_Document)
+        return msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=kind)
     except (OSError, msgspec.MsgspecError) as error:
         raise UavctlError(f"{folder} holds no campaign ({error}); give the folder of one") from error
 
 
-def _of_cell(table: pa.Table, index: int) -> Runs:
-    cells = table["cell"].to_numpy()
-    first, last = np.searchsorted(cells, [index, index + 1])
-    rows = table.slice(first, last - first)
+def read_cells(folder: Path, cells: Sequence[C], figures: Callable[[pa.Table, C], F]) -> list[F]:
+    """What `figures` makes of the rows of each cell in `runs.parquet`.
+
+    Raises:
+        UavctlError: It is missing or damaged.
+    """
+    try:
+        table = pq.read_table(folder / RUNS)
+        column = table["cell"].to_numpy()
+        ends = (np.searchsorted(column, [cell.index, cell.index + 1]) for cell in cells)
+        return [figures(table.slice(a, b - a), cell) for cell, (a, b) in zip(cells, ends, strict=True)]
+    except (OSError, pa.ArrowException, KeyError) as error:
+        raise UavctlError(
+            f"{folder / RUNS}: cannot be read ({error}); if the campaign was interrupted, go on with --resume"
+        ) from error
+
+
+def _of_cell(rows: pa.Table, cell: CellFigures) -> Runs:  # noqa: ARG001 all are alike
     errors = rows["error"].to_pylist()
     numbers = rows["run"].to_numpy()
     good = np.array([not error for error in errors], dtype=np.bool_) & np.isfinite(rows["cost"].to_numpy())

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -295,20 +295,6 @@ def compose(spec: CampaignSpec, configuration: str, told: SpecProblems | None = 
     )
 
 
-def campaign_of(document: Mapping[str, object]) -> Campaign:
-    """The campaign of its `campaign.json`.
-
-    Raises:
-        ConfigError: It is not one that this version understands.
-    """
-    try:
-        spec = msgspec.convert(document.get("spec"), CampaignSpec)
-        configuration = msgspec.convert(document.get("configuration"), str)
-    except msgspec.ValidationError as error:
-        raise ConfigError((f"campaign.json: {error}; use the version that flew the campaign",)) from error
-    return compose(spec, configuration)
-
-
 def _one_a_step(believed: Config) -> Config:
     """A campaign's links carry one position a step: a scheme that counts on all there are has to know."""
     if not believed.conditioned:
@@ -378,24 +364,13 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
-    text = text_of(path)
-    table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
-    source = Source(str(path), key_lines(text))
-    found: list[ConfigProblem] = []
-    told = SpecProblems(source)
-    told.tell(oversized(table))
-    if told.problems:
-        raise ConfigError(told.problems)
-    spec = cast("CampaignSpec | None", decode(CampaignSpec, table, "", found, {}))
-    told.tell([*found, *_kinds(table)])
-    if spec is None:
-        raise ConfigError(told.problems)
+    spec, told, text = read_spec(path, CampaignSpec)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)
     told.tell(_sizes(spec))
     if told.problems:  # the rest is work for each of them
         raise ConfigError(told.problems)
     told.tell(_names(spec))
-    name = spec.config if spec.config in presets() else str(path.parent / spec.config)
+    name = configuration_of(path, spec.config)
     base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
     if base is None:
         raise ConfigError(told.problems)
@@ -403,6 +378,34 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     told.tell(_starts(spec, base))
     base = msgspec.structs.replace(base, mission=MissionConfig(), fence=())  # runs go to the target, and nowhere else
     return compose(spec, dump_config(base), told), text
+
+
+Spec = TypeVar("Spec", bound=Section)
+
+
+def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, SpecProblems, str]:
+    """The specification in a file, problems with it so far, and the file's text.
+
+    Raises:
+        ConfigError: There is none; with all problems found.
+    """
+    text = text_of(path)
+    table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
+    found: list[ConfigProblem] = []
+    told = SpecProblems(Source(str(path), key_lines(text)))
+    told.tell(oversized(table))
+    if told.problems:
+        raise ConfigError(told.problems)
+    spec = cast("Spec | None", decode(kind, table, "", found, {}))
+    told.tell([*found, *(_kinds(table) if kind is CampaignSpec else ())])
+    if spec is None:
+        raise ConfigError(told.problems)
+    return spec, told, text
+
+
+def configuration_of(path: Path, config: str) -> str:
+    """The `config` of a campaign's file as `load_config` takes it: a preset, or a file seen from there."""
+    return config if config in presets() else str(path.parent / config)
 
 
 def text_of(path: Path) -> str:
@@ -446,9 +449,7 @@ def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
     for key, names in lists.items():
         if not names:
             yield ConfigProblem(key, "is empty: there is nothing to fly", f"add a [[{key}]]")
-        for i, name in enumerate(names):
-            if name in names[:i]:
-                yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
+        yield from taken_twice(key, names)
     if TRUE in links:
         place = f"link[{links.index(TRUE)}].name"
         yield ConfigProblem(place, f'"{TRUE}" means the link that is flown on', "give it another name")
@@ -476,6 +477,13 @@ def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
                 controller_class(kind)
             except DesignError as error:
                 yield ConfigProblem(f"controller[{i}].kind", error.reason, error.hint)
+
+
+def taken_twice(key: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
+    """Names in the tables [[key]] that are there already."""
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
 
 
 def _known(key: str, name: str, names: Sequence[str], what: str) -> Iterator[ConfigProblem]:

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.tasks import Columns, Work
+from uavctl.lab.campaign.pool import Columns, Work
 
 DOCUMENT, SPECIFICATION, RUNS, PARTS = "campaign.json", "campaign.toml", "runs.parquet", "parts"
 _GROUP_ROWS = 65_536

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -17,11 +16,11 @@ from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
+from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import SMPC
 from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, fly
 from uavctl.lab.trial import NEAR_M, NEARER_M, room_of, usable_seen
-from uavctl.smpc.baselines import PidGains
 from uavctl.smpc.batch import Tally
 
 # The cells of a campaign: the product of its controllers, links, disturbances and plants, in the order given.
@@ -53,13 +52,6 @@ def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
         _cell(campaign, index, which, recipes[which[0], campaign.believed_link(*which[:2])])
         for index, which in enumerate(_product(campaign))
     )
-
-
-def cell_of(campaign: Campaign, index: int, library_for: LibraryFor) -> Cell:
-    """One cell alone; see `cells_of`."""
-    which = _product(campaign)[index]
-    recipe = _recipe(campaign, (which[0], campaign.believed_link(*which[:2])), library_for)
-    return _cell(campaign, index, which, recipe)
 
 
 Which = tuple[int, int, int, int]  # indices of controller, link, disturbance and plant
@@ -97,7 +89,7 @@ def _cell(campaign: Campaign, index: int, which: Which, recipe: Recipe | str) ->
 
 
 def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
-    """What `campaign.json` holds: enough to fly every run again."""
+    """What `campaign.json` holds."""
     spec = campaign.spec
     return {
         "version": VERSION,
@@ -115,7 +107,7 @@ def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
 def told(cell: Cell) -> dict[str, object]:
     """What `campaign.json` holds of a cell."""
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
-    design = None if recipe is None else recipe.design
+    design, gains = (None, None) if recipe is None else (recipe.design, recipe.gains)
     smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
     delta_u = None if smpc is None else smpc.delta_u
     return {
@@ -129,7 +121,7 @@ def told(cell: Cell) -> dict[str, object]:
         "library_id": None if recipe is None else recipe.library_id,
         "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
         "promised_u": None if delta_u is None else 1.0 - delta_u,
-        "gains": None if recipe is None or recipe.gains is None else _gains(recipe.gains),
+        "gains": None if gains is None else {one.name: getattr(gains, one.name).tolist() for one in fields(gains)},
         "link_loss": _plain_loss(cell.setting.link),
         "usable_room": None if smpc is None or recipe is None else _usable(recipe),
         "refused": cell.refused,
@@ -143,10 +135,6 @@ def _usable(recipe: Recipe) -> float | None:
     except DesignError:
         return None
     return share if math.isfinite(share) else None
-
-
-def _gains(gains: PidGains) -> dict[str, list[float]]:
-    return {field.name: getattr(gains, field.name).tolist() for field in fields(gains)}
 
 
 def _plain_loss(link: LinkConfig) -> float | None:
@@ -205,8 +193,6 @@ def _first_s(near: NDArray[np.bool_], dt_s: float) -> Array:
 # A task of a campaign: some runs of one cell, in; a row of figures for each, out. The same wherever it is done.
 
 
-Columns = dict[str, NDArray[np.generic]]
-
 _MET = ("decisions", "infeasible", "slack_used", "fallbacks")
 _WHOLE = ("steps", "state_violations", "input_violations", "saturated", "max_age", *_MET)
 _WAYS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")
@@ -214,60 +200,20 @@ _REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap", *_WAYS)
 _AT_LIMIT = 1e-9
 
 
-class Work(Protocol):
-    """What a worker is given: some runs of a cell, in any world."""
-
-    @property
-    def cell(self) -> int:
-        """Index of the cell."""
-        ...
-
-    @property
-    def runs(self) -> int:
-        """How many."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
-        ...
-
-    def fly(self) -> Columns:
-        """Fly the runs; what raises is told in a row, and stops nothing."""
-        ...
-
-    def lost(self, error: str) -> Columns:
-        """The rows of runs that all ended without figures."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class Task:
+class Task(Work):
     """Runs `first` … `first` + `runs` - 1 of a cell."""
 
-    cell: int
-    first: int
-    runs: int
     setting: Setting
     recipe: Recipe
-
-    @property
-    def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
-        return name_of(self.cell, self.first)
 
     def fly(self) -> Columns:
         """See `fly_task`."""
         return fly_task(self)
 
     def lost(self, error: str) -> Columns:
-        """The rows of a task whose runs all ended without figures."""
+        """See `Work`."""
         return _without_figures(self, self.first, self.runs, error)
-
-
-def name_of(cell: int, first: int) -> str:
-    """Name of a task that begins with a run of a cell; sorts as the rows do."""
-    return f"{cell:05d}-{first:08d}"
 
 
 def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:

@@ -9,23 +9,23 @@ from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from msgspec import Meta
 
 from uavctl import __version__
 from uavctl.build.controller import build_controller, design_of
-from uavctl.config import Config, Source, dump_config, load, load_config, parse, presets
-from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section, key_lines, oversized
-from uavctl.config.load import decode, parse_toml
+from uavctl.config import Config, dump_config, load, load_config, parse
+from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section
+from uavctl.config.load import parse_toml
 from uavctl.config.reference import tables
-from uavctl.errors import ConfigError, DesignError, UavctlError
+from uavctl.errors import ConfigError, DesignError
 from uavctl.lab.campaign.controllers import LibraryFor
-from uavctl.lab.campaign.results import DOCUMENT, RUNS
+from uavctl.lab.campaign.pool import Columns, Work
+from uavctl.lab.campaign.results import ToldCell, read_cells, read_document
 from uavctl.lab.campaign.spec import (
     CONFIGURATION,
     MOST_CELLS,
@@ -34,11 +34,13 @@ from uavctl.lab.campaign.spec import (
     LinkSpec,
     Name,
     Overrides,
-    SpecProblems,
+    configuration_of,
     placed,
+    read_spec,
+    taken_twice,
     text_of,
 )
-from uavctl.lab.campaign.tasks import Columns, name_of, told_of
+from uavctl.lab.campaign.tasks import told_of
 from uavctl.lab.own_loop import TUNED, OwnTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
@@ -189,21 +191,13 @@ class TrialPlace:
 
 
 @dataclass(frozen=True)
-class TrialTask:
+class TrialTask(Work):
     """Flights `first` … `first` + `runs` - 1 of a cell."""
 
-    cell: int
-    first: int
-    runs: int
     flown: TrialCell
     seconds: float
     from_s: float
     master: int
-
-    @property
-    def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
-        return name_of(self.cell, self.first)
 
     def fly(self) -> Columns:
         """Fly; a flight that raises has what ended it in its row, and stops nothing."""
@@ -217,7 +211,7 @@ class TrialTask:
         return self._columns(rows)
 
     def lost(self, error: str) -> Columns:
-        """The rows of flights that all ended without figures."""
+        """See `Work`."""
         return self._columns([(TrialFlight(seed_of(self.master, self.first + i)), error) for i in range(self.runs)])
 
     def _columns(self, rows: Sequence[tuple[TrialFlight, str]]) -> Columns:
@@ -250,7 +244,7 @@ def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...
     places = []
     for index, (scenario, autopilot, rate_hz, air, link, controller) in enumerate(product(*axes)):
         pilot = _pilot(spec, controller, autopilot, text)
-        cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, _settings(link), air)
+        cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, link.set, air)
         found: tuple[str | None, float | None, str] = (None, None, "")
         if pilot.own is None:
             config = believed(cell)
@@ -266,10 +260,6 @@ def _pilot(spec: TrialSpec, given: TrialControllerSpec, autopilot: AutopilotName
     if given.kind == "own-loop":
         own = TUNED[autopilot] if given.tuned else OwnTuning()
     return TrialPilot(given.name, spec.config, given.set, own, given.link == "true", text)
-
-
-def _settings(link: LinkSpec) -> tuple[str, ...]:
-    return tuple(link.set)
 
 
 def _designed(knows: Config, library_for: LibraryFor) -> tuple[str | None, float | None, str]:
@@ -344,19 +334,8 @@ def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
-    text = text_of(path)
-    table = parse_toml(text, str(path))
-    source = Source(str(path), key_lines(text))
-    found: list[ConfigProblem] = []
-    told = SpecProblems(source)
-    told.tell(oversized(table))
-    if told.problems:
-        raise ConfigError(told.problems)
-    spec = cast("TrialSpec | None", decode(TrialSpec, table, "", found, {}))
-    told.tell(found)
-    if spec is None:
-        raise ConfigError(told.problems)
-    name = spec.config if spec.config in presets() else str(path.parent / spec.config)
+    spec, told, text = read_spec(path, TrialSpec)
+    name = configuration_of(path, spec.config)
     spec = msgspec.structs.replace(spec, config=name, runs=spec.runs if runs is None else runs)
     told.tell(_wrong(spec))
     base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
@@ -372,13 +351,8 @@ def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
 
 
 def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
-    for key, names in (
-        ("controller", [one.name for one in spec.controller]),
-        ("link", [one.name for one in spec.link]),
-    ):
-        for i, name in enumerate(names):
-            if name in names[:i]:
-                yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
+    yield from taken_twice("controller", [one.name for one in spec.controller])
+    yield from taken_twice("link", [one.name for one in spec.link])
     for i, one in enumerate(spec.controller):
         if one.kind == "own-loop" and (one.set or one.link != "true"):
             yield ConfigProblem(
@@ -405,27 +379,20 @@ def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
 # What the flights of a campaign in the world of the quadrotor came to.
 
 
-class ToldPlace(msgspec.Struct, frozen=True, kw_only=True):
+class ToldPlace(ToldCell, frozen=True, kw_only=True):
     """A cell as `campaign.json` has it."""
 
-    index: int
-    controller: str
-    kind: str
     scenario: Scenario
     autopilot: str
     rate_hz: float
     air: str
-    link: str
-    refused: str
-    usable_room: float | None = None
-    design_id: str | None = None
 
 
 class ToldTrial(msgspec.Struct, frozen=True, kw_only=True):
     """A campaign as `campaign.json` has it."""
 
     name: str
-    world: str
+    world: Literal["quadrotor"]
     uavctl_version: str
     master: int
     runs: int
@@ -445,35 +412,17 @@ class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
     values: dict[str, list[float]]
 
 
-def told_trial(folder: Path) -> ToldTrial | None:
-    """What a folder's campaign compared; None if it is of another world, or none at all."""
-    try:
-        told = msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=ToldTrial)
-    except (OSError, msgspec.MsgspecError):
-        return None
-    return told if told.world == QUADROTOR else None
-
-
 def summarise_trial(folder: Path) -> tuple[ToldTrial, list[TrialSummary]]:
     """The figures of every cell of a campaign.
 
     Raises:
         UavctlError: The folder has no results that can be read.
     """
-    told = told_trial(folder)
-    if told is None:
-        raise UavctlError(f"{folder} holds no campaign of flights; give the folder of one")
-    try:
-        table = pq.read_table(folder / RUNS)
-        return told, [_summary(table, place) for place in told.cells]
-    except (OSError, pa.ArrowException, KeyError) as error:
-        raise UavctlError(f"{folder / RUNS}: cannot be read ({error}); go on with --resume") from error
+    told = read_document(folder, ToldTrial)
+    return told, read_cells(folder, told.cells, _summary)
 
 
-def _summary(table: pa.Table, place: ToldPlace) -> TrialSummary:
-    cells = table["cell"].to_numpy()
-    first, last = np.searchsorted(cells, [place.index, place.index + 1])
-    rows = table.slice(first, last - first)
+def _summary(rows: pa.Table, place: ToldPlace) -> TrialSummary:
     errors = rows["error"].to_pylist()
     good = [i for i, error in enumerate(errors) if not error]
     columns = {name: rows[name].to_pylist() for name in (*REAL, "mode")}

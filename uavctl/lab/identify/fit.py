@@ -109,13 +109,6 @@ def fit_axes(
     return tuple(found)
 
 
-def fit_axis(
-    flown: Sequence[Stretch], axis: int, model: AxisModel, dead_time_s: float, start: Sequence[float] | None = None
-) -> AxisFit:
-    """Fit one axis, see `fit_axes`."""
-    return fit_axes(flown, (axis,), (model,), dead_time_s, (start,))[0]
-
-
 def standard_errors(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> dict[str, float]:
     """Standard error of each fitted value with the dead time as given, by the curvature at the optimum.
 

@@ -114,7 +114,11 @@ def stretches(asked: SetpointHistory, seen: PositionHistory) -> tuple[Stretch, .
     Raises:
         RecordingError: There is none that is long enough; says what is missing.
     """
-    found = tuple(stretch for stretch in _all(asked, seen) if _long_enough(stretch))
+    found = tuple(
+        stretch
+        for stretch in _all(asked, seen)
+        if len(stretch.times_s) >= LEAST_SAMPLES and stretch.length_s >= SHORTEST_S
+    )
     if not found:
         flown_s = sum(end - begin for begin, end in _spans(asked))
         raise RecordingError(
@@ -176,10 +180,6 @@ def _all(asked: SetpointHistory, seen: PositionHistory) -> Iterator[Stretch]:
         changed = np.concatenate([[True], np.any(np.diff(accel, axis=0) != 0.0, axis=1)])
         held = (seen.times_s > begin) & (seen.times_s <= end)
         yield Stretch(times_s[changed], accel[changed], seen.times_s[held], seen.positions_m[held])
-
-
-def _long_enough(stretch: Stretch) -> bool:
-    return len(stretch.times_s) >= LEAST_SAMPLES and stretch.length_s >= SHORTEST_S
 
 
 # The history of a flight out of its recording: our own, or a `.tlog` of anybody's.

@@ -13,7 +13,7 @@ on a grid, cubic in between; with the limits open, the remainder is 0 and λ the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,17 @@ from scipy.special import roots_hermitenorm
 from uavctl.build.controller import build_design, build_spec, start_state
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
-from uavctl.lab.bench.timing import Case, copies, few_policies, median, timed
+from uavctl.lab.bench.timing import Case, median, timed
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, DesignTried
 from uavctl.smpc.bounds import lqr
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
-from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary, Region
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem
+from uavctl.smpc.hahn_stursberg.policies import PolicyProgram
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
+from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -91,7 +94,7 @@ def least_settled_cost(
     p, noise = lqr(plant, q_x, q_u).p, plant.e @ plant.w @ plant.e.T
     unknown = _growing(plant.a, noise)
     grid = _Grid(_REACH * np.sqrt(np.diagonal(noise)), fineness.states)
-    low, high = _sides(input_set)
+    ((low,), (high,)) = input_set.bounds
     inputs = np.linspace(low, high, fineness.inputs)
     ahead = (grid.points @ plant.a.T)[:, None] + inputs[:, None] * plant.b.T  # y (G, U, 2)
     known = _square(grid.points, q_x - p)
@@ -144,11 +147,6 @@ def _square(points: Array, weight: Array) -> Array:
     return np.asarray(np.einsum("...i,ij,...j->...", points, weight, points), dtype=np.float64)
 
 
-def _sides(limits: Polytope) -> tuple[float, float]:
-    rows = limits.c[:, 0]
-    return float((limits.b[rows < 0] / rows[rows < 0]).max()), float((limits.b[rows > 0] / rows[rows > 0]).min())
-
-
 # What takes a minute or two: which schedules make a design, complexity over τ, and the least settled cost.
 
 
@@ -160,13 +158,14 @@ _SEARCHED = "schedule.search_states=[[35,-2,-20,-4],[20,-5,-15,5],[5,-5,-5,5],[2
 _TAUS = (2, 3, 4, 5, 6)
 _HORIZON, _FREE = 12, 8  # H as printed; N = H - τ as in the printed design
 _STATES, _RUNS, _POLICIES = 20, 3, 6
+_TRIES_PER_POLICY = 50
 
 
 def measure_depth(seed: int, told: Told) -> Depth:
     """Measure all of it."""
     config = load(PRESET).config
     design, loss = build_design(config), build_spec(config).link.outage(1)
-    one = copies(design, decompose(design)[0], 1)
+    one = alone(design, decompose(design)[0])
     told("least settled cost within the input limits")
     least = least_settled_cost(one.plant, one.input_set, one.q_x, one.q_u, loss)
     return Depth(
@@ -254,8 +253,62 @@ def _one_axis(tau: int, horizon: int) -> Design | str:
         design = build_design(load(PRESET, overrides).config)
     except (ConfigError, DesignError) as error:
         return str(error)
-    return copies(design, decompose(design)[0], 1)
+    return alone(design, decompose(design)[0])
 
 
 def _ms(us: float | None) -> float | None:
     return None if us is None else us / 1e3
+
+
+def few_policies(design: Design, count: int, rng: np.random.Generator) -> tuple[Library, int] | None:
+    """A library of `count` policies for a design of one component, and its number of gains; None if there is none."""
+    (component,) = decompose(design)
+    problem = MeanProblem(design, horizon_of(design, component))
+    program, region = PolicyProgram(problem, design.max_iterations), Region(design, component)
+    policies = [program.cheapest()]
+    for _ in range(_TRIES_PER_POLICY * count):
+        if len(policies) == count:
+            break
+        found = program.best(problem.question(*region.draw(rng)))
+        policies += [found] if found is not None else []
+    kept = [policy for policy in policies if policy is not None]
+    if len(kept) < len(policies):
+        return None
+    part = PartLibrary(
+        theta=np.array([policy.theta for policy in kept]),
+        level=np.array([policy.level for policy in kept]),
+        slope=np.array([policy.slope for policy in kept]),
+    )
+    return Library(design.design_id, ((part,),)), problem.horizon.n_theta
+
+
+def alone(design: Design, component: Component) -> Design:
+    """The design of one component alone; likelihoods and schedule stay the design's.
+
+    The axis has no meaning in space; only the component's first position is named.
+    """
+    n_u, held = component.b.shape[1], int(component.held[0])
+    plant = Plant(
+        a=component.a,
+        b=component.b,
+        e=component.e,
+        w=component.w,
+        dt_s=design.plant.dt_s,
+        axes=("north",),
+        position_index=(held,),
+        velocity_index=(held,),
+        accel_per_input=np.zeros((1, n_u)),
+    )
+    return replace(
+        design,
+        plant=plant,
+        state_set=Polytope(component.c_x, component.b_x),
+        input_set=Polytope(component.c_u, component.b_u),
+        q_x=component.q_x,
+        q_u=component.q_u,
+        target=design.target[component.states],
+        terminal=make_terminal(plant, design.terminal.tau, component.k, component.q_x, component.q_u),
+        estimate_cov=component.estimate_cov,
+        late=(),
+        design_id=f"{design.design_id}, 1 x {component.states.tolist()}",
+    )

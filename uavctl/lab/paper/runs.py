@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import reduce
-from multiprocessing import get_context
+from functools import cache, partial, reduce
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,10 +19,10 @@ from scipy.special import gammaincinv
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
+from uavctl.lab.campaign.pool import processes
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions, OneByOne
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.explicit import ExplicitDecider
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
@@ -49,18 +46,14 @@ class Setup:
 
 
 class Watched:
-    """A decider whose plans are held against (19c): the last mean state is the target.
-
-    Attributes:
-        missed: Plans so far that end elsewhere.
-    """
+    """A decider whose plans are held against (19c): the last mean state is the target."""
 
     def __init__(self, decider: Decider, design: Design) -> None:
         a, b, steps = design.plant.a, design.plant.b, design.horizon
         self._decider, self._target = decider, design.target
         self._of_x = np.linalg.matrix_power(a, steps)
         self._of_inputs = np.hstack([np.linalg.matrix_power(a, steps - 1 - t) @ b for t in range(steps)])
-        self.missed = 0
+        self.missed = 0  # plans so far that end elsewhere
 
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
@@ -87,17 +80,11 @@ class Chunk:
 class ChunkRunner:
     """Flies chunks of one design's runs."""
 
-    def __init__(self, setup: Setup, *, many: bool) -> None:
-        """Args: what flies; whether so much is flown that tables of answers are worth their seconds."""
+    def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
         self._setup = setup
         solver = LibrarySolver(design, setup.library, exact=config.solver.exact)
-        decider: Decider
-        if many:
-            decider = ExplicitDecider(design, setup.library, solver, design.target)
-        else:
-            decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
-        self._watched = Watched(decider, design)
+        self._watched = Watched(OneByOne(solver, design.target, (design.horizon, design.plant.n_u)), design)
         self._smpc = BatchSmpc(
             self._watched, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
         )
@@ -186,51 +173,30 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Totals of runs of T steps; *settled* is the second half of a run.
+    """Totals of runs of T steps; *settled* is the second half of a run."""
 
-    Attributes:
-        cost: Summed cost of a run.
-        settled_cost: Mean stage cost of a run's settled steps.
-        trend: Mean stage cost of a run's last quarter minus that of the quarter before.
-        runs_outside: Runs that left X.
-        runs_asking: Runs in which an input outside U was asked for.
-        failed: Runs that ended in numbers that are not finite.
-        decisions, infeasible, slack_used, missed, fallbacks: See `Chunk`.
-        outside: Runs outside X after each step (T,).
-        asking: Runs that ask for an input outside U, in each step (T,).
-        ages: Runs of each age in each step (T, T).
-        arrived: Runs by the first step in which they were in the ellipsoid (T+2,); the last entry: never.
-        ended_inside: Runs whose last state is in the ellipsoid.
-        settled_inside: Settled states in the ellipsoid.
-        settled: Number of settled states.
-        settled_sum: Their sum (n_x,).
-        settled_squares: Sum of their outer products (n_x, n_x).
-        largest_gap: Largest certified relative gap of a plan.
-        closest: Least room to each state limit (m_x,), negated so that the largest is the closest.
-    """
-
-    cost: Moments
-    settled_cost: Moments
-    trend: Moments
-    runs_outside: int
-    runs_asking: int
-    failed: int
-    decisions: int
+    cost: Moments  # summed cost of a run
+    settled_cost: Moments  # mean stage cost of a run's settled steps
+    trend: Moments  # mean stage cost of a run's last quarter minus that of the quarter before
+    runs_outside: int  # runs that left X
+    runs_asking: int  # runs in which an input outside U was asked for
+    failed: int  # runs that ended in numbers that are not finite
+    decisions: int  # this and the next four as in `Chunk`
     infeasible: int
     slack_used: int
     missed: int
     fallbacks: int
-    outside: Counts
-    asking: Counts
-    ages: Counts
-    arrived: Counts
-    ended_inside: int
-    settled_inside: int
-    settled: int
-    settled_sum: Array
-    settled_squares: Array
-    largest_gap: float
-    closest: Array
+    outside: Counts  # runs outside X after each step (T,)
+    asking: Counts  # runs that ask for an input outside U, in each step (T,)
+    ages: Counts  # runs of each age in each step (T, T)
+    arrived: Counts  # runs by the first step in which they were in the ellipsoid (T+2,); the last entry: never
+    ended_inside: int  # runs whose last state is in the ellipsoid
+    settled_inside: int  # settled states in the ellipsoid
+    settled: int  # number of settled states
+    settled_sum: Array  # their sum (n_x,)
+    settled_squares: Array  # sum of their outer products (n_x, n_x)
+    largest_gap: float  # largest certified relative gap of a plan
+    closest: Array  # least room to each state limit (m_x,), negated so that the largest is the closest
 
     def __add__(self, other: Totals) -> Totals:
         def joined(name: str) -> Any:
@@ -304,9 +270,8 @@ def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
 Advance = Callable[[int], None]
 
 CHUNK = 1000  # runs flown together; the same whoever flies them, so that workers change nothing
-HERE_UP_TO = 500  # runs that are not worth another process, nor tables
+HERE_UP_TO = 500  # runs that are not worth another process
 DRAWN = 200  # runs whose trajectories are kept, for the figures
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,43 +327,25 @@ def _flier(
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
     """Maps tasks to their results, in order."""
     if runs <= HERE_UP_TO:
-        crew = RunnerOfDesign(setups, many=False)
+        crew = RunnerOfDesign(setups)
         yield lambda tasks: map(crew.fly, tasks)
         return
-    with _single_threaded(), TemporaryDirectory() as folder:
-        # Not as an argument: a process that ends while it is being sent more than a pipe holds would be waited for.
+    with processes(workers) as pool, TemporaryDirectory() as folder:
+        # Not with each task: designs and libraries are larger than what a pipe holds.
         path = Path(folder) / "setups"
         path.write_bytes(pickle.dumps(list(setups)))
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _join, (path,))
         try:
-            yield lambda tasks: pool.map(_fly, tasks)
+            yield lambda tasks: pool.each(partial(_fly, path), tasks)
         except BrokenProcessPool as error:
             raise UavctlError("a worker process ended before its runs; take fewer --workers, or free memory") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _single_threaded() -> Iterator[None]:
-    """Processes started here calculate in one thread: as many would only wait for each other, and round differently."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class RunnerOfDesign:
     """One pilot a design."""
 
-    def __init__(self, setups: Sequence[Setup], *, many: bool) -> None:
+    def __init__(self, setups: Sequence[Setup]) -> None:
         self._designs = [setup.design for setup in setups]
-        self._pilots = [ChunkRunner(setup, many=many) for setup in setups]
+        self._pilots = [ChunkRunner(setup) for setup in setups]
 
     def fly(self, task: ChunkTask) -> Flights:
         """The runs of one task; those of the first one are kept for the figures."""
@@ -407,12 +354,11 @@ class RunnerOfDesign:
         return Flights(total(chunk, self._designs[task.which]), chunk.flown.states[:kept].copy())
 
 
-_crew: list[RunnerOfDesign] = []  # of a worker process
+@cache
+def _crew(path: Path) -> RunnerOfDesign:
+    """Of a worker process; made for its first task."""
+    return RunnerOfDesign(pickle.loads(path.read_bytes()))
 
 
-def _join(path: Path) -> None:
-    _crew.append(RunnerOfDesign(pickle.loads(path.read_bytes()), many=True))
-
-
-def _fly(task: ChunkTask) -> Flights:
-    return _crew[0].fly(task)
+def _fly(path: Path, task: ChunkTask) -> Flights:
+    return _crew(path).fly(task)

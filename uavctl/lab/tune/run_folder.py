@@ -173,16 +173,11 @@ class TuneProgress(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TuneFolder:
-    """A run on disk.
-
-    Attributes:
-        path: The folder.
-        progress: How far the run has come.
-    """
+    """A run on disk."""
 
     def __init__(self, path: Path, progress: TuneProgress) -> None:
         self.path = path
-        self.progress = progress
+        self.progress = progress  # how far the run has come
 
     @classmethod
     def opened(cls, path: Path, config: Config, asked: TuneAsked) -> TuneFolder:
@@ -194,7 +189,8 @@ class TuneFolder:
         text = dump_config(config)
         digest = hashlib.sha256(text.encode()).hexdigest()
         if not (path / STATE).exists():
-            if path.exists() and (not path.is_dir() or any(map(_is_anothers, path.iterdir()))):
+            # A run that was cut off while it wrote its first file leaves a part of that.
+            if path.exists() and (not path.is_dir() or any(one.name != f"{STATE}.part" for one in path.iterdir())):
                 raise UsageError(f"--folder {path}: is no run of `uavctl tune`, and not empty; choose another folder")
             path.mkdir(parents=True, exist_ok=True)
             folder = cls(path, TuneProgress(asked=asked, digest=digest))
@@ -268,17 +264,14 @@ def sole_run(path: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"--folder {path}: no folder can be had there ({error.strerror}); choose another") from error
     try:
-        _lock(descriptor, path)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            reason = "another `uavctl tune` is at work in it; wait for it, or end it"
+            raise UsageError(f"--folder {path}: {reason}") from None
         yield
     finally:
         os.close(descriptor)
-
-
-def _lock(descriptor: int, path: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UsageError(f"--folder {path}: another `uavctl tune` is at work in it; wait for it, or end it") from None
 
 
 def read_tuned(path: Path) -> Config:
@@ -299,11 +292,6 @@ def read_tuned(path: Path) -> Config:
             "command then writes it anew"
         )
     return config
-
-
-def _is_anothers(path: Path) -> bool:
-    """Whether a file is none of a run that was cut off while it wrote its first one."""
-    return path.name != f"{STATE}.part"
 
 
 def _read(path: Path) -> TuneProgress:

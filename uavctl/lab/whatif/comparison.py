@@ -236,15 +236,11 @@ def story(found: WhatIf) -> list[str]:
 
 def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
     """Rows of the figures: name, recorded, reproduced, what-if."""
-    columns = [dict(rows(_bare(one))) for one in (found.recorded, found.reproduced, found.what_if)]
+    bare = [replace(one, recording=None, report=None) for one in (found.recorded, found.reproduced, found.what_if)]
+    columns = [dict(rows(one)) for one in bare]
     for name in dict.fromkeys(name for column in columns for name in column):
         if name not in _NOT_FLOWN:
             yield (name, *(column.get(name, "-") for column in columns))
-
-
-def _bare(summary: FlightSummary) -> FlightSummary:
-    """Without what does not compare: where it is written."""
-    return replace(summary, recording=None, report=None)
 
 
 def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:

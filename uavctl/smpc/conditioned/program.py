@@ -31,25 +31,22 @@ _APART = 1e-8  # of a setpoint: what the first row and the set of inputs have in
 class SlewRows:
     """|D (u_t - u_(t-1))| <= side in each row that can bind.
 
-    Attributes:
-        d: D (m, n_u), change of an axis' acceleration setpoint per change of the input [m/s² per unit].
-        axes: Index of the plant's axis of each row (m,).
-        side: Largest change in a step [m/s²].
-
     Args:
         input_set: U; a change as large as the whole of it needs no row.
         slew_mps3: Largest change in a second [m/s³]; infinite for no rows.
     """
 
     def __init__(self, plant: Plant, input_set: Polytope, slew_mps3: float) -> None:
-        self.side = slew_mps3 * plant.dt_s
+        self.side = slew_mps3 * plant.dt_s  # largest change in a step [m/s²]
         self._set = input_set
         self._low, self._high = input_set.bounds
         self._lows, self._highs = self._low.tolist(), self._high.tolist()
         d = plant.accel_map
         with np.errstate(invalid="ignore"):  # an input without limits that an axis does not feel
             widest = np.nansum(np.abs(d) * (self._high - self._low), axis=1)
+        # Index of the plant's axis of each row (m,)
         self.axes = np.flatnonzero(np.any(d != 0.0, axis=1) & (widest > self.side))
+        # D (m, n_u), change of an axis' acceleration setpoint per change of the input [m/s² per unit]
         self.d = d[self.axes]
         self._sides = np.full(self.axes.size, self.side)
         self._box = all(np.count_nonzero(row) == 1 for row in input_set.c)
@@ -256,17 +253,14 @@ def _directions(of_z: Array, above: Index, below: Index) -> Array:
 
 
 class RestPlaces:
-    """Equilibria of one part: the one nearest to a target that keeps given limits.
-
-    Attributes:
-        rows: Of each row of the part, its value (m, n_y) at an equilibrium of the whole plant.
-    """
+    """Equilibria of one part: the one nearest to a target that keeps given limits."""
 
     def __init__(self, problem: ControlProblem, rests: Equilibria, part: Part) -> None:
         (self._own,) = np.nonzero(np.isin(rests.held, part.states))
         self._states, self._held = part.states, rests.held[self._own]
         self._x_eq = rests.x_eq[np.ix_(part.states, self._own)]
         rows = problem.state_set.c[np.ix_(part.rows_x, part.states)] @ self._x_eq
+        # Of each row of the part, its value (m, n_y) at an equilibrium of the whole plant
         self.rows = np.zeros((part.rows_x.size, rests.held.size))
         self.rows[:, self._own] = rows
         (self._used,) = np.nonzero(np.any(rows != 0.0, axis=1))
@@ -296,13 +290,7 @@ class RestPlaces:
 
 
 class RegulatedRows:
-    """What follows from a deviation dx (n_x,) of the state from its reference, under the regulator.
-
-    Attributes:
-        rows: Rows of the state set (m,) that are asked about, part after part.
-        columns: Of each part, which of them are its own.
-        hard: Of each part, which of the hard rows are its own.
-    """
+    """What follows from a deviation dx (n_x,) of the state from its reference, under the regulator."""
 
     def __init__(self, problem: ControlProblem, law: Lqr, parts: Sequence[Part], slew: SlewRows) -> None:
         plant, steps, n_x = problem.plant, problem.horizon, problem.plant.n_x
@@ -314,8 +302,9 @@ class RegulatedRows:
             inputs[:, part.inputs[:, None], part.states] = of_u
         # Tall matrices, column by column: the product is a few long sums then.
         self._plan = np.asfortranarray(np.vstack([inputs.reshape(-1, n_x), states.reshape(-1, n_x)]))
+        # Rows of the state set (m,) that are asked about, part after part
         self.rows = np.concatenate([part.rows_x for part in parts])
-        self.columns = _after_another([part.rows_x.size for part in parts])
+        self.columns = _after_another([part.rows_x.size for part in parts])  # of each part, which of them are its own
         changes = np.diff(inputs, axis=0, prepend=0.0)
         hard: list[Array] = []
         of_hold: list[Array] = []
@@ -336,7 +325,7 @@ class RegulatedRows:
             before = sum(one.size for one in sides)
             sides.append(side.ravel())
             first.append(np.stack([own, before + len(c) + np.arange(own.size)]))
-        self.hard = _after_another([one.size for one in sides])
+        self.hard = _after_another([one.size for one in sides])  # of each part, which of the hard rows are its own
         self._hard_sides, self._of_hold = np.concatenate(sides), np.vstack(of_hold)
         # Where the rows of u_0 - u_(-1) are, and behind those of their part the ones of u_(-1) - u_0.
         self._owner, self._above = np.hstack(first)

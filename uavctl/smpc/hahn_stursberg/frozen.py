@@ -56,19 +56,12 @@ class FrozenAnswer(msgspec.Struct, frozen=True, eq=False):
 
 
 class Frozen:
-    """Frozen policies of all components.
-
-    Attributes:
-        rows: Where each component's rows are.
-        means: Where each component's q is.
-        programs: The components' pinned mean QPs.
-        allowed: Largest multiplier of each row (Σ m,) that an accepted answer has.
-    """
+    """Frozen policies of all components."""
 
     def __init__(self, mixtures: Sequence[Mixture]) -> None:
         problems = [mixture.problem for mixture in mixtures]
-        self.rows = slices([len(problem.rows) for problem in problems])
-        self.means = slices([problem.h.shape[0] for problem in problems])
+        self.rows = slices([len(problem.rows) for problem in problems])  # where each component's rows are
+        self.means = slices([problem.h.shape[0] for problem in problems])  # where each component's q is
         self._row_starts = np.array([s.start for s in self.rows])
         soft = np.concatenate([np.isfinite(problem.price) for problem in problems])
         price = np.concatenate([np.where(np.isfinite(p.price), p.price, 0.0) for p in problems])
@@ -86,10 +79,11 @@ class Frozen:
         allowed[links] = _ZERO * scale[links]
         # A soft row that is pinned would not be left at its price: such a policy answers nothing.
         allowed[self._pins] = np.where(soft[self._pins], -1.0, slope[self._pins])
-        self.allowed = allowed
+        self.allowed = allowed  # largest multiplier of each row (Σ m,) that an accepted answer has
         self._most = np.where(soft & ~state, price, np.inf)  # the offset's multipliers; see `QuadraticProgram`
         sense = np.where(soft, SOFT, 0).astype(np.int32)
         sense[self._pins] = EQUAL
+        # The components' pinned mean QPs
         self.programs = [
             QuadraticProgram(problem.h, problem.a, sense[s], price[s], curve[s])
             for s, problem in zip(self.rows, problems, strict=True)

@@ -175,17 +175,7 @@ class Horizon:
     """Prediction of one component over H steps.
 
     Attributes:
-        component: The component.
-        steps: H.
-        tau: Delay τ of the terminal law.
-        free: N = H - τ, the number of stages with a free mean input.
-        past: Disturbances before k that are not known at k [steps].
-        gains: (t, r, input, row of `feedback`) of each entry of θ.
         feedback: T (n_f, n_w): M_{t,r} = Θ_{t,r} T. The identity where no disturbance is redundant.
-        drive: Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank.
-        input_stages: Stages whose input limits are not implied by the terminal condition: N, but H where B has not full
-            column rank, because (19c) then says nothing about what the state does not feel.
-        phi: Φ_t (H+1, n_x, n_x).
         gamma: Γ_t (H+1, n_x, N n_u).
         gamma_eq: Γ^eq_t (H+1, n_x, n_y).
         p: Hessian (n_θ, n_θ) of the covariance cost ½ θᵀPθ + qᵀθ + c_0.
@@ -201,16 +191,20 @@ class Horizon:
                 not hold.
         """
         self.component = component
-        self.steps = steps
-        self.tau = tau
-        self.free = steps - tau
-        self.past = past
+        self.steps = steps  # H
+        self.tau = tau  # delay τ of the terminal law
+        self.free = steps - tau  # N = H - τ, the number of stages with a free mean input
+        self.past = past  # disturbances before k that are not known at k [steps]
         n_u = component.b.shape[1]
         self._spread, self.feedback, self._root_w = _shown(component.e, component.w)
         self._n_w = self._spread.shape[1]
         fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # nothing to feed back otherwise
+        # Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank
         self.drive = _felt(component.b)
+        # Stages whose input limits are not implied by the terminal condition: N, but H where B has not full column
+        # rank, because (19c) then says nothing about what the state does not feel
         self.input_stages = self.free if len(self.drive) == n_u else steps
+        # (t, r, input, row of `feedback`) of each entry of θ
         self.gains = tuple(
             (t, r, i, j)
             for t in range(steps)
@@ -221,7 +215,7 @@ class Horizon:
         powers = [np.eye(component.a.shape[0])]
         for _ in range(steps + past):
             powers.append(component.a @ powers[-1])
-        self.phi = np.array(powers[: steps + 1])
+        self.phi = np.array(powers[: steps + 1])  # Φ_t (H+1, n_x, n_x)
         self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
         self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i S
         self.gamma, self.gamma_eq = self._means()

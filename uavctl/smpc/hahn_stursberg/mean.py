@@ -70,17 +70,8 @@ class MeanProblem:
 
     Attributes:
         horizon: The component's prediction.
-        rows: What each row is, in order: inputs, states, reference, offset.
-        links: Rows whose back-off the gains move.
-        h: Hessian (n_q, n_q): cost ½ qᵀHq + fᵀq + c.
-        a: A (m, n_q).
-        r: R (m, n_p).
         upper: Right sides without back-offs (m,), inf where open.
         lower: Left sides without back-offs (m,), -inf where open.
-        backoff: Constant back-offs (m,), 0 for links.
-        price: Linear price of leaving a row (m,), inf for hard rows.
-        curve: Its quadratic part (m,): price s + curve s².
-        linear: (n_q, n_p): f = linear p, without a path.
         residual_q: Root of the cost, the part of q.
         residual_p: The part of p.
         z: Z (n_w, n_q).
@@ -100,20 +91,24 @@ class MeanProblem:
         self._here = np.eye(self.n_p)[n_x + n_y :]
         self.z, self.w, self.reachable = self._coordinates()
         self.residual_q, self.residual_p = self._residuals()
-        self.h = 2.0 * self.residual_q.T @ self.residual_q
-        self.linear = 2.0 * self.residual_q.T @ self.residual_p
-        self.rows = (*self._input_rows(), *self._state_rows(), *self._reference_rows(), *self._offset_rows())
+        self.h = 2.0 * self.residual_q.T @ self.residual_q  # Hessian (n_q, n_q): cost ½ qᵀHq + fᵀq + c
+        self.linear = 2.0 * self.residual_q.T @ self.residual_p  # (n_q, n_p): f = linear p, without a path
+        # What each row is, in order: inputs, states, reference, offset
+        offset = [Row(RowKind.OFFSET, horizon.free, c, -1, -1, 0.0) for c in np.eye(self.n_y)]
+        self.rows = (*self._input_rows(), *self._state_rows(), *self._reference_rows(), *offset)
+        # Rows whose back-off the gains move
         self.links = np.array([i for i, row in enumerate(self.rows) if row.noise is not None], dtype=np.intp)
         kinds = np.array([row.kind for row in self.rows])
         self._moving = np.flatnonzero(np.isin(kinds, (RowKind.STATE, RowKind.REFERENCE)))
         maps = [self._map(row) for row in self.rows]
-        self.a = np.array([w @ self.z for w, _ in maps])
-        self.r = np.array([w @ self.w + p for w, p in maps])
+        self.a = np.array([w @ self.z for w, _ in maps])  # A (m, n_q)
+        self.r = np.array([w @ self.w + p for w, p in maps])  # R (m, n_p)
         self.upper, self.lower = self._sides()
-        self.backoff = np.array([row.backoff for row in self.rows])
+        self.backoff = np.array([row.backoff for row in self.rows])  # constant back-offs (m,), 0 for links
         soft = np.isin(kinds, (RowKind.STATE, RowKind.OFFSET))
         prices = np.where(kinds == RowKind.STATE, design.slack_linear, design.offset_weight)
-        self.price = np.where(soft, prices, np.inf)
+        self.price = np.where(soft, prices, np.inf)  # linear price of leaving a row (m,), inf for hard rows
+        # Its quadratic part (m,): price s + curve s²
         self.curve = np.where(kinds == RowKind.STATE, design.slack_quadratic, 0.0)
 
     def parameters(self, x: Array, target: Array) -> Array:
@@ -242,9 +237,6 @@ class MeanProblem:
                 if np.any(c @ eq != 0):
                     rows.append(Row(kind, free, c, upper, lower, float(backoff[max(upper, lower)])))
         return rows
-
-    def _offset_rows(self) -> list[Row]:
-        return [Row(RowKind.OFFSET, self.horizon.free, c, -1, -1, 0.0) for c in np.eye(self.n_y)]
 
     def _map(self, row: Row) -> tuple[Array, Array]:
         """A row's value as coefficients of w and p."""

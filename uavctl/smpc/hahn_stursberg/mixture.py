@@ -38,8 +38,6 @@ class RowOrder:
     """Rows of a mean QP in the order: those that no gain moves, links from above, links from below.
 
     Attributes:
-        static: Rows that no gain moves.
-        origin: Row of the mean problem that each of them is.
         up: Where the links from above are.
         low: Where the links from below are.
     """
@@ -47,8 +45,8 @@ class RowOrder:
     def __init__(self, problem: MeanProblem) -> None:
         self._problem = problem
         links = problem.links
-        self.static = np.setdiff1d(np.arange(len(problem.rows)), links)
-        self.origin = np.concatenate([self.static, links, links])
+        self.static = np.setdiff1d(np.arange(len(problem.rows)), links)  # rows that no gain moves
+        self.origin = np.concatenate([self.static, links, links])  # row of the mean problem that each of them is
         s, n_l = self.static.size, links.size
         self.up, self.low = slice(s, s + n_l), slice(s + n_l, s + 2 * n_l)
         self._soft = np.isfinite(problem.price[self.origin])

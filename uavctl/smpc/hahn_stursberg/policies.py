@@ -49,29 +49,20 @@ class Policy:
 
 
 class Covariance:
-    """Cost and constraints of the gains of one component, and the cut that multipliers give.
-
-    Attributes:
-        horizon: The component's prediction.
-        kappa: κ of the link rows (n_l,).
-        scale: A typical cost.
-        noises: Noise of each link row, affine in θ.
-        usual: Back-offs (n_l,) of the gains that minimise J_cov alone.
-        equal: Equalities of the reduced terminal condition.
-        order: Order of its matrix.
-        triangle: Its upper triangle in the solver's scaling.
-    """
+    """Cost and constraints of the gains of one component, and the cut that multipliers give."""
 
     def __init__(self, horizon: Horizon, links: Sequence[Row]) -> None:
-        self.horizon = horizon
-        self.kappa = np.array([row.kappa for row in links])
-        self.scale = max(horizon.c_0, 1e-12)
-        self.noises = [_with_unseen(row) for row in links]
+        self.horizon = horizon  # the component's prediction
+        self.kappa = np.array([row.kappa for row in links])  # κ of the link rows (n_l,)
+        self.scale = max(horizon.c_0, 1e-12)  # a typical cost
+        self.noises = [_with_unseen(row) for row in links]  # noise of each link row, affine in θ
         self._values, self._vectors = np.linalg.eigh(horizon.p)
+        # Back-offs (n_l,) of the gains that minimise J_cov alone
         self.usual = self.backoffs(np.asarray(-np.linalg.lstsq(horizon.p, horizon.q, rcond=None)[0], dtype=np.float64))
         reduced = terminal_bound(horizon)
-        self.equal = reduced.fixed
-        self.order = reduced.rows + reduced.columns if reduced.rows and reduced.columns else 0
+        self.equal = reduced.fixed  # equalities of the reduced terminal condition
+        self.order = reduced.rows + reduced.columns if reduced.rows and reduced.columns else 0  # order of its matrix
+        # Its upper triangle in the solver's scaling
         self.triangle = Affine(np.zeros(0), sparse.csr_array((0, horizon.n_theta)))
         if self.order:
             triangle, weight = reduced.triangle(), _svec_weight(self.order)
