@@ -445,8 +445,8 @@ class ControlLoop:
         unfit = ""
         if out.setpoint is None or estimate is None:
             unfit = "the controller has no estimate of the position"
-        elif (age_s := (estimate.at_ns - estimate.captured_ns) * 1e-9) > self._config.fresh_s:
-            unfit = f"the newest position is {age_s:.1f} s old"
+        elif estimate.age_s > self._config.fresh_s:
+            unfit = f"the newest position is {estimate.age_s:.1f} s old"
         return HandoverView(
             at_ns=inp.at_ns,
             vehicle=self.vehicle,

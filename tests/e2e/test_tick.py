@@ -16,7 +16,7 @@ from places import ROOT
 from sim.simulation import World
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
-from uavctl.records import Outgoing, Plan, Received
+from uavctl.records import LinkStats, Outgoing, Plan, Received
 
 PAGE = (ROOT / "docs" / "tick.md").read_text(encoding="utf-8")
 T = TypeVar("T")
@@ -42,7 +42,8 @@ class Watched:
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
         before, self.at_s = len(self.memory.entries), at_ns * 1e-9
         sent, files = crossed(lambda: list(self.loop.tick(tick, at_ns)))
-        if any(isinstance(record, Plan) for _, _, record in self.memory.entries[before:]) and self.at_s > WARM_S:
+        kinds = {type(record) for _, _, record in self.memory.entries[before:]}
+        if Plan in kinds and LinkStats not in kinds and self.at_s > WARM_S:  # counters of a second are not of the tick
             self.planning.append(files)
         yield from sent
 

@@ -19,8 +19,8 @@ from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.baselines import ControlProblem, PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
 from uavctl.smpc.bounds import lqr
+from uavctl.smpc.conditioned.backoffs import SELDOM, age_risk, equal_risk
 from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
-from uavctl.smpc.conditioned.risk import SELDOM, age_risk, equal_risk
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 
 Array = NDArray[np.float64]

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from uavctl.lab.campaign.tasks import Cell, fly_task, tasks_of
-from uavctl.smpc.conditioned.backoffs import SLACK, rest_backoffs
+from uavctl.smpc.conditioned.backoffs import SLACK, age_risk, quantile, rest_backoffs
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
-from uavctl.smpc.conditioned.risk import age_risk, quantile
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.link import AgeModel, bernoulli, gilbert_elliott
 from uavctl.smpc.nominal import unseen

@@ -32,20 +32,21 @@ from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT, NOMINAL, Answer, Preview, finite, inside
 from uavctl.smpc.batch import Decisions, gathered
 from uavctl.smpc.bounds import lqr
-from uavctl.smpc.conditioned.backoffs import Deviations, rest_backoffs
-from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
-from uavctl.smpc.conditioned.risk import (
+from uavctl.smpc.conditioned.backoffs import (
     DISTANT,
     LARGEST_RISK,
     PRICE,
     AgeRisk,
+    Deviations,
     age_risk,
     binding,
     equal_risk,
     quantile,
+    rest_backoffs,
     shifted,
     spent,
 )
+from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, parts, unseen
 from uavctl.smpc.plant import Plant, digest
