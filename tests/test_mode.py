@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.mavlink.handover_guards import (
+from uavctl.mavlink.handover_states import (
     LEAVES_NONE,
     TRANSITIONS,
     HandoverEvent,

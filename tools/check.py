@@ -18,7 +18,7 @@ from pathlib import Path
 from logs.recording.topics import topics_page
 from uavctl.config.reference import render
 from uavctl.lab.campaign.trials import campaign_page
-from uavctl.mavlink.handover_guards import page as hand_over_page
+from uavctl.mavlink.handover_states import page as hand_over_page
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {

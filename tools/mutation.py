@@ -46,9 +46,10 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "uavctl/flight/fallback.py": ("tests/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/test_limits.py",),
-    "uavctl/flight/gating.py": ("tests/test_reach_rules.py", "tests/test_stuck_rules.py"),
-    "uavctl/mavlink/handover_guards.py": ("tests/test_mode.py",),
-    "uavctl/mavlink/signing.py": ("tests/test_signing.py",),
+    "uavctl/flight/outliers.py": ("tests/test_reach_rules.py",),
+    "uavctl/flight/stale_source.py": ("tests/test_stuck_rules.py",),
+    "uavctl/mavlink/handover_states.py": ("tests/test_mode.py",),
+    "uavctl/mavlink/signing.py": ("tests/test_signing.py", "tests/test_gate.py"),
 }
 CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless
 

@@ -30,11 +30,12 @@ from uavctl.flight.decision import (
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, Breach, Watching, contradicts, is_outside, watch
 from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
 from uavctl.flight.fallback import FallbackEnd
-from uavctl.flight.gating import REPEATED, MeasurementUpdate, forget, take
+from uavctl.flight.gating import MeasurementUpdate, forget, take
 from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
+from uavctl.flight.stale_source import REPEATED
 from uavctl.labels import Names, tell_all
 from uavctl.records import (
     ControlMode,
