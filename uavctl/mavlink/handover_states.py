@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from enum import Enum, StrEnum
 
-from uavctl.mavlink.autopilots import HABITS
-
 
 class HandoverState(StrEnum):
     """Who flies, or what is under way."""
@@ -182,61 +180,3 @@ LEAVES_NONE = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverSt
 TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
     (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
 }
-
-
-def page() -> str:
-    """The page of the documentation that shows the table."""
-    return f"""# Who flies: the hand-over
-
-Written from the table in `uavctl/mavlink/handover_states.py` (`make docs`).
-A word on an arrow is what a tick sees; of several
-things the first in this list counts:
-{", ".join(f"`{seen}`" for seen in HandoverEvent)}.
-What is not drawn changes nothing. Setpoints are sent in `ENGAGED` only; neutral ones (zero acceleration) where PX4
-wants a stream before it gives OFFBOARD: in `READY`, on the way up (not to ArduPilot, whose climb they would end), and
-in `RETURNING`.
-
-```mermaid
-{drawing()}```
-
-* `take-off` is `--arm --takeoff HEIGHT`; `engage` is `uavctl ctl engage`. Nothing else leads towards arming or back
-  from the pilot. `land` comes from the controller, or from the operator on the way up.
-* `left`: the daemon before this one ended while it had the vehicle, and nobody had asked it to (it was killed, or
-  failed); and the vehicle, which has not started anew since, is armed when it is heard first. Nothing is sent, as
-  setpoints would end PX4's failsafe; `uavctl ctl engage` takes it up again. Whoever ends so leaves word in the file
-  of its lock ([operation.md](operation.md#how-it-ends)).
-* `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
-  (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
-* `failsafe`: the vehicle itself says that a failsafe acts (system status CRITICAL, or "failsafe" in a text), and is in
-  a mode that failsafes choose ({_listed()}).
-  Any other mode is the pilot's, and so are these without such a word. On a flight that began with `--arm` it is waited
-  for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
-  has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
-  `ctl engage` comes first. A flight that the pilot began is released.
-* PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
-  (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
-* What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
-  still says otherwise 0.3 s later is the pilot's word.
-* A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
-  have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
-  external mode, at the end of a climb, waits for none: a pilot who switches in that second has to switch again.
-* While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
-"""
-
-
-def _listed() -> str:
-    """The modes that failsafes choose, by autopilot."""
-    return "; ".join(f"{name}: {', '.join(sorted(habits.failsafes))}" for name, habits in HABITS.items())
-
-
-def drawing() -> str:
-    """The table as a Mermaid state diagram: every way from one state to another, by what is seen."""
-    lines = ["stateDiagram-v2", "    [*] --> WAITING"]
-    for before in HandoverState:
-        ways: dict[HandoverState, list[str]] = {}
-        for seen in HandoverEvent:
-            after = TRANSITIONS[before, seen][0]
-            if after is not before:
-                ways.setdefault(after, []).append(seen.value)
-        lines += [f"    {before.name} --> {after.name}: {', '.join(seen)}" for after, seen in ways.items()]
-    return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"
