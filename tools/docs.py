@@ -16,8 +16,8 @@ from uavctl.config.document import Section, description, element, is_section, ty
 from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.lab.campaign.spec import CampaignSpec
 from uavctl.lab.campaign.trials import TrialSpec
-from uavctl.mavlink.autopilots import HABITS
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState
+from uavctl.mavlink.profile import HABITS
 from uavctl.records import Record
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import msgspec
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.autopilots import HABITS, AutopilotProfile
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.profile import HABITS, AutopilotProfile
 from uavctl.mavlink.requests import PendingRequest
 from uavctl.records import Command, Order, VehicleStatus
 
