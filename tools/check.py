@@ -15,18 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from logs.recording.topics import topics_page
-from uavctl.config.reference import render
-from uavctl.lab.campaign.trials import campaign_page
-from uavctl.mavlink.handover_guards import page as hand_over_page
+from docs import PAGES, ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGES = {
-    ROOT / "docs" / "configuration.md": render,
-    ROOT / "docs" / "campaign-keys.md": campaign_page,
-    ROOT / "docs" / "topics.md": topics_page,
-    ROOT / "docs" / "hand-over.md": hand_over_page,
-}
 BIN = Path(sys.executable).parent
 # Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.

@@ -31,7 +31,7 @@ from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
 from uavctl.lab.identify.result import Identified, identify
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import VEHICLE, ControlLoop
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Order, Record
 
 DOCS = Path(__file__).parents[1] / "docs" / "autopilots.md"

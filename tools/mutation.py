@@ -46,9 +46,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
-    "uavctl/flight/gating.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
-    "uavctl/mavlink/handover_guards.py": ("tests/mavlink/test_mode.py",),
-    "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py",),
+    "uavctl/flight/sensor_faults.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
+    "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
+    "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
 }
 CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless
 

@@ -17,7 +17,8 @@ from uavctl.flight.controller import Controller
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
 from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver
-from uavctl.mavlink.handover_guards import LEAVES_NONE, HandoverState, HandoverView, Sending, against_moving
+from uavctl.mavlink.handover_guards import HandoverView, against_moving
+from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
 from uavctl.mavlink.messages import Ack, Message, Text
 from uavctl.mavlink.relay import Relay
 from uavctl.outcome import Cause, FlightCourse

@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from uavctl.flight.decision import MISSION_OVER
 from uavctl.mavlink.handover import Passage
-from uavctl.mavlink.handover_guards import HandoverEvent, HandoverState, fails, silent
+from uavctl.mavlink.handover_guards import fails, silent
+from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
 

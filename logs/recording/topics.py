@@ -18,7 +18,7 @@ from typing import cast
 import msgspec
 import numpy as np
 
-from logs.recording.derived_topics import VIEWS, DerivedTopic
+from logs.recording.derived_topics import VIEWS
 from uavctl.errors import RecordingError
 from uavctl.records import (
     Checked,
@@ -127,7 +127,6 @@ TOPICS: tuple[Topic, ...] = (
 _BY_NAME = {topic.name: topic for topic in TOPICS}
 _VIEW_BY_NAME = {view.name: view for view in VIEWS}
 _RAW = re.compile(r"/raw/([^/]+)/(in|out)")
-_RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
 
 
 @lru_cache(maxsize=256)
@@ -166,63 +165,6 @@ def definition(topic: str) -> Definition:
     return _BY_NAME[topic].definition
 
 
-def topics_page() -> str:
-    """The page docs/topics.md, made from the rows."""
-    lines = [
-        "# Topics of a recording",
-        "",
-        "MCAP, log times in nanoseconds of the recorder's monotonic clock. Numbers are written with the digits",
-        'that give the same float back; NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`;',
-        "`null` is only ever a missing value.",
-        "",
-        "| topic | record | encoding | what it is |",
-        "|---|---|---|---|",
-        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | mavlink | {_RAW_TEXT} |",
-        *(f"| `{topic.name}` | `{topic.record.__name__}` | json | {topic.text} |" for topic in TOPICS),
-        "",
-    ]
-    for topic in TOPICS:
-        lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
-        properties = cast("dict[str, dict[str, object]]", _schema(topic.record)["properties"])
-        lines += [f"| `{name}` | {_type_text(schema)} |" for name, schema in properties.items()]
-        lines.append("")
-    return "\n".join([*lines, *_views_section()])
-
-
-def _views_section() -> list[str]:
-    lines = [
-        "# Topics for viewers",
-        "",
-        "Made from the records above while they are written, for programs that show recordings",
-        "([viewers.md](viewers.md) says how to open one); protobuf, with the schemas inside the file. A replay and a",
-        "report never read them. Places are local NED, in the frame `ned`; the frame `room` (axes: east, north, up)",
-        "is the one to look from. Log times are those of the records. NaN: there is no number.",
-        "",
-        "| topic | schema | what it is |",
-        "|---|---|---|",
-        *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
-        "",
-    ]
-    for view in VIEWS:
-        if issubclass(view.kind, Record):
-            lines += _message_section(view, view.kind)
-    return lines
-
-
-def _message_section(view: DerivedTopic, kind: type[Record]) -> list[str]:
-    fields = msgspec.structs.fields(kind)
-    return [
-        f"## `{view.name}`",
-        "",
-        (kind.__doc__ or "").strip(),
-        "",
-        "| field | type |",
-        "|---|---|",
-        *(f"| `{field.name}` | `{field.type.__name__}` |" for field in fields),
-        "",
-    ]
-
-
 def _schema(record: type[Record]) -> dict[str, object]:
     (reference,), parts = msgspec.json.schema_components([record], schema_hook=_anything, ref_template="#/$defs/{name}")
     name = cast("str", reference["$ref"]).rpartition("/")[2]
@@ -235,25 +177,6 @@ def _anything(kind: type) -> dict[str, object]:
     if kind is object:
         return {"description": "any JSON value"}
     raise NotImplementedError(kind)
-
-
-def _type_text(schema: dict[str, object]) -> str:
-    """One field's type in words."""
-    if "$ref" in schema:
-        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`"
-    if "anyOf" in schema:
-        return " or ".join(_type_text(one) for one in cast("list[dict[str, object]]", schema["anyOf"]))
-    kind = cast("str", schema.get("type", "any"))
-    if kind == "array":
-        return f"array of {_type_text(_items(schema))}"
-    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
-        return f"object of {_type_text(cast('dict[str, object]', schema['additionalProperties']))}"
-    return kind
-
-
-def _items(schema: dict[str, object]) -> dict[str, object]:
-    fixed = cast("list[dict[str, object]]", schema.get("prefixItems", []))
-    return fixed[0] if fixed else cast("dict[str, object]", schema["items"])
 
 
 # Records as exact JSON.

@@ -1,7 +1,7 @@
 """The simulated MAVLink vehicle: bytes in, bytes out.
 
 Its bytes are made and read with pymavlink's dialect directly, not with the controller's codec. It shows what was
-observed of the real autopilots: the table of `personality.py`, the rules for setpoints in `setpoints.py`, the state
+observed of the real autopilots: the table of `profile.py`, the rules for setpoints in `setpoints.py`, the state
 machine of `pilot.py`, the estimate of `estimator.py`, and the commands, parameters and streams in the files of these
 names. What is not known is not answered, as the real ones do.
 """

@@ -24,7 +24,7 @@ from uavctl.cli import flying
 from uavctl.cli.app import run
 from uavctl.daemon.lock import sole_daemon
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause, FlightCourse, make_ending
 from uavctl.records import Command, Order
 

@@ -21,7 +21,8 @@ from uavctl.mavlink import codec
 from uavctl.mavlink.codec import Encoder, decode
 from uavctl.mavlink.connection import Item, MavlinkConnection
 from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
+from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.handover_states import HandoverState, Sending
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Event, PositionSample, Setpoint, SetpointSource, Severity
 

@@ -20,7 +20,7 @@ from take_off_rig import RELAYED, Flight
 
 from logs.recording.reader import read
 from uavctl.cli.prepare import Prepared
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Truth, Vec3
 
 TOOL = ROOT / "tools" / "soak.py"

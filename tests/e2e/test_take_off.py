@@ -12,7 +12,7 @@ from take_off_rig import GOAL, Flight
 
 from logs.recording.replay import replay
 from sim.autopilot.profile import PERSONALITIES, Role
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Decision, Event, Order, Setpoint
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])

@@ -13,7 +13,7 @@ from take_off_rig import RELAYED, Flight
 
 from logs.recording.replay import replay
 from uavctl.cli.flying import tell_notices
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Order, Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])

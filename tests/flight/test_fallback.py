@@ -17,10 +17,10 @@ from uavctl.flight.fallback import (
     back,
     enter,
     learnt,
-    remember,
     request,
 )
 from uavctl.flight.limits import ZERO
+from uavctl.flight.step import remember
 from uavctl.records import ControlMode, Vec3
 
 S = 1_000_000_000

@@ -27,7 +27,7 @@ from flight_rig import (
 )
 
 from uavctl.flight.controller import Controller
-from uavctl.flight.gating import GateParameters
+from uavctl.flight.sensor_faults import GateParameters
 from uavctl.flight.step import StepOutput
 from uavctl.records import ControlMode, PositionSample
 from uavctl.smpc.answer import Answer

@@ -11,9 +11,9 @@ from flight_rig import DT_NS, HORIZON, MS, TICK_NS, TICKS, estimator_parameters,
 from msgspec import structs
 from scipy.integrate import quad
 
-from uavctl.flight.gating import GateParameters, OutlierTrack, Reach, doubt, judge, make_reach, radius
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.limits import LimitsParameters
+from uavctl.flight.sensor_faults import GateParameters, OutlierTrack, Reach, doubt, judge, make_reach, radius
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 LIMITS = LimitsParameters(accel_mps2=(2.0, 9.0, 1.5), slew_mps3=1.0)

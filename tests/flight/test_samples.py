@@ -11,7 +11,8 @@ from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, 
 from msgspec import structs
 
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
-from uavctl.flight.gating import FROZEN, REPEATED, GateParameters, MeasurementUpdate, SourceHealth, take
+from uavctl.flight.gating import MeasurementUpdate, SourceHealth, take
+from uavctl.flight.sensor_faults import FROZEN, REPEATED, GateParameters
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleMotion
 
 CONTROLLER = make_controller()

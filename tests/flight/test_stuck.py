@@ -25,7 +25,7 @@ from flight_rig import (
 )
 from numpy.typing import NDArray
 
-from uavctl.flight.gating import GateParameters
+from uavctl.flight.sensor_faults import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
 from uavctl.records import ControlMode, StepInput, Vec3, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview

@@ -10,8 +10,8 @@ from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sampl
 from msgspec.structs import replace
 
 from uavctl.flight.estimator import absorb, begin, set_input
-from uavctl.flight.gating import GateParameters, Moved, Watch, Watches, doubtful, observe, stuck
 from uavctl.flight.kalman import Belief, make_kalman
+from uavctl.flight.sensor_faults import GateParameters, Moved, Watch, Watches, doubtful, observe, stuck
 from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)

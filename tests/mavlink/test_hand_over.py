@@ -7,7 +7,8 @@ from hand_over_rig import ACCEPTED, DENIED, ENGAGE, FLY, NEUTRAL, NOTHING, NOW, 
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover_guards import HEARTBEAT_TIMEOUT_NS, HandoverState
+from uavctl.mavlink.handover_guards import HEARTBEAT_TIMEOUT_NS
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Order, Severity
 

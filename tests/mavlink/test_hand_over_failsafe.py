@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import Text
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Severity

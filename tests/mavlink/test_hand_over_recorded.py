@@ -15,7 +15,8 @@ from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, Ha
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
+from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.handover_states import HandoverState, Sending
 from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Command, Event, Order, PositionSample, VehicleStatus

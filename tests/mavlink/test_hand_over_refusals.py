@@ -21,7 +21,8 @@ from hand_over_rig import (
 )
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover_guards import GRACE_NS, HandoverState
+from uavctl.mavlink.handover_guards import GRACE_NS
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import Text
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_REFUSED, Command, Order

@@ -12,7 +12,8 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import CLOCK_NS, HandoverState
+from uavctl.mavlink.handover_guards import CLOCK_NS
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Setpoint
 

@@ -5,17 +5,8 @@ from __future__ import annotations
 from itertools import product
 
 import pytest
-from places import ROOT
 
-from uavctl.mavlink.handover_guards import (
-    LEAVES_NONE,
-    TRANSITIONS,
-    HandoverEvent,
-    HandoverState,
-    Sending,
-    drawing,
-    page,
-)
+from uavctl.mavlink.handover_states import LEAVES_NONE, TRANSITIONS, HandoverEvent, HandoverState, Sending
 
 # W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, V failsafe, X released,
 # L landing, S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
@@ -110,15 +101,3 @@ def test_every_state_has_an_end() -> None:
             reached.add(state)
             todo += [after for seen in HandoverEvent if (after := TRANSITIONS[state, seen][0]) not in reached]
         assert reached & {HandoverState.DONE, HandoverState.FAILED}
-
-
-def test_the_drawing_has_every_way_once() -> None:
-    lines = drawing().splitlines()
-    ways = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
-    assert sum("-->" in line for line in lines) == len(ways) + 3  # the beginning, two ends
-    assert "    RELEASED --> RETURNING: engage" in lines
-
-
-def test_the_page_of_the_documentation_is_the_table_s() -> None:
-    told = (ROOT / "docs" / "hand-over.md").read_text(encoding="utf-8")
-    assert told == page() and drawing() in told

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim.autopilot.profile import PERSONALITIES, px4_custom
-from uavctl.mavlink.autopilots import HABITS, autopilot_name, describe_mode
+from uavctl.mavlink.profile import HABITS, autopilot_name, describe_mode
 
 
 @pytest.mark.parametrize(

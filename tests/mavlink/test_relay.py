@@ -22,7 +22,7 @@ from uavctl.frames import from_euler
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.mavlink.codec import Encoder, UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
 from uavctl.records import Datagram, Event, LinkStats, PositionSample, Vec3
 

@@ -11,7 +11,8 @@ from uavctl import loop as control
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.step import StepOutput, step
 from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverState, HandoverView
+from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Event, RelayStats, StepInput
 

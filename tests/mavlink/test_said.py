@@ -8,7 +8,7 @@ from mavlink_rig import Peer, events, make_link, packets
 
 from uavctl.cli.flying import AGAIN_NS, Said, waits_for
 from uavctl.config import load_config
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.vehicle import LOST, MOST, WAIT_NS
 from uavctl.records import Event, Severity
 

@@ -10,7 +10,7 @@ from sim.autopilot.autopilot import Checks
 from uavctl.config import load_config
 from uavctl.config.sim import ChecksConfig
 from uavctl.errors import ConfigError
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 
 UNINIT, STANDBY, ACTIVE, CRITICAL = 0, 3, 4, 5
 

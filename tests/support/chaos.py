@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import mode_of
-from uavctl.flight.gating import GateParameters
+from uavctl.flight.sensor_faults import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
 from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview

@@ -40,7 +40,7 @@ from uavctl.daemon.health import HealthWatch, Notifier
 from uavctl.daemon.lock import lock_paths
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Ending, RelayStats
 

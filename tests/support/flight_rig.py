@@ -13,11 +13,11 @@ from scipy.linalg import block_diag, expm
 
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.fallback import FallbackParameters
-from uavctl.flight.gating import GateParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Room, hold
+from uavctl.flight.sensor_faults import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
 from uavctl.labels import names_of
 from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus

@@ -6,7 +6,8 @@ from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverState, HandoverView, Sending
+from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.handover_states import HandoverState, Sending
 from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.records import Command, Event, Order, VehicleStatus

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 from take_off_rig import RELAYED, Flight
 
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 
 AUTOPILOTS = ("px4", "ardupilot")
 LIMIT_S = 60.0  # in which a vehicle is flown, or on the ground again with a reason told

@@ -13,7 +13,7 @@ from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Event, Order, Setpoint
 
 # Positions come through the relay alone, from cameras whose packets a third of are lost in bursts of ten on the mean.

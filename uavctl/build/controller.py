@@ -16,10 +16,10 @@ from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
 from uavctl.flight.envelope import EnvelopeParameters
 from uavctl.flight.fallback import FallbackParameters
-from uavctl.flight.gating import GateParameters
 from uavctl.flight.kalman import EstimatorParameters, make_kalman, settled_cov
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
+from uavctl.flight.sensor_faults import GateParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.planner import (

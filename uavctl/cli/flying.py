@@ -36,7 +36,7 @@ from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import lacking
 from uavctl.records import Command, ControlMode, Ending, Event, Header, Order, PolicyLibrary, Record, Severity, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign

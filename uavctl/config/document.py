@@ -9,13 +9,15 @@ from __future__ import annotations
 import os
 import re
 import stat
+import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import FieldInfo
 
 # One thing that is wrong with a configuration.
 
@@ -339,3 +341,78 @@ def _outwards(key: str) -> Iterator[str]:
     while key:
         yield key
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
+
+
+# What the types of the keys say in words.
+
+
+_SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
+
+
+def is_section(annotation: object) -> bool:
+    """Whether a field's type is a table of its own."""
+    return isinstance(annotation, type) and issubclass(annotation, Section)
+
+
+def element(annotation: Any) -> type[Section] | None:
+    """The tables that a field is a list of, if it is one: `[[name]]`."""
+    if get_origin(annotation) is Annotated:
+        return element(get_args(annotation)[0])
+    arguments = get_args(annotation)
+    if get_origin(annotation) is tuple and arguments[1:] == (Ellipsis,) and is_section(arguments[0]):
+        section: type[Section] = arguments[0]
+        return section
+    return None
+
+
+def type_text(annotation: Any) -> str:
+    """A field's type with its limits, in words."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        metas = [meta for meta in arguments[1:] if isinstance(meta, Meta)]
+        return type_text(arguments[0]) + "".join(_limits(meta, _unit(arguments[0])) for meta in metas)
+    if origin is Literal:
+        return " or ".join(f'"{choice}"' for choice in arguments)
+    if origin in (Union, types.UnionType):
+        return ", or ".join(type_text(argument) for argument in arguments if argument is not types.NoneType)
+    if element(annotation) is not None:
+        return "list of tables"
+    if origin is tuple:
+        count = "" if arguments[1:] == (Ellipsis,) else f"{len(arguments)} "
+        return f"list of {count}{_plural(type_text(arguments[0]))}"
+    return _SCALARS[annotation]
+
+
+def _plural(text: str) -> str:
+    return text.replace("list", "lists", 1) if text.startswith("list") else text.replace("number", "numbers", 1)
+
+
+def description(field: FieldInfo) -> str:
+    """Unit and meaning of a field; empty for a table."""
+    metas = (meta for meta in get_args(field.type)[1:] if isinstance(meta, Meta))
+    return next((meta.description for meta in metas if meta.description), "")
+
+
+def _unit(annotation: Any) -> str:
+    """What a length counts."""
+    return "characters" if annotation is str else "entries"
+
+
+def _limits(meta: Meta, unit: str) -> str:
+    bounds = [
+        f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in _bounds(meta) if value is not None
+    ]
+    lengths = [
+        f"{word} {value}"
+        for word, value in ((f"{unit}: at least", meta.min_length), (_most(meta, unit), meta.max_length))
+        if value is not None
+    ]
+    return f" ({', '.join(bounds + lengths)})" if bounds or lengths else ""
+
+
+def _most(meta: Meta, unit: str) -> str:
+    return f"{unit}: at most" if meta.min_length is None else "at most"
+
+
+def _bounds(meta: Meta) -> tuple[tuple[str, float | None], ...]:
+    return ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))

@@ -25,15 +25,18 @@ from uavctl.config.document import (
     DataFileError,
     Section,
     Source,
+    description,
+    element,
     excess,
+    is_section,
     key_lines,
     oversized,
     read_lines,
     read_text,
+    type_text,
 )
 from uavctl.config.link import LinkConfig, read_trace
 from uavctl.config.mission import MissionConfig, read_samples
-from uavctl.config.reference import description, element, is_section, type_text
 from uavctl.config.sim import MOST_FAULTS, FaultConfig, faults
 from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.errors import ConfigError, DesignError

@@ -14,7 +14,7 @@ from uavctl.clock import Due
 from uavctl.config import Config
 from uavctl.config.checks import position_index
 from uavctl.errors import UsageError
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
 from uavctl.records import ControlMode, Decision, Estimate, LinkEstimate, RelayStats, Vector, VehicleStatus
 

@@ -9,11 +9,12 @@ import msgspec
 from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Watching
 from uavctl.flight.estimator import Coming, FilterHistory
 from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
-from uavctl.flight.gating import GateParameters, Reach, SourceHealth, make_reach
+from uavctl.flight.gating import SourceHealth
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
+from uavctl.flight.sensor_faults import GateParameters, Reach, make_reach
 from uavctl.labels import Names
 from uavctl.records import Command, Plan, Vec3
 from uavctl.smpc.answer import Solver

@@ -175,11 +175,6 @@ def _after_hold(end: FallbackEnd, land: bool) -> ControlMode:
 Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), oldest first
 
 
-def remember(biases: Biases, at_ns: int, bias: Vector) -> Biases:
-    """The biases of late, with one more, from an estimate with a fresh position in it."""
-    return (*(one for one in biases if at_ns - one[0] <= LATELY_NS), (at_ns, bias))
-
-
 def learnt(biases: Biases) -> Vector:
     """The part of a bias (n_u,) that has been there all the time of late; zero of one that is not known for long.
 

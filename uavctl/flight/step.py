@@ -31,11 +31,12 @@ from uavctl.flight.decision import (
 from uavctl.flight.envelope import ABSURD, NOT_WATCHING, OF_POSITIONS, Breach, Watching, contradicts, is_outside, watch
 from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
 from uavctl.flight.fallback import FallbackEnd
-from uavctl.flight.gating import REPEATED, MeasurementUpdate, forget, take
+from uavctl.flight.gating import MeasurementUpdate, forget, take
 from uavctl.flight.kalman import Array, captured_ns
 from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
+from uavctl.flight.sensor_faults import REPEATED
 from uavctl.labels import Names, tell_all
 from uavctl.records import (
     ControlMode,
@@ -51,6 +52,7 @@ from uavctl.records import (
     Severity,
     StepInput,
     Vec3,
+    Vector,
     VehicleStatus,
 )
 from uavctl.smpc.plant import Plant
@@ -341,7 +343,12 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
         return biases if state.fallback is not None else ()
     if not tick.boundary or tick.age_steps or tick.estimate is None or not tick.estimate.bias:
         return biases
-    return fb.remember(biases, tick.boundary_ns, tick.estimate.bias)
+    return remember(biases, tick.boundary_ns, tick.estimate.bias)
+
+
+def remember(biases: fb.Biases, at_ns: int, bias: Vector) -> fb.Biases:
+    """The biases of late, with one more, from an estimate with a fresh position in it."""
+    return (*(one for one in biases if at_ns - one[0] <= fb.LATELY_NS), (at_ns, bias))
 
 
 def _flown_against(state: ControlState, tick: Tick, inp: StepInput) -> tuple[float, ...]:

@@ -11,7 +11,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.autopilots import HABITS
 from uavctl.mavlink.clocksync import ClockSource, RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
@@ -29,6 +28,7 @@ from uavctl.mavlink.messages import (
     TimeSync,
 )
 from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
+from uavctl.mavlink.profile import HABITS
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.mavlink.vehicle import SECOND_VEHICLE, Joiner, VehicleWatch
@@ -349,7 +349,8 @@ class MavlinkConnection:
         Args:
             place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
         """
-        if self._vehicle.autopilot != "ardupilot":
+        habits = HABITS.get(self._vehicle.autopilot)
+        if habits is None or not habits.wants_place:
             return ()
         asks, tells = self._globe.due(at_ns)
         if not asks:
@@ -392,7 +393,7 @@ class MavlinkConnection:
             return ()
         trips = self.trips(self.vehicle)
         offset_ns = None if trips is None else trips.offset_ns(at_ns)
-        asks = autopilot == "px4" and self.vehicle_asks_time
+        asks = autopilot in HABITS and HABITS[autopilot].moves_stamps and self.vehicle_asks_time
         poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
 

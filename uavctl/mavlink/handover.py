@@ -1,4 +1,4 @@
-"""The hand-over from tick to tick: walks the table of `mode.py`, makes requests of the vehicle, tells what happens."""
+"""The hand-over from tick to tick: walks the table of its states, makes requests of the vehicle, tells what happens."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import (
     ASKING,
     LEAVING,
-    TRANSITIONS,
     GuardResult,
-    HandoverEvent,
-    HandoverState,
     HandoverView,
     Progress,
-    Sending,
     against_engaging,
     evaluate,
     habits_of,
     silent,
 )
+from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
 from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 

@@ -214,4 +214,4 @@ def test_a_wrong_file_is_told_with_its_lines(tmp_path: Path, capsys: pytest.Capt
     assert run(["campaign", str(tmp_path / "c.toml")]) == 2
     told = capsys.readouterr().err
     assert 'c.toml:3: step: unknown key (nearest valid name "steps")' in told
-    assert 'c.toml:6: controller[0].kind: "lqq" is not a choice (nearest valid name "lqg")' in told
+    assert 'c.toml:6: controller[0].kind: there is no controller "lqq" (nearest valid name "lqg")' in told

@@ -17,7 +17,7 @@ from uavctl.config.load import parse
 from uavctl.daemon.lock import sole_daemon
 from uavctl.errors import NotReachedError, VehicleTakenError
 from uavctl.lab.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
-from uavctl.mavlink.handover_guards import HandoverState
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 
 STICK = "POSCTL"

@@ -5,8 +5,8 @@ import json
 import msgspec
 import pytest
 
-from logs.recording.derived_topics import PLOTS, VIEWS
-from logs.recording.topics import TOPICS, definition, is_view, raw_link, record_type, topics_page
+from logs.recording.derived_topics import VIEWS
+from logs.recording.topics import TOPICS, definition, is_view, raw_link, record_type
 from uavctl import records as data
 from uavctl.records import Datagram, Decision, Record, raw_topic
 
@@ -59,17 +59,6 @@ def test_unknown_topic() -> None:
         definition("/raw/vehicle/sideways")
 
 
-def test_page_lists_every_topic_and_field() -> None:
-    page = topics_page()
-    for topic in TOPICS:
-        assert page.count(f"| `{topic.name}` |") == 1
-        section = page.split(f"## `{topic.name}`")[1].split("## ")[0]
-        for field in msgspec.structs.fields(topic.record):
-            assert f"| `{field.name}` |" in section
-    assert "| `position_m` | array of number |" in page
-    assert "| `solve` | `SolveStatus` or null |" in page
-
-
 def test_topics_for_viewers_are_no_records() -> None:
     names = {view.name for view in VIEWS}
     assert len(names) == len(VIEWS) and not names & {topic.name for topic in TOPICS}
@@ -78,13 +67,3 @@ def test_topics_for_viewers_are_no_records() -> None:
         with pytest.raises(KeyError):
             record_type(name)
     assert not any(is_view(topic.name) for topic in TOPICS) and not is_view("/raw/vehicle/in")
-
-
-def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
-    page = topics_page()
-    for view in VIEWS:
-        assert page.count(f"| `{view.name}` | `{view.schema_name}` |") == 1
-    for kind, name in PLOTS.items():
-        section = page.split(f"## `{name}`")[1].split("## ")[0]
-        for field in msgspec.structs.fields(kind):
-            assert f"| `{field.name}` |" in section

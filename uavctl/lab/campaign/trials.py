@@ -21,7 +21,6 @@ from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
-from uavctl.config.reference import tables
 from uavctl.errors import ConfigError, DesignError
 from uavctl.lab.campaign.controllers import LibraryFor
 from uavctl.lab.campaign.pool import Columns, Work
@@ -30,7 +29,6 @@ from uavctl.lab.campaign.spec import (
     CONFIGURATION,
     MOST_CELLS,
     MOST_OF_A_KIND,
-    CampaignSpec,
     LinkSpec,
     Name,
     Overrides,
@@ -133,28 +131,6 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="links")] = (
         LinkSpec(name="as configured"),
     )
-
-
-# The reference page of a campaign's keys, made from the types; `make docs` writes it.
-
-
-_HEAD = """# Keys of a campaign
-
-This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
-
-A campaign is a TOML file; `docs/campaigns/` has complete ones, and [campaigns.md](campaigns.md) says how to fly and
-read them. Every `set` is a list of overrides of the flight configuration, as `--set` takes them
-([configuration.md](configuration.md)).
-"""
-_FLIGHTS = """# Keys of a campaign of flights
-
-With `world = "quadrotor"` a campaign flies the true vehicle, and its file has these keys instead.
-"""
-
-
-def campaign_page() -> str:
-    """The whole page, as Markdown."""
-    return "\n".join((_HEAD, *tables(CampaignSpec, ""), _FLIGHTS, *tables(TrialSpec, "")))
 
 
 # The cells of a campaign in the world of the quadrotor, and the tasks that fly them.

@@ -62,6 +62,10 @@ class AutopilotProfile:
     # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
     # the place of arming
     climbs_on_arming: bool
+    reads_raw: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
+    wants_place: bool  # without GPS it has to be told a place on the globe before it arms
+    moves_stamps: bool  # it moves the stamps of positions by what it has asked with TIMESYNC
+    number: int  # MAV_AUTOPILOT of its heartbeats
     modes: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
 
 
@@ -75,6 +79,10 @@ HABITS = {
         failsafes=frozenset({"AUTO.LAND", "AUTO.LOITER", "AUTO.RTL"}),
         returns=True,
         climbs_on_arming=True,
+        reads_raw=False,
+        wants_place=False,
+        moves_stamps=True,
+        number=mavlink.MAV_AUTOPILOT_PX4,
         modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
     # It climbs in GUIDED; a setpoint would end the climb.
@@ -86,6 +94,10 @@ HABITS = {
         failsafes=frozenset({"LAND", "RTL", "SMART_RTL", "BRAKE"}),
         returns=False,
         climbs_on_arming=False,
+        reads_raw=True,
+        wants_place=True,
+        moves_stamps=False,
+        number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         modes={"GUIDED": (4, 0)},
     ),
 }
@@ -93,8 +105,7 @@ HABITS = {
 
 def autopilot_name(autopilot: int) -> str:
     """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
-    names = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
-    return names.get(autopilot, "unknown")
+    return next((name for name, habits in HABITS.items() if habits.number == autopilot), "unknown")
 
 
 def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:

@@ -1,0 +1,46 @@
+"""The pages of docs/ that are made from types and tables are what those say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from docs import PAGES, drawing, topics_page
+from logs.recording.derived_topics import PLOTS, VIEWS
+from logs.recording.topics import TOPICS
+from uavctl.mavlink.handover_states import TRANSITIONS
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_is_up_to_date(page: Path) -> None:
+    assert page.read_text(encoding="utf-8") == PAGES[page](), "run `make docs`"
+
+
+def test_the_drawing_has_every_way_once() -> None:
+    lines = drawing().splitlines()
+    ways = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
+    assert sum("-->" in line for line in lines) == len(ways) + 3  # the beginning, two ends
+    assert "    RELEASED --> RETURNING: engage" in lines
+
+
+def test_page_lists_every_topic_and_field() -> None:
+    page = topics_page()
+    for topic in TOPICS:
+        assert page.count(f"| `{topic.name}` |") == 1
+        section = page.split(f"## `{topic.name}`")[1].split("## ")[0]
+        for field in msgspec.structs.fields(topic.record):
+            assert f"| `{field.name}` |" in section
+    assert "| `position_m` | array of number |" in page
+    assert "| `solve` | `SolveStatus` or null |" in page
+
+
+def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
+    page = topics_page()
+    for view in VIEWS:
+        assert page.count(f"| `{view.name}` | `{view.schema_name}` |") == 1
+    for kind, name in PLOTS.items():
+        section = page.split(f"## `{name}`")[1].split("## ")[0]
+        for field in msgspec.structs.fields(kind):
+            assert f"| `{field.name}` |" in section

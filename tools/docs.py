@@ -1,0 +1,234 @@
+"""The pages of docs/ that are made from types and tables of the product; `make docs` writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import cast
+
+import msgspec
+from msgspec import NODEFAULT
+from msgspec.structs import FieldInfo
+
+from logs.recording.derived_topics import VIEWS, DerivedTopic
+from logs.recording.topics import TOPICS, definition
+from uavctl.config.document import Section, description, element, is_section, type_text
+from uavctl.config.types import OF_HAHN_STURSBERG, Config
+from uavctl.lab.campaign.spec import CampaignSpec
+from uavctl.lab.campaign.trials import TrialSpec
+from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState
+from uavctl.mavlink.profile import HABITS
+from uavctl.records import Record
+
+ROOT = Path(__file__).resolve().parent.parent
+_CONFIGURATION = """# Configuration
+
+This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
+
+A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`, `room-px4`, `room-ardupilot`,
+`room-hahn-stursberg`: complete examples in `uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides
+any key, with a value as TOML writes it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string
+needs no quotes.
+Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are refused before anything starts,
+all at once, each with file, line and key (exit code 2). So is what is beyond all bounds: every number has a range,
+and every list and text a longest length, whether it is told below or not (1e7 at most, 1000 characters).
+
+States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`; acceleration,
+lead of the vehicle's own reference in position and in velocity, and integral with model `velocity-reference`).
+n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
+"""
+_CAMPAIGN = """# Keys of a campaign
+
+This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
+
+A campaign is a TOML file; `docs/campaigns/` has complete ones, and [campaigns.md](campaigns.md) says how to fly and
+read them. Every `set` is a list of overrides of the flight configuration, as `--set` takes them
+([configuration.md](configuration.md)).
+"""
+_FLIGHTS = """# Keys of a campaign of flights
+
+With `world = "quadrotor"` a campaign flies the true vehicle, and its file has these keys instead.
+"""
+_RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
+
+
+def configuration_page() -> str:
+    """The page docs/configuration.md, made from the types of the configuration."""
+    return "\n".join((_CONFIGURATION, *tables(Config, "")))
+
+
+def tables(section: type[Section], path: str) -> Iterator[str]:
+    """A section's keys and those of its tables, as Markdown; `path` is what its keys begin with."""
+    fields = msgspec.structs.fields(section)
+    title = f"`[{path}]`" if path else "Top level"
+    yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
+    yield "| key | type | meaning | default |\n|---|---|---|---|"
+    for field in fields:
+        if not is_section(field.type):
+            needed = f"{path}.{field.encode_name}" in OF_HAHN_STURSBERG
+            default = "required with scheme `hahn-stursberg`" if needed else _default(field)
+            cells = (f"`{field.encode_name}`", type_text(field.type), description(field), default)
+            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    yield ""
+    for field in fields:
+        name = f"{path}.{field.encode_name}" if path else field.encode_name
+        one = element(field.type)
+        if one is not None:
+            yield from tables(one, f"[{name}]")
+        elif is_section(field.type):
+            yield from tables(field.type, name)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.default is NODEFAULT:
+        return "required"
+    if field.default is None:
+        return "none"
+    return f"`{msgspec.json.encode(field.default).decode()}`"
+
+
+def campaign_page() -> str:
+    """The page docs/campaign-keys.md, made from the types of the two kinds of campaign."""
+    return "\n".join((_CAMPAIGN, *tables(CampaignSpec, ""), _FLIGHTS, *tables(TrialSpec, "")))
+
+
+def topics_page() -> str:
+    """The page docs/topics.md, made from the rows."""
+    lines = [
+        "# Topics of a recording",
+        "",
+        "MCAP, log times in nanoseconds of the recorder's monotonic clock. Numbers are written with the digits",
+        'that give the same float back; NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`;',
+        "`null` is only ever a missing value.",
+        "",
+        "| topic | record | encoding | what it is |",
+        "|---|---|---|---|",
+        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | mavlink | {_RAW_TEXT} |",
+        *(f"| `{topic.name}` | `{topic.record.__name__}` | json | {topic.text} |" for topic in TOPICS),
+        "",
+    ]
+    for topic in TOPICS:
+        lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
+        properties = msgspec.json.decode(definition(topic.name).schema)["properties"]
+        lines += [f"| `{name}` | {_json_type(schema)} |" for name, schema in properties.items()]
+        lines.append("")
+    return "\n".join([*lines, *_views_section()])
+
+
+def _views_section() -> list[str]:
+    lines = [
+        "# Topics for viewers",
+        "",
+        "Made from the records above while they are written, for programs that show recordings",
+        "([viewers.md](viewers.md) says how to open one); protobuf, with the schemas inside the file. A replay and a",
+        "report never read them. Places are local NED, in the frame `ned`; the frame `room` (axes: east, north, up)",
+        "is the one to look from. Log times are those of the records. NaN: there is no number.",
+        "",
+        "| topic | schema | what it is |",
+        "|---|---|---|",
+        *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
+        "",
+    ]
+    for view in VIEWS:
+        if issubclass(view.kind, Record):
+            lines += _message_section(view, view.kind)
+    return lines
+
+
+def _message_section(view: DerivedTopic, kind: type[Record]) -> list[str]:
+    fields = msgspec.structs.fields(kind)
+    return [
+        f"## `{view.name}`",
+        "",
+        (kind.__doc__ or "").strip(),
+        "",
+        "| field | type |",
+        "|---|---|",
+        *(f"| `{field.name}` | `{field.type.__name__}` |" for field in fields),
+        "",
+    ]
+
+
+def _json_type(schema: dict[str, object]) -> str:
+    """One field's type in words."""
+    if "$ref" in schema:
+        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`"
+    if "anyOf" in schema:
+        return " or ".join(_json_type(one) for one in cast("list[dict[str, object]]", schema["anyOf"]))
+    kind = cast("str", schema.get("type", "any"))
+    if kind == "array":
+        return f"array of {_json_type(_items(schema))}"
+    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
+        return f"object of {_json_type(cast('dict[str, object]', schema['additionalProperties']))}"
+    return kind
+
+
+def _items(schema: dict[str, object]) -> dict[str, object]:
+    fixed = cast("list[dict[str, object]]", schema.get("prefixItems", []))
+    return fixed[0] if fixed else cast("dict[str, object]", schema["items"])
+
+
+def hand_over_page() -> str:
+    """The page docs/hand-over.md, made from the table."""
+    return f"""# Who flies: the hand-over
+
+Written from the table in `uavctl/mavlink/handover_states.py` (`make docs`).
+A word on an arrow is what a tick sees; of several
+things the first in this list counts:
+{", ".join(f"`{seen}`" for seen in HandoverEvent)}.
+What is not drawn changes nothing. Setpoints are sent in `ENGAGED` only; neutral ones (zero acceleration) where PX4
+wants a stream before it gives OFFBOARD: in `READY`, on the way up (not to ArduPilot, whose climb they would end), and
+in `RETURNING`.
+
+```mermaid
+{drawing()}```
+
+* `take-off` is `--arm --takeoff HEIGHT`; `engage` is `uavctl ctl engage`. Nothing else leads towards arming or back
+  from the pilot. `land` comes from the controller, or from the operator on the way up.
+* `left`: the daemon before this one ended while it had the vehicle, and nobody had asked it to (it was killed, or
+  failed); and the vehicle, which has not started anew since, is armed when it is heard first. Nothing is sent, as
+  setpoints would end PX4's failsafe; `uavctl ctl engage` takes it up again. Whoever ends so leaves word in the file
+  of its lock ([operation.md](operation.md#how-it-ends)).
+* `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
+  (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
+* `failsafe`: the vehicle itself says that a failsafe acts (system status CRITICAL, or "failsafe" in a text), and is in
+  a mode that failsafes choose ({_failsafe_modes()}).
+  Any other mode is the pilot's, and so are these without such a word. On a flight that began with `--arm` it is waited
+  for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
+  has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
+  `ctl engage` comes first. A flight that the pilot began is released.
+* PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
+  (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
+* What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
+  still says otherwise 0.3 s later is the pilot's word.
+* A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
+  have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
+  external mode, at the end of a climb, waits for none: a pilot who switches in that second has to switch again.
+* While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
+"""
+
+
+def _failsafe_modes() -> str:
+    """The modes that failsafes choose, by autopilot."""
+    return "; ".join(f"{name}: {', '.join(sorted(habits.failsafes))}" for name, habits in HABITS.items())
+
+
+def drawing() -> str:
+    """The table as a Mermaid state diagram: every way from one state to another, by what is seen."""
+    lines = ["stateDiagram-v2", "    [*] --> WAITING"]
+    for before in HandoverState:
+        ways: dict[HandoverState, list[str]] = {}
+        for seen in HandoverEvent:
+            after = TRANSITIONS[before, seen][0]
+            if after is not before:
+                ways.setdefault(after, []).append(seen.value)
+        lines += [f"    {before.name} --> {after.name}: {', '.join(seen)}" for after, seen in ways.items()]
+    return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"
+
+
+PAGES: dict[Path, Callable[[], str]] = {
+    ROOT / "docs" / "configuration.md": configuration_page,
+    ROOT / "docs" / "campaign-keys.md": campaign_page,
+    ROOT / "docs" / "topics.md": topics_page,
+    ROOT / "docs" / "hand-over.md": hand_over_page,
+}

@@ -1,0 +1,182 @@
+"""The hand-over between pilot and controller, as a table of transitions.
+
+Without an order the controller never asks for a mode but landing: it streams neutral setpoints so that the pilot may
+switch, flies while the vehicle is armed in its external mode, and is out once the pilot has taken over. Ordered to,
+it asks for the mode, arms, lets the vehicle climb and asks for the external mode: `uavctl.mavlink.handover` walks
+the table. A vehicle that a daemon before has left in the air is not taken up again without an order.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, StrEnum
+
+
+class HandoverState(StrEnum):
+    """Who flies, or what is under way."""
+
+    WAITING = "waiting"  # no vehicle is heard
+    READY = "ready"  # heard; neutral setpoints warm the stream up
+    MODE = "asking for the mode"  # on the ground, ordered to take off
+    ARMING = "arming"
+    CLIMBING = "climbing"  # the vehicle climbs by itself
+    ENGAGING = "engaging"  # at height: the external mode is asked for
+    RETURNING = "returning"  # the same from `released`, ordered to
+    ENGAGED = "engaged"  # armed and in the external mode: setpoints
+    FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
+    RELEASED = "released"  # the pilot has taken over: nothing is sent unless ordered to
+    LANDING = "landing"  # landing was asked for: no setpoints any more, for good
+    SETTLING = "settling"  # the vehicle lands by itself
+    DONE = "done"  # disarmed after all: nothing is sent, for good
+    FAILED = "failed"  # the vehicle does not do what was asked: nothing is sent, for good
+
+
+class HandoverEvent(StrEnum):
+    """What a tick sees; of several things the first in this order."""
+
+    REBOOT = "reboot"  # the vehicle has started anew
+    LAND = "land"  # the controller, or the operator, asks for landing
+    GRANTED = "granted"  # what was asked for is there
+    REFUSED = "refused"  # what was asked for will not come
+    SILENCE = "silence"  # no heartbeat, or the last one is too old
+    TAKE_OFF = "take-off"  # ordered, and nothing speaks against it
+    ENGAGE = "engage"  # ordered, and the vehicle is in the air
+    LEFT = "left"  # found armed, and a daemon before this one ended while it had it
+    DISARMED = "disarmed"
+    FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
+    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's, or on the pilot's flight a failsafe's
+    EXTERNAL = "external"  # armed, in the external mode
+    PENDING = "pending"  # what was asked for is not there yet
+
+
+class Sending(Enum):
+    """What a tick may stream to the vehicle."""
+
+    NOTHING = "nothing"
+    NEUTRAL = "neutral"
+    SETPOINTS = "setpoints"
+
+
+Target = tuple[HandoverState, Sending]
+_W, _R, _M, _A, _C = (
+    HandoverState.WAITING,
+    HandoverState.READY,
+    HandoverState.MODE,
+    HandoverState.ARMING,
+    HandoverState.CLIMBING,
+)
+_G, _B, _E, _X, _L = (
+    HandoverState.ENGAGING,
+    HandoverState.RETURNING,
+    HandoverState.ENGAGED,
+    HandoverState.RELEASED,
+    HandoverState.LANDING,
+)
+_S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
+_NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+
+# What is not here changes nothing, and nothing is sent.
+_CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
+    _W: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe, and so take over
+        HandoverEvent.DISARMED: (_R, _NEUTRAL),
+        HandoverEvent.OTHER: (_R, _NEUTRAL),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _R: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.SILENCE: (_W, _NOTHING),
+        HandoverEvent.TAKE_OFF: (_M, _NEUTRAL),
+        HandoverEvent.ENGAGE: (_B, _NEUTRAL),
+        HandoverEvent.DISARMED: (_R, _NEUTRAL),
+        HandoverEvent.OTHER: (_R, _NEUTRAL),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _M: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_D, _NOTHING),  # it stands on the ground, disarmed
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_A, _NEUTRAL),
+        HandoverEvent.PENDING: (_M, _NEUTRAL),
+    },
+    _A: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_C, _NEUTRAL),
+        HandoverEvent.PENDING: (_A, _NEUTRAL),
+    },
+    _C: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.DISARMED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_G, _NEUTRAL),
+        HandoverEvent.PENDING: (_C, _NEUTRAL),
+    },
+    _G: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.DISARMED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_E, _FLY),
+        HandoverEvent.PENDING: (_G, _NEUTRAL),
+    },
+    _B: {
+        HandoverEvent.REBOOT: (_X, _NOTHING),
+        HandoverEvent.LAND: (_X, _NOTHING),  # the pilot flies still
+        HandoverEvent.REFUSED: (_X, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_E, _FLY),
+        HandoverEvent.PENDING: (_B, _NEUTRAL),
+    },
+    _E: {
+        HandoverEvent.REBOOT: (_X, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.SILENCE: (
+            _E,
+            _FLY,
+        ),  # the controller brakes and holds, for a while: the vehicle may hear us still
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.EXTERNAL: (_E, _FLY),
+    },
+    _V: {
+        HandoverEvent.REBOOT: (_F, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.GRANTED: (_C, _NEUTRAL),  # it has ended by itself, and the climb goes on
+        HandoverEvent.REFUSED: (_L, _NOTHING),
+        HandoverEvent.ENGAGE: (_G, _NEUTRAL),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+    },
+    _X: {HandoverEvent.ENGAGE: (_B, _NEUTRAL), HandoverEvent.DISARMED: (_D, _NOTHING)},
+    _L: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+        HandoverEvent.GRANTED: (_S, _NOTHING),
+    },
+    _S: {
+        HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_L, _NOTHING),  # it only seemed to land for us: its climb goes on
+        HandoverEvent.OTHER: (_X, _NOTHING),
+    },
+    _D: {},
+    _F: {},
+}
+# Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
+LEAVES_NONE = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
+TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
+    (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
+}
