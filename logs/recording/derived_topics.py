@@ -36,6 +36,8 @@ from uavctl.records import (
     VehicleStatus,
 )
 
+PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
+
 # What people plot, as flat records; NaN where there is no number, which a plot shows as a gap.
 
 
@@ -170,14 +172,14 @@ def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
 
 def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
     """Age in a tick; `captured_ns` is the capture time of the newest position so far."""
-    return AgePlot(
+    return _same(
+        AgePlot,
+        decision,
         age_s=math.nan if captured_ns is None else (decision.at_ns - captured_ns) * 1e-9,
         age_steps=_number(decision.age_steps),
         limit_steps=float(design.horizon),
         plan_index=_number(decision.plan_index),
-        news=decision.news,
         mode=decision.mode.value,
-        reason=decision.reason,
     )
 
 
@@ -230,16 +232,7 @@ def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, 
 
 def solve_plot(plan: Plan) -> SolvePlot:
     """How a plan was found."""
-    return SolvePlot(
-        status=plan.status.value,
-        method=plan.method,
-        iterations=plan.iterations,
-        gap=plan.gap,
-        cost=plan.cost,
-        slack=plan.slack,
-        offset=plan.offset,
-        terminal_miss=plan.terminal_miss,
-    )
+    return _same(SolvePlot, plan, status=plan.status.value)
 
 
 def timing_plot(timing: Timing) -> TimingPlot:
@@ -254,23 +247,14 @@ def timing_plot(timing: Timing) -> TimingPlot:
 
 def link_plot(link: LinkEstimate) -> LinkPlot:
     """What is believed of the link."""
-    return LinkPlot(
-        arrival_mean=link.arrival_mean,
-        arrival_lower=link.arrival_lower,
-        promised=link.promised,
-        below_promise=link.below_promise,
-        bursts=link.bursts,
-        burst_statistic=link.burst_statistic,
-    )
+    return _same(LinkPlot, link)
 
 
 def counter_plot(stats: LinkStats) -> CounterPlot:
     """Counters of a connection."""
-    return CounterPlot(
-        link=stats.link,
-        datagrams=stats.datagrams,
-        messages=stats.messages,
-        samples=stats.samples,
+    return _same(
+        CounterPlot,
+        stats,
         bad=sum(stats.bad.values()),
         clock_offset_ms=_number(stats.clock_offset_ns) * 1e-6,
         clock_rtt_ms=_number(stats.clock_rtt_ns) * 1e-6,
@@ -281,14 +265,17 @@ def counter_plot(stats: LinkStats) -> CounterPlot:
 def truth_plot(truth: Truth) -> TruthPlot:
     """The simulator's state."""
     position, velocity = (Axes(north=v[0], east=v[1], down=v[2]) for v in (truth.position_m, truth.velocity_mps))
-    return TruthPlot(position_m=position, velocity_mps=velocity, sent=truth.sent, lost=truth.lost)
+    return _same(TruthPlot, truth, position_m=position, velocity_mps=velocity)
 
 
 def vehicle_plot(status: VehicleStatus) -> VehiclePlot:
     """The vehicle as it tells."""
-    return VehiclePlot(
-        mode=status.mode, armed=status.armed, external=status.external, battery_v=_number(status.battery_v)
-    )
+    return _same(VehiclePlot, status, battery_v=_number(status.battery_v))
+
+
+def _same(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
+    """A record of `kind` with the fields of the same name of `record`, but for `others`."""
+    return kind(**{name: getattr(record, name) for name in kind.__struct_fields__ if name not in others}, **others)
 
 
 def _number(value: float | None) -> float:

@@ -17,7 +17,7 @@ import struct
 import types
 import typing
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum, StrEnum
@@ -74,10 +74,10 @@ class _Form(Protocol):
 
 
 class _Leaf:
-    """One column."""
+    """One column; `cell` makes a cell of a value."""
 
-    def __init__(self, kind: ColumnKind) -> None:
-        self._kind = kind
+    def __init__(self, kind: ColumnKind, cell: Callable[[Any], Cell] = lambda value: value) -> None:
+        self._kind, self._cell = kind, cell
 
     def learn(self, value: Any) -> None:
         """Nothing depends on the value."""
@@ -86,107 +86,43 @@ class _Leaf:
         yield TableColumn(name, self._kind)
 
     def put(self, value: Any, row: list[Cell]) -> None:
-        row.append(value)
+        row.append(None if value is None else self._cell(value))
 
 
-class _Choice(_Leaf):
-    """An enumeration, by its values."""
+class _Parts:
+    """The columns of a value's parts, one after another.
 
-    def put(self, value: Any, row: list[Cell]) -> None:
-        row.append(None if value is None else value.value)
+    Args:
+        mark: between the value's name and the part's key.
+        parts: a value's parts by key.
+        forms: of the parts that each value has.
+        item: type of the parts that only some values have: as many as the longest list, the keys of any mapping.
+    """
 
-
-class _Json(_Leaf):
-    """Anything, as JSON text."""
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        row.append(None if value is None else msgspec.json.encode(value).decode())
-
-
-class _Count(_Leaf):
-    """How many records a list has; they stand in a table of their own."""
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        row.append(None if value is None else len(value))
-
-
-class _Place:
-    """Three numbers: one each axis."""
+    def __init__(
+        self, mark: str, parts: Callable[[Any], Mapping[Any, Any]], forms: Mapping[Any, _Form], item: Any = None
+    ) -> None:
+        self._mark, self._parts, self._forms, self._item = mark, parts, dict(forms), item
 
     def learn(self, value: Any) -> None:
-        """Nothing depends on the value."""
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        yield from (TableColumn(f"{name}_{axis}", ColumnKind.FLOAT) for axis in _AXES)
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        row.extend((None,) * len(_AXES) if value is None else value)
-
-
-class _List:
-    """As many as the longest has."""
-
-    def __init__(self, item: type) -> None:
-        self._item = item
-        self._forms: list[_Form] = []
-
-    def learn(self, value: Any) -> None:
-        for place, one in enumerate(value or ()):
-            if place == len(self._forms):
-                self._forms.append(_form(self._item))
-            self._forms[place].learn(one)
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        for place, form in enumerate(self._forms):
-            yield from form.columns(f"{name}_{place}")
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        held = value or ()
-        for place, form in enumerate(self._forms):
-            form.put(held[place] if place < len(held) else None, row)
-
-
-class _Mapping:
-    """One each key that any of them has, in the keys' order."""
-
-    def __init__(self, item: type) -> None:
-        self._item = item
-        self._forms: dict[str, _Form] = {}
-
-    def learn(self, value: Any) -> None:
-        for key, one in (value or {}).items():
+        for key, part in ({} if value is None else self._parts(value)).items():
             if key not in self._forms:
                 self._forms = dict(sorted([*self._forms.items(), (key, _form(self._item))]))
-            self._forms[key].learn(one)
+            self._forms[key].learn(part)
 
     def columns(self, name: str) -> Iterator[TableColumn]:
         for key, form in self._forms.items():
-            yield from form.columns(f"{name}.{key}")
+            yield from form.columns(f"{name}{self._mark}{key}" if name else key)
 
     def put(self, value: Any, row: list[Cell]) -> None:
-        held = value or {}
+        held = {} if value is None else self._parts(value)
         for key, form in self._forms.items():
             form.put(held.get(key), row)
 
 
-class _Fields:
-    """A record, field by field."""
-
-    def __init__(self, kind: type[msgspec.Struct]) -> None:
-        self._forms = {field.name: _form(field.type) for field in msgspec.structs.fields(kind)}
-
-    def learn(self, value: Any) -> None:
-        if value is not None:
-            for name, form in self._forms.items():
-                form.learn(getattr(value, name))
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        for field, form in self._forms.items():
-            yield from form.columns(f"{name}.{field}" if name else field)
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        for name, form in self._forms.items():
-            form.put(None if value is None else getattr(value, name), row)
+def _fields(kind: type[msgspec.Struct]) -> _Parts:
+    forms = {field.name: _form(field.type) for field in msgspec.structs.fields(kind)}
+    return _Parts(".", lambda value: {name: getattr(value, name) for name in forms}, forms)
 
 
 _LEAVES = {
@@ -209,15 +145,20 @@ def _form(kind: Any) -> _Form:
     if kind in _LEAVES:
         return _Leaf(_LEAVES[kind])
     if kind == Vec3:
-        return _Place()
+        axis = _Leaf(ColumnKind.FLOAT)
+        return _Parts("_", lambda value: dict(zip(_AXES, value, strict=True)), dict.fromkeys(_AXES, axis))
     if origin is tuple and arguments[-1] is Ellipsis:
-        return _Count(ColumnKind.INTEGER) if _is_record(arguments[0]) else _List(arguments[0])
+        if _is_record(arguments[0]):  # they stand in a table of their own
+            return _Leaf(ColumnKind.INTEGER, len)
+        return _Parts("_", lambda value: dict(enumerate(value)), {}, arguments[0])
     if origin is dict:
-        return _Json(ColumnKind.TEXT) if arguments[1] is object else _Mapping(arguments[1])
+        if arguments[1] is object:
+            return _Leaf(ColumnKind.TEXT, lambda value: msgspec.json.encode(value).decode())
+        return _Parts(".", dict, {}, arguments[1])
     if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return _Choice(ColumnKind.TEXT)
+        return _Leaf(ColumnKind.TEXT, lambda value: value.value)
     if _is_record(kind):
-        return _Fields(kind)
+        return _fields(kind)
     raise TypeError(f"no column can hold {kind}")
 
 
@@ -238,7 +179,7 @@ class _Table:
 
     def __init__(self, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> None:
         self._lead = lead
-        self._form = _Fields(kind)
+        self._form = _fields(kind)
         self.lists = tuple(_lists(kind))
         self.rows = 0
 

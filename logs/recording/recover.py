@@ -128,21 +128,13 @@ def _copy(src: Path, segment: Segment) -> RecoverResult:
         damage=tuple(damage),
     )
     if not (result.lossless and result.ended):
-        segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(_note(src, result, at_ns))))
+        text = f"{RECOVERED}{src.name}: {_losses(result)}"
+        note = RecorderNote(
+            at_ns=at_ns, segment=1, written=result.messages, dropped=0, refused=0, failures=0, text=text
+        )
+        segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
     segment.finish()
     return result
-
-
-def _note(src: Path, result: RecoverResult, at_ns: int) -> RecorderNote:
-    return RecorderNote(
-        at_ns=at_ns,
-        segment=1,
-        written=result.messages,
-        dropped=0,
-        refused=0,
-        failures=0,
-        text=f"{RECOVERED}{src.name}: {_losses(result)}",
-    )
 
 
 def _losses(result: RecoverResult) -> str:

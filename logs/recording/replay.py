@@ -34,7 +34,6 @@ from uavctl.records import (
     Refused,
     Sink,
     StepInput,
-    VehicleStatus,
 )
 from uavctl.smpc.plant import Plant
 
@@ -245,7 +244,7 @@ def context(
         positions=len(inp.samples),
         position_m=None if newest is None else newest.position_m,
         position_age_s=None if newest is None else (inp.at_ns - newest.captured_ns) * 1e-9,
-        vehicle="" if inp.vehicle is None else _vehicle(inp.vehicle),
+        vehicle="" if inp.vehicle is None else f"{inp.vehicle.mode}, {'armed' if inp.vehicle.armed else 'disarmed'}",
         orders=tuple(map(_order, inp.commands)),
         missed_ticks=inp.missed_ticks,
         stop=inp.stop,
@@ -257,10 +256,6 @@ def context(
 def _order(command: Command) -> str:
     given = command.position_m if command.height_m is None else command.height_m
     return command.order.value if given is None else f"{command.order.value} {given}"
-
-
-def _vehicle(status: VehicleStatus) -> str:
-    return f"{status.mode}, {'armed' if status.armed else 'disarmed'}"
 
 
 COMPARED = frozenset(

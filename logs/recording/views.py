@@ -290,10 +290,6 @@ def _reach(design: DesignView, backoff: Matrix) -> Floats:
     return design.positions_of(reach)
 
 
-def _sphere(at: Fields, semi_axes_m: Sequence[float]) -> Fields:
-    return {"pose": at, "size": vector([2 * one for one in semi_axes_m]), "color": _SPREAD}
-
-
 def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
     """Ellipsoid that holds the position with 95 %, from the covariance."""
     cov = [[0.0] * 3 for _ in range(3)]
@@ -304,7 +300,8 @@ def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
     turn = quaternion(from_axes(directions.T.tolist()))
-    return _sphere(pose(design.position_of(estimate.mean), turn), semi_axes_m.tolist())
+    at = pose(design.position_of(estimate.mean), turn)
+    return {"pose": at, "size": vector([2 * one for one in semi_axes_m.tolist()]), "color": _SPREAD}
 
 
 _POSES = Many(lambda at_m: _made(PosesInFrame, poses=[pose(at_m)]), 3)

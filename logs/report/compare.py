@@ -263,17 +263,16 @@ def compare(loaded: Sequence[LoadedFlight]) -> FlightComparison:
 
 def _likeness(first: LoadedFlight, other: LoadedFlight) -> Match:
     alike = 0
-    mine, theirs = (_flown(Path(one.side.recording)) for one in (first, other))
+    mine, theirs = (
+        filter(lambda message: message.definition.topic not in _NOT_FLOWN, good_messages(Path(one.side.recording)))
+        for one in (first, other)
+    )
     for left, right in zip_longest(mine, theirs):
         if left is None or right is None or _word(left) != _word(right):
             parting = _parting(left, right, first.flight.origin_ns)
             return Match(name=other.side.name, identical=False, records=alike, parting=parting)
         alike += 1
     return Match(name=other.side.name, identical=True, records=alike, parting=None)
-
-
-def _flown(path: Path) -> Iterator[RecordedMessage]:
-    return (message for message in good_messages(path) if message.definition.topic not in _NOT_FLOWN)
 
 
 def _word(message: RecordedMessage) -> tuple[str, bytes, int]:

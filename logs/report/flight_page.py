@@ -17,10 +17,10 @@ from logs.report import page, plots
 from logs.report.figures import picture
 from logs.report.page import Mark, PageSection
 from logs.report.plots import path_3d
-from logs.report.statistics import LEVEL, Share
+from logs.report.statistics import LEVEL
 from logs.report.summary_text import part_begins, story
 from logs.report.timeline import timeline
-from logs.report.verdict_model import AxisVerdict, LeadVerdict, ModelOutcome, ModelVerdict
+from logs.report.verdict_model import AxisVerdict, ModelOutcome, ModelVerdict
 from logs.report.verdicts import ClockVerdict, DelayVerdict, Judged, LimitRisk, LinkVerdict, Verdicts, judge, plain
 from uavctl.labels import number
 from uavctl.records import Event
@@ -208,7 +208,15 @@ def _model(flight: FlightData, judged: Judged) -> PageSection:
         body.append(page.grid(drawings))
     if verdict.leads:
         ahead = ("time ahead", "in the ellipsoid", "share", "interval")
-        rows = [_lead_row(one) for one in verdict.leads]
+        rows = [
+            (
+                f"{one.lead_s:.3g} s",
+                f"{one.inside.hits} of {one.inside.trials}",
+                f"{_percent(one.inside.rate)}{_mark(one.too_few, one.refuted)}",
+                f"{100 * one.inside.low:.3g} … {100 * one.inside.high:.3g} %",
+            )
+            for one in verdict.leads
+        ]
         body.append(page.table_folded("Ellipsoids in figures", ahead, rows, frozenset({0, 1, 2, 3})))
     note = (
         "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
@@ -228,15 +236,6 @@ def _axis_row(one: AxisVerdict) -> tuple[str, ...]:
         f"{one.variance_low**0.5:.2f} … {one.variance_high**0.5:.2f}",
         f"{round(one.mean, 2) + 0.0:+.2f}{_mark(one.mean_refuted)}".replace("-", "−"),
         f"{_p(one.whiteness_p)}{_mark(one.telling, one.whiteness_refuted)}",
-    )
-
-
-def _lead_row(one: LeadVerdict) -> tuple[str, ...]:
-    return (
-        f"{one.lead_s:.3g} s",
-        f"{one.inside.hits} of {one.inside.trials}",
-        f"{_percent(one.inside.rate)}{_mark(one.too_few, one.refuted)}",
-        _interval(one.inside),
     )
 
 
@@ -273,10 +272,6 @@ def _clock_row(one: ClockVerdict) -> tuple[str, ...]:
         figure(one.rtt_ms),
         str(one.rejected),
     )
-
-
-def _interval(one: Share) -> str:
-    return f"{100 * one.low:.3g} … {100 * one.high:.3g} %"
 
 
 def _percent(share: float) -> str:

@@ -78,25 +78,19 @@ def _cut(flight: FlightData) -> list[str]:
 
 def _engaged(flight: FlightData, s: FlightSummary, final_m: float, settled_m: float) -> str:
     begun_s = flight.spans(FLOWN)[0][0]
-    took = f"took over {_after(begun_s)} and flew"
+    after = "at the first tick" if begun_s == 0 else f"{number(begun_s)} s after the first tick"
+    took = f"took over {after} and flew"
     if begun_s == 0 and flight.part:
         took = "was flying already, and flew"
     start_m = position_error_m(flight)[0]
+    goal = "trajectory's place of the moment" if s.trajectory else "target"
     blind = predicted_only(s)
     seen = "" if s.state_source == "truth" else f", {blind}" if blind else ", by the estimate"
     return (
         f"The controller {took} {count(s.steps, 'step')} of {flight.design.dt_s:g} s. "
-        f"It began {number(start_m)} m from the {_goal(s)} and ended {number(final_m)} m from it{seen}; "
+        f"It began {number(start_m)} m from the {goal} and ended {number(final_m)} m from it{seen}; "
         f"over the last quarter the distance was {number(settled_m)} m (root mean square)."
     )
-
-
-def _goal(s: FlightSummary) -> str:
-    return "trajectory's place of the moment" if s.trajectory else "target"
-
-
-def _after(begun_s: float) -> str:
-    return "at the first tick" if begun_s == 0 else f"{number(begun_s)} s after the first tick"
 
 
 def _silence(flight: FlightData, s: FlightSummary) -> str:

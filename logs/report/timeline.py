@@ -104,7 +104,7 @@ def lanes(flight: FlightData) -> Iterator[Lane]:
         Lane("vehicle", tuple(_vehicle(flight))),
         Lane("positions", marks=tuple(_positions(flight))),
         Lane("plans", marks=tuple(_plans(flight))),
-        Lane("limits", marks=(("limit", _outside(flight)),)),
+        Lane("limits", marks=(("limit", flight.steps.t_s[state_outside(flight) | input_outside(flight)]),)),
         Lane("events", marks=tuple(_events(flight))),
         Lane("orders", marks=(("target", _orders(flight)),)),
     )
@@ -159,10 +159,6 @@ def _plans(flight: FlightData) -> Iterator[tuple[str, Floats]]:
     yield "limit", flight.seconds(failed)
 
 
-def _outside(flight: FlightData) -> Floats:
-    return flight.steps.t_s[state_outside(flight) | input_outside(flight)]
-
-
 def _events(flight: FlightData) -> Iterator[tuple[str, Floats]]:
     roles = {Severity.INFO: "muted", Severity.WARNING: "sample", Severity.ERROR: "limit"}
     for severity, role in roles.items():
@@ -189,7 +185,7 @@ def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
             [(one.begun_s, one.ended_s - one.begun_s)],
             (row - 0.32, 0.64),
             color=colour(one.role),
-            alpha=_alpha(one),
+            alpha=0.9 if one.role == "grid" else 0.3,
             lw=0,
         )
         if _fits(one, character_s):
@@ -198,10 +194,6 @@ def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
         shown = _apart(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
         low, high = np.full(len(shown), row - 0.28), np.full(len(shown), row + 0.28)
         strokes(ax, (shown, low), (shown, high), colour(role), 1.2)
-
-
-def _alpha(one: Span) -> float:
-    return 0.9 if one.role == "grid" else 0.3
 
 
 def _apart(times_s: Floats, shown_s: float) -> Floats:

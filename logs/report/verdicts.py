@@ -21,7 +21,7 @@ from uavctl.config.load import parse
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkEstimateParameters, burst_statistic, observe
 from uavctl.labels import duration
-from uavctl.records import ControlMode, Decision, LinkStats, PositionSample, Truth
+from uavctl.records import ControlMode, LinkStats, PositionSample, Truth
 
 # Verdict on the clocks: where capture times come from, how steady the offset was, and how true the stamps were.
 
@@ -434,13 +434,9 @@ def _trials(flight: FlightData) -> tuple[Flags, Flags]:
     }
     promised, trial = np.zeros(len(decisions), dtype=bool), np.zeros(len(decisions), dtype=bool)
     for place, (before, now) in enumerate(pairwise(decisions), 1):
-        promised[place] = now.step == before.step + 1 and _tracks(before) and before.plan_seq in whole
+        promised[place] = now.step == before.step + 1 and before.mode is ControlMode.TRACK and before.plan_seq in whole
         trial[place] = promised[place] and now.age_steps == 0
     return trial, promised
-
-
-def _tracks(decision: Decision) -> bool:
-    return decision.mode is ControlMode.TRACK
 
 
 def _rows_outside(flight: FlightData) -> Flags:
