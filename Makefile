@@ -9,13 +9,17 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 
-.PHONY: fly test test-clients mutation docs clean
+.PHONY: fly test test-all test-clients mutation docs clean
 
 fly: $(STAMP)
 	$(VENV)/bin/uavctl loopback --udp --config room
 
+# A person's loop, before each commit; test-all adds slow tests and the built wheel.
 test: $(STAMP)
 	$(VENV)/bin/python tools/check.py
+
+test-all: $(STAMP)
+	$(VENV)/bin/python tools/check.py --all
 
 test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \

@@ -1,6 +1,7 @@
 """All checks of the tree: the quick ones side by side, then the tests; the first that fails ends the run.
 
-`make test` and continuous integration run this; `--write-docs` only writes the generated pages.
+`make test` runs this, `make test-all` and continuous integration with `--all`; `--write-docs` only writes the generated
+pages.
 """
 
 from __future__ import annotations
@@ -81,22 +82,24 @@ def check_wheel(cache: str) -> str:
         return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
 
 
-def check_tests(cache: str) -> None:
-    """All tests; pytest's own closing line is the last one, and no test at all is a failure (exit code 5).
+def check_tests(cache: str, *, everything: bool) -> None:
+    """All tests, or those that are not slow; no test at all is a failure (exit code 5).
 
     A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+    command += [] if everything else ["-m", "not slow"]
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": cache}, check=False)
     if done.returncode != 0:
         raise StageError(f"pytest: exit code {done.returncode}")
 
 
-def stages(cache: str) -> tuple[tuple[str, Callable[[], str]], ...]:
-    """Everything but the tests, what takes longest first; policy libraries are kept in `cache`."""
+def stages(cache: str, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
+    """All but the tests, what takes longest first; policy libraries are kept in `cache`."""
+    wheel = (("wheel, outside the checkout", lambda: check_wheel(cache)),)
     return (
         ("mypy", lambda: run([BIN / "mypy"])),
-        ("wheel, outside the checkout", lambda: check_wheel(cache)),
+        *(wheel if everything else ()),
         ("ruff check", lambda: run([BIN / "ruff", "check"])),
         ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
         ("import contracts", lambda: run([BIN / "lint-imports"])),
@@ -117,18 +120,22 @@ def passes(name: str, stage: Callable[[], str]) -> bool:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the stages, two at a time, then the tests; 0 if all of them pass."""
+    """Run the stages, two at a time, then the tests; 0 if all of them pass. `--all`: the wheel and slow tests too."""
     if list(arguments) == ["--write-docs"]:
         for page, text in PAGES.items():
             page.write_text(text(), encoding="utf-8")
         return 0
+    everything = list(arguments) == ["--all"]
+    if arguments and not everything:
+        say("give nothing, --all or --write-docs")
+        return 2
     with tempfile.TemporaryDirectory(prefix="uavctl-check-cache-") as cache:
         with ThreadPoolExecutor(2) as pool:
-            if not all(list(pool.map(lambda one: passes(*one), stages(cache)))):
+            if not all(list(pool.map(lambda one: passes(*one), stages(cache, everything=everything)))):
                 return 1
         say("pytest ...")
         try:
-            check_tests(cache)
+            check_tests(cache, everything=everything)
         except StageError as error:
             say(f"{error}\nFAILED  pytest")
             return 1
