@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 
 from sim.autopilot.autopilot import Autopilot
-from sim.autopilot.profile import PERSONALITIES, Parameters
+from sim.autopilot.profile import SIMULATED, Parameters
 from sim.cameras import AXES, Cameras
 from sim.channel import within
 from sim.vehicle.linear import LinearVehicle
@@ -43,7 +43,7 @@ def problems(
     autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfig], key: str
 ) -> Iterator[ConfigProblem]:
     """What an autopilot of this kind cannot do of a list of faults: parameters, values and modes that it has not."""
-    parameters, modes = Parameters(autopilot), tuple(mode.name for mode in PERSONALITIES[autopilot].modes)
+    parameters, modes = Parameters(autopilot), tuple(mode.name for mode in SIMULATED[autopilot].modes)
     for i, fault in enumerate(faults):
         if fault.kind == "frame":
             yield from _unknown(f"{key}[{i}].name", "there are no axes", fault.name, tuple(AXES))
@@ -94,7 +94,7 @@ class Faults:
         wrong = tuple(problems(config.sim.autopilot, config.sim.fault, "sim.fault"))
         if wrong:
             raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
-        self._kind = PERSONALITIES[config.sim.autopilot]
+        self._kind = SIMULATED[config.sim.autopilot]
         self._vehicle = vehicle
         self._autopilot = autopilot
         self._cameras = cameras

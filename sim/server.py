@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
 from uavctl.config.checks import outside
 from uavctl.config.sim import ids
@@ -385,7 +385,7 @@ def serve_all(
         for seat in seats:
             ports: dict[str, Port] = {}
             opened.append(ports)
-            ports[VEHICLE] = open_port(seat.vehicle, PERSONALITIES[seat.config.sim.autopilot].greeting)
+            ports[VEHICLE] = open_port(seat.vehicle, SIMULATED[seat.config.sim.autopilot].greeting)
             if seat.mocap != seat.vehicle:
                 ports[MOCAP] = open_port(seat.mocap)
             if door is not None:

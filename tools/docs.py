@@ -17,7 +17,7 @@ from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.lab.campaign.spec import CampaignSpec
 from uavctl.lab.campaign.trials import TrialSpec
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState
-from uavctl.mavlink.profile import HABITS
+from uavctl.mavlink.profile import PROFILES
 from uavctl.records import Record
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -210,7 +210,7 @@ in `RETURNING`.
 
 def _failsafe_modes() -> str:
     """The modes that failsafes choose, by autopilot."""
-    return "; ".join(f"{name}: {', '.join(sorted(habits.failsafes))}" for name, habits in HABITS.items())
+    return "; ".join(f"{name}: {', '.join(sorted(profile.failsafes))}" for name, profile in PROFILES.items())
 
 
 def drawing() -> str:

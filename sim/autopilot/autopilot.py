@@ -19,7 +19,7 @@ from sim.autopilot.commands import CommandRequest, Commands
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.inertial import ERRORS, InertialSensors
 from sim.autopilot.pilot import CRASHED, CRITICAL, WARNING, Phase, Pilot
-from sim.autopilot.profile import PERSONALITIES, Mode, Parameters, ParameterType, Role, SimulatedProfile
+from sim.autopilot.profile import SIMULATED, Mode, Parameters, ParameterType, Role, SimulatedProfile
 from sim.autopilot.setpoints import SetpointKind, interpret
 from sim.autopilot.telemetry import HOME_POSITION, GeodeticOrigin, Message, Telemetry, TelemetrySources
 from sim.channel import earliest, within
@@ -275,7 +275,7 @@ DATA_STREAMS = {1: (27, 116), 2: (1, 24), 3: (65,), 6: (32, 33), 10: (30,), 11: 
 
 
 class Autopilot:
-    """A vehicle with the personality named by `config.sim.autopilot`; see `Pilot` for `airborne`.
+    """A vehicle with the profile named by `config.sim.autopilot`; see `Pilot` for `airborne`.
 
     Args:
         vehicle: what flies: the linear plant, or a vehicle with loops of its own.
@@ -295,7 +295,7 @@ class Autopilot:
     def __init__(
         self, config: Config, vehicle: Plant | Vehicle, start_ns: int, seed: np.random.SeedSequence, *, airborne: bool
     ) -> None:
-        kind = self._kind = PERSONALITIES[config.sim.autopilot]
+        kind = self._kind = SIMULATED[config.sim.autopilot]
         craft: Vehicle = SteeredPlant(vehicle) if isinstance(vehicle, Plant) else vehicle
         boot_ns = self._boot_ns = start_ns - UPTIME_NS
         self.craft = craft

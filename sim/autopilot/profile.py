@@ -202,7 +202,7 @@ def _stored(value: float, kind: ParameterType) -> float:
     return float(min(max(math.floor(value + 0.5), -LIMITS[kind]), LIMITS[kind] - 1))
 
 
-# How a PX4 and an ArduCopter differ, as tables: modes, frames, answers, habits.
+# How a PX4 and an ArduCopter differ, as tables: modes, frames, answers, profile.
 #
 # Mode numbers are the `custom_mode` of each autopilot's HEARTBEAT; base modes are those of recorded flights.
 
@@ -359,4 +359,4 @@ ARDUPILOT = SimulatedProfile(
     greeting=(b"\n\nInit ArduCopter V4.6.2 (simulated)\n\nFree RAM: 131072\n", b"parameters loaded\nready to fly\n"),
 )
 
-PERSONALITIES = {"px4": PX4, "ardupilot": ARDUPILOT}
+SIMULATED = {"px4": PX4, "ardupilot": ARDUPILOT}

@@ -18,7 +18,7 @@ from logs.recording.flight import FlightData
 from logs.recording.reader import read
 from logs.recording.summary import summarise
 from logs.report import flight_page as report
-from sim.autopilot.profile import FAILED, PERSONALITIES, Role
+from sim.autopilot.profile import FAILED, SIMULATED, Role
 from uavctl import loop as control
 from uavctl.cli import flying
 from uavctl.cli.app import run
@@ -60,7 +60,7 @@ def stick(mode: str) -> Callable[[Endings], None]:
 
 def fail(mode: Role) -> Callable[[Endings], None]:
     """A failsafe of the vehicle's own."""
-    return lambda rig: rig.peers.autopilot.pilot.fail(PERSONALITIES[rig.config.sim.autopilot].by_role(mode), rig.now_ns)
+    return lambda rig: rig.peers.autopilot.pilot.fail(SIMULATED[rig.config.sim.autopilot].by_role(mode), rig.now_ns)
 
 
 def deafen(kind: str) -> Callable[[Endings], None]:

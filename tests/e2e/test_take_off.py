@@ -11,7 +11,7 @@ from sim_rig import decode
 from take_off_rig import GOAL, Flight
 
 from logs.recording.replay import replay
-from sim.autopilot.profile import PERSONALITIES, Role
+from sim.autopilot.profile import SIMULATED, Role
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Decision, Event, Order, Setpoint
 
@@ -134,7 +134,7 @@ def test_the_pilot_s_stick_ends_streaming_and_is_never_argued_with(autopilot: st
 def test_the_vehicle_s_own_failsafe_has_precedence(autopilot: str) -> None:
     flight = Flight(autopilot, "sim.plant=quadrotor").take_off().run(7.0)
     pilot = flight.peers.autopilot.pilot
-    pilot.fail(PERSONALITIES[autopilot].by_role(Role.LAND), flight.now_ns)
+    pilot.fail(SIMULATED[autopilot].by_role(Role.LAND), flight.now_ns)
     before = flight.commands()
     flight.run(2.0, until=HandoverState.FAILSAFE)
     flight.run(20.0, until=HandoverState.DONE)

@@ -6,11 +6,15 @@ import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 from places import ROOT
 
 from logs.recording.reader import records
@@ -112,3 +116,61 @@ def test_a_fault_happens(tmp_path: Path) -> None:
     amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / told["recording"], Truth)}
     assert amiss[min(amiss)] == ()
     assert amiss[max(amiss)] == ("calm",)
+
+
+class Server(threading.Thread):
+    """A server of lines on loopback: a body at rest, and its clock."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.port = self.socket.getsockname()[1]
+
+    def run(self) -> None:
+        while True:
+            try:
+                data, client = self.socket.recvfrom(2048)
+            except OSError:
+                return
+            now_us = time.monotonic_ns() // 1000
+            if data.startswith(b"time"):
+                self.socket.sendto(data + f" {now_us}".encode(), client)
+            for line in ("nonsense", f"{now_us} 1.5 -2.0 -1.0"):
+                self.socket.sendto(line.encode(), client)
+
+
+SCRIPT = """
+import select, sys, time
+from uavctl.io.sources import open_source
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.messages import Position
+connection = open_source(sys.argv[1])
+found, until = [], time.monotonic() + 60
+while not found and time.monotonic() < until:
+    select.select([connection], [], [], 0.1)
+    found += [m for data, _ in connection.receive() for m in decode(data).messages if isinstance(m, Position)]
+connection.close()
+print(found[0].position_m)
+"""
+
+
+def test_a_position_source_is_a_class_and_a_line(tmp_path: Path) -> None:
+    recipe, commands, touched = walk("A position source", tmp_path)
+    assert (touched, commands) == (2, [])
+    (recipe.work / "hear.py").write_text(SCRIPT)
+    server = Server()
+    server.start()
+    try:
+        place = recipe.run(f"python hear.py lines://127.0.0.1:{server.port}/drone")
+    finally:
+        server.socket.close()
+    assert [float(value) for value in place.strip("()\n").split(",")] == [1.5, -2.0, -1.0]
+    with pytest.raises(AssertionError, match="does the server run there"):
+        recipe.run("python hear.py lines://127.0.0.1:9/drone")
+
+
+def test_an_autopilot_is_a_row(tmp_path: Path) -> None:
+    recipe, (script,), touched = walk("An autopilot", tmp_path)
+    assert touched == 1
+    assert recipe.run(script) == "generic ('COMPANION', True) ('LAND', False)\n"

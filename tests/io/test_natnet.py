@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, levelled, rotate
-from uavctl.io.camera import BodyPose, CameraError, Echo, NatNetUrl, parse
+from uavctl.io.camera import BodyPose, CameraError, CameraUrl, Echo, parse
 from uavctl.io.camera_host import Words, questions
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
@@ -191,9 +191,9 @@ def test_an_echo_is_the_servers_clock() -> None:
 
 
 def test_urls() -> None:
-    assert parse("natnet://10.0.0.5/drone%201") == NatNetUrl("10.0.0.5", 1510, "drone 1")
+    assert parse("natnet://10.0.0.5/drone%201") == CameraUrl("natnet", "10.0.0.5", 1510, "drone 1")
     given = parse("natnet://motive:1600/a/b?up=z&interface=10.0.0.9")
-    assert given == NatNetUrl("motive", 1600, "a/b", "z", "10.0.0.9")
+    assert given == CameraUrl("natnet", "motive", 1600, "a/b", "z", "10.0.0.9")
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sim.autopilot.profile import PERSONALITIES, px4_custom
-from uavctl.mavlink.profile import HABITS, autopilot_name, describe_mode
+from sim.autopilot.profile import SIMULATED, px4_custom
+from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
 
 
 @pytest.mark.parametrize(
@@ -39,13 +39,13 @@ def test_autopilots(number: int, name: str) -> None:
     assert autopilot_name(number) == name
 
 
-@pytest.mark.parametrize("autopilot", HABITS)
+@pytest.mark.parametrize("autopilot", PROFILES)
 def test_the_modes_that_are_asked_for_are_those_that_are_shown(autopilot: str) -> None:
-    habits = HABITS[autopilot]
-    assert {habits.external, habits.take_off} == set(habits.modes)
-    for name, (first, second) in habits.modes.items():
+    profile = PROFILES[autopilot]
+    assert {profile.external, profile.take_off} == set(profile.modes)
+    for name, (first, second) in profile.modes.items():
         custom = px4_custom(first, second) if autopilot == "px4" else first
-        assert describe_mode(autopilot, 2, custom) == (name, name == habits.external)
-        shown = PERSONALITIES[autopilot].by_number(custom)
+        assert describe_mode(autopilot, 2, custom) == (name, name == profile.external)
+        shown = SIMULATED[autopilot].by_number(custom)
         assert shown is not None and shown.name == name
-    assert not habits.climbing & habits.landing
+    assert not profile.climbing & profile.landing

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.config.connections import RelayConfig
@@ -194,7 +194,7 @@ class Indoors:
 
     def pilot_flies(self, external: str) -> None:
         """The pilot takes off by hand, and switches at 1.2 m."""
-        pilot, kind = self.peers.autopilot.pilot, PERSONALITIES[self.config.sim.autopilot]
+        pilot, kind = self.peers.autopilot.pilot, SIMULATED[self.config.sim.autopilot]
         if kind.name == "ardupilot":
             pilot.change(kind.mode(external), self.peers.now_ns)
         assert pilot.arm(self.peers.now_ns) == 0 and pilot.take_off(1.2, self.peers.now_ns) == 0

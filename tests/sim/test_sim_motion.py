@@ -11,7 +11,7 @@ from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import S, quadrotor, run
 
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, interpret
 from sim.vehicle.interface import LEVEL
 from sim.vehicle.quadrotor import Quadrotor
@@ -28,7 +28,7 @@ def told(name: str, mask: int, velocity: Vec3 = AHEAD, accel: Vec3 = CHANGE) -> 
     message = mavlink.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, mask, *HERE, *velocity, *accel, 0.0, 0.0
     )
-    return interpret(PERSONALITIES[name], message, (0.0, 0.0, 0.0), LEVEL)
+    return interpret(SIMULATED[name], message, (0.0, 0.0, 0.0), LEVEL)
 
 
 @BOTH

@@ -8,7 +8,7 @@ import numpy as np
 from draw_controller import draw_controller, fits
 from msgspec.structs import replace
 
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from uavctl.config import Config, load_config
 from uavctl.config.link import LinkConfig
 from uavctl.config.sim import FaultConfig
@@ -211,7 +211,7 @@ def _faults(
         elif kind == "battery":
             fault = replace(fault, charge=float(rng.uniform(0.0, 0.5)))
         elif kind == "mode":
-            fault = replace(fault, name=str(rng.choice([mode.name for mode in PERSONALITIES[autopilot].modes])))
+            fault = replace(fault, name=str(rng.choice([mode.name for mode in SIMULATED[autopilot].modes])))
         else:
             name = "COM_OF_LOSS_T" if autopilot == "px4" else "GUID_TIMEOUT"
             fault = replace(fault, name=name, value=float(rng.uniform(0.5, 3.0)))

@@ -27,7 +27,7 @@ from logs.recording.reader import read
 from logs.recording.recorder import SyncRecorder
 from logs.recording.summary import summarise
 from logs.report import flight_page as report
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.cli import fly as fly_cmd
 from uavctl.cli import tune as tune_flight
@@ -155,7 +155,7 @@ class Endings:
         return self.loop
 
     def stick(self, mode: str) -> None:
-        kind = PERSONALITIES[self.config.sim.autopilot]
+        kind = SIMULATED[self.config.sim.autopilot]
         self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
 
     def at(self, state: HandoverState, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:

@@ -8,7 +8,7 @@ from typing import Any
 from loopback_rig import Memory, header, shared
 from sim_rig import decode
 
-from sim.autopilot.profile import PERSONALITIES
+from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.lab.own_loop import EXTERNAL_ONLY
@@ -85,7 +85,7 @@ class Flight:
 
     def stick(self, mode: str) -> None:
         """The pilot changes the mode."""
-        kind = PERSONALITIES[self.config.sim.autopilot]
+        kind = SIMULATED[self.config.sim.autopilot]
         self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
 
     @property

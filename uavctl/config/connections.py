@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from ipaddress import ip_network
 from pathlib import PurePath
 from typing import Annotated, Literal
@@ -66,7 +67,28 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
 # Whom the control loop talks to: frame and clock of the positions' source, and the connections.
 
 
-CAMERAS = ("natnet:",)  # URLs of camera systems that are listened to without a bridge
+@dataclass(frozen=True)
+class CameraSystem:
+    """A camera system that is listened to without a bridge to MAVLink."""
+
+    camera: str  # `module:Class` of its `uavctl.io.camera.Camera`, made with the body's name and the axis that is up
+    package: str  # what that imports beyond ours; empty for nothing
+    extra: str  # of ours, that installs the package
+    port: int  # of its server, if a URL names none
+    advice: str  # where no answer comes
+
+
+# By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY. Another one is a line here and its class.
+CAMERA_SYSTEMS = {
+    "natnet": CameraSystem(
+        camera="uavctl.io.natnet:NatNet",
+        package="natnet",
+        extra="optitrack",
+        port=1510,  # Motive's own default
+        advice="does Motive run there, is NatNet enabled in its streaming settings, and does no firewall block it?",
+    )
+}
+CAMERAS = tuple(f"{scheme}:" for scheme in CAMERA_SYSTEMS)
 CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
 
 

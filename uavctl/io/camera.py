@@ -8,6 +8,7 @@ from ipaddress import IPv4Address
 from typing import Protocol, get_args
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from uavctl.config.connections import CAMERA_SYSTEMS
 from uavctl.errors import ConnectionSpecError, UavctlError
 from uavctl.frames import Quaternion, Up
 from uavctl.records import Vec3
@@ -76,47 +77,49 @@ class Camera(Protocol):
         ...
 
 
-# natnet://SERVER[:PORT]/BODY[?up=y|z&interface=ADDRESS].
+# SCHEME://SERVER[:PORT]/BODY[?up=y|z&interface=ADDRESS].
 
 
-SCHEME = "natnet"
-COMMAND_PORT = 1510  # Motive's own default
-FORM = "natnet://SERVER[:PORT]/BODY, and after it ?up=z where Motive streams Z up, interface=ADDRESS for our side"
+FORM = "SERVER[:PORT]/BODY, and after it ?up=z where the cameras' up is Z, interface=ADDRESS for our side"
 
 
 @dataclass(frozen=True)
-class NatNetUrl:
-    """A rigid body of a Motive server."""
+class CameraUrl:
+    """A body that a server of cameras tells of."""
 
-    host: str  # name or address of the computer that Motive runs on
-    port: int  # its command port
-    body: str  # name of the rigid body, as Motive has it
-    up: Up = "y"  # the axis that Motive streams as up
+    system: str  # its scheme, a key of `CAMERA_SYSTEMS`
+    host: str  # name or address of the server
+    port: int  # where it takes questions
+    body: str  # name of the body, as the cameras have it
+    up: Up = "y"  # the axis that they call up
     interface: str = "0.0.0.0"  # address of our network interface to the cameras
 
 
-def parse(url: str) -> NatNetUrl:
+def parse(url: str) -> CameraUrl:
     """Read a URL.
 
     Raises:
         ConnectionSpecError: it is not of this form.
     """
+    scheme = url.partition(":")[0]
+    form = f"write {scheme}://{FORM}"
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
         options = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query)))
     except ValueError as error:
-        raise ConnectionSpecError(f"connection {url!r}: {error}; write {FORM}") from error
+        raise ConnectionSpecError(f"connection {url!r}: {error}; {form}") from error
     body = unquote(parts.path.removeprefix("/"))
-    if parts.scheme != SCHEME or not host or not body or parts.fragment or port == 0:
-        raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; write {FORM}")
+    if scheme not in CAMERA_SYSTEMS or not host or not body or parts.fragment or port == 0:
+        raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; {form}")
     up, interface = options.pop("up", "y"), options.pop("interface", "0.0.0.0")
     if options:
-        raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; write {FORM}")
+        raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; {form}")
     for axis in get_args(Up):
         if up == axis:
-            return NatNetUrl(host, COMMAND_PORT if port is None else port, body, axis, _address(url, interface))
-    raise ConnectionSpecError(f"connection {url!r}: up={up!r} is neither y nor z; see Motive's streaming settings")
+            port = CAMERA_SYSTEMS[scheme].port if port is None else port
+            return CameraUrl(scheme, host, port, body, axis, _address(url, interface))
+    raise ConnectionSpecError(f"connection {url!r}: up={up!r} is neither y nor z; see the cameras' streaming settings")
 
 
 def _address(url: str, text: str) -> str:

@@ -1,8 +1,8 @@
 """The process that listens to cameras for one daemon.
 
-Started as `python -m uavctl.io.camera_host FD SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of the
-pipe is gone, however the daemon died. The pipe is a pair of sockets that keep the bounds of messages; what a message
-is, its first byte says (MAVLink has its own).
+Started as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of
+the pipe is gone, however the daemon died. The pipe is a pair of sockets that keep the bounds of messages; what a
+message is, its first byte says (MAVLink has its own).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import struct
 import sys
 import time
 from collections import Counter, deque
+from collections.abc import Callable
+from importlib import import_module
 from typing import cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -227,15 +229,16 @@ def _joined(group: tuple[str, int], interface: str) -> socket.socket:
 
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
-    descriptor, address, port, body, up, interface = arguments
+    descriptor, camera, address, port, body, up, interface = arguments
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
-    from uavctl.io.natnet import NatNet  # the package is there only where OptiTrack is used
+    module, _, name = camera.partition(":")
+    make: Callable[[str, Up], Camera] = getattr(import_module(module), name)
 
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
         try:
-            host = Host(NatNet(body, cast(Up, up)), pipe, (address, int(port)), interface)
+            host = Host(make(body, cast(Up, up)), pipe, (address, int(port)), interface)
             try:
                 host.run()
             finally:

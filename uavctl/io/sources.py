@@ -11,13 +11,12 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
-from typing import Protocol
 
+from uavctl.config.connections import CAMERA_SYSTEMS, CAMERAS
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.admission import AllowList, Budgets, Rules
 from uavctl.io.base import Base, Connection
-from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, SCHEME, NatNetUrl, parse
-from uavctl.io.camera import SCHEME as NATNET
+from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, parse
 from uavctl.io.transport import ANYBODY, open_connection
 
 # The daemon's end of a process that listens to cameras.
@@ -36,12 +35,14 @@ class Piped(Base):
 
     Args:
         arguments: of `uavctl.io.camera_host`, without the pipe.
+        advice: what may be amiss where the server does not answer.
         now: clock for the times of arrival [ns].
         rules: how many messages a second are taken.
     """
 
-    def __init__(self, url: str, arguments: list[str], now: Callable[[], int], rules: Rules) -> None:
+    def __init__(self, url: str, arguments: list[str], advice: str, now: Callable[[], int], rules: Rules) -> None:
         super().__init__(url, now)
+        self._advice = advice
         self._over: Counter[str] = Counter()
         self._budgets, self._sender = Budgets(rules, self._over), (url, 0)
         self._budgets.trust(self._sender, now())
@@ -78,11 +79,8 @@ class Piped(Base):
         if kind == REFUSED:
             raise ConnectionSpecError(f"connection {self.url!r}: {text}")
         if kind != READY:
-            advice = (
-                "does Motive run there, is NatNet enabled in its streaming settings, and does no firewall block it?"
-            )
             raise ConnectionSpecError(
-                f"connection {self.url!r}: {text or 'its process has ended'}; {advice}"
+                f"connection {self.url!r}: {text or 'its process has ended'}; {self._advice}"
             ) from TimeoutError(text)
 
     def fileno(self) -> int:
@@ -124,35 +122,34 @@ class Piped(Base):
         return None
 
 
-def open_natnet(url: str, now: Callable[[], int], rules: Rules) -> Connection:
-    """Open a rigid body of an OptiTrack system; see `uavctl.io.sources.open_source`.
+def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
+    """Open a body of a camera system; see `open_source`.
 
     Raises:
         ConnectionSpecError: the URL, the package, the server or the body is not as it has to be.
     """
     place = parse(url)
-    if find_spec(SCHEME) is None:
+    system = CAMERA_SYSTEMS[place.system]
+    if system.package and find_spec(system.package) is None:
         raise ConnectionSpecError(
-            f"connection {url!r} needs the package natnet, which is not installed; run: pip install 'uavctl[optitrack]'"
+            f"connection {url!r} needs the package {system.package}, which is not installed; run: "
+            f"pip install 'uavctl[{system.extra}]'"
         )
-    address = _resolve(url, place)
+    try:
+        address = socket.gethostbyname(place.host)
+    except OSError as error:
+        raise ConnectionSpecError(
+            f"connection {url!r}: host {place.host!r} is unknown ({error}); check the name"
+        ) from error
     if not AllowList(rules.allow).lets_in(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
-    piped = Piped(url, [address, str(place.port), place.body, place.up, place.interface], now, rules)
+    arguments = [system.camera, address, str(place.port), place.body, place.up, place.interface]
+    piped = Piped(url, arguments, system.advice, now, rules)
     with ExitStack() as stack:
         stack.callback(piped.close)
         piped.wait_until_ready()
         stack.pop_all()
     return piped
-
-
-def _resolve(url: str, place: NatNetUrl) -> str:
-    try:
-        return socket.gethostbyname(place.host)
-    except OSError as error:
-        raise ConnectionSpecError(
-            f"connection {url!r}: host {place.host!r} is unknown ({error}); check the name"
-        ) from error
 
 
 # Where positions come from: MAVLink as it is, or a camera system whose words are turned into MAVLink at the edge.
@@ -164,32 +161,23 @@ def _resolve(url: str, place: NatNetUrl) -> str:
 #
 # * Recording, replay, check, relay and the rules for stamps and clocks see one language. What reaches the controller is
 #   recorded as the bytes that it was, and a replay needs neither cameras nor their package.
-# * Another camera system is one class (`uavctl.io.camera.Camera`) and one line of `_OPENERS`.
+# * Another camera system is one class (`uavctl.io.camera.Camera`) and one line of
+#   `uavctl.config.connections.CAMERA_SYSTEMS`.
 #
 # Why a process and not a thread: a decoder in Python would hold the interpreter's lock when a tick is due, and a
 # malformed frame can make it reserve gigabytes. The process has its own memory limit; when it ends, positions are
 # lost, which the controller knows how to bear, and nothing else happens.
 
 
-class Opener(Protocol):
-    """Opens the source that a URL names."""
-
-    def __call__(self, url: str, now: Callable[[], int], rules: Rules) -> Connection:
-        """See `open_source`."""
-        ...
-
-
-_OPENERS: dict[str, Opener] = {NATNET: open_natnet}
-
-
 def open_source(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rules = ANYBODY) -> Connection:
     """Open a source of positions.
 
     Args:
-        url: natnet://SERVER[:PORT]/BODY, or what `uavctl.io.transport.open_connection` takes.
+        url: a camera system's, as natnet://SERVER[:PORT]/BODY, or what `uavctl.io.transport.open_connection` takes.
         now: clock for the times of arrival [ns].
 
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; says what to do.
     """
-    return _OPENERS.get(url.partition("://")[0], open_connection)(url, now, rules)
+    opener = _open_camera if url.startswith(CAMERAS) else open_connection
+    return opener(url, now, rules)

@@ -28,7 +28,7 @@ from uavctl.mavlink.messages import (
     TimeSync,
 )
 from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
-from uavctl.mavlink.profile import HABITS
+from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.mavlink.vehicle import SECOND_VEHICLE, Joiner, VehicleWatch
@@ -58,9 +58,7 @@ ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
 GPS_GLOBAL_ORIGIN = 49
 RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0}
 
-# What turns and what shows the acceleration, as each autopilot has it.
-INERTIAL_HZ = 50.0
-INERTIAL = {"px4": (ATTITUDE_QUATERNION, HIGHRES_IMU), "ardupilot": (ATTITUDE, RAW_IMU)}
+INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
 
 SOURCE_PARAMETER = "EK3_SRC1_POSXY"
 EXTERNAL = 6.0  # of the source: external positions
@@ -113,7 +111,8 @@ class Streams:
             self._tries += 1
             wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
         # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
-        kinds = INERTIAL.get(autopilot, ()) if self._inertial and not self._feels else ()
+        profile = PROFILES.get(autopilot) if self._inertial and not self._feels else None
+        kinds = () if profile is None else profile.inertial
         if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
             self._felt_next_ns = at_ns + AGAIN_NS
             self._felt_tries += 1
@@ -337,11 +336,11 @@ class MavlinkConnection:
 
     def _mode(self, ask: RequestKind) -> tuple[float, ...]:
         """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
-        habits = HABITS.get(self._vehicle.autopilot)
-        if habits is None:
+        profile = PROFILES.get(self._vehicle.autopilot)
+        if profile is None:
             raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
-        name = habits.external if ask is RequestKind.EXTERNAL_MODE else habits.take_off
-        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, habits.modes[name]))
+        name = profile.external if ask is RequestKind.EXTERNAL_MODE else profile.take_off
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.modes[name]))
 
     def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
         """What an ArduPilot without GPS has to be told before it arms; to be called while it is to be armed.
@@ -349,8 +348,8 @@ class MavlinkConnection:
         Args:
             place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
         """
-        habits = HABITS.get(self._vehicle.autopilot)
-        if habits is None or not habits.wants_place:
+        profile = PROFILES.get(self._vehicle.autopilot)
+        if profile is None or not profile.wants_place:
             return ()
         asks, tells = self._globe.due(at_ns)
         if not asks:
@@ -393,7 +392,7 @@ class MavlinkConnection:
             return ()
         trips = self.trips(self.vehicle)
         offset_ns = None if trips is None else trips.offset_ns(at_ns)
-        asks = autopilot in HABITS and HABITS[autopilot].moves_stamps and self.vehicle_asks_time
+        asks = autopilot in PROFILES and PROFILES[autopilot].moves_stamps and self.vehicle_asks_time
         poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
 

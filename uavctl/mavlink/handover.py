@@ -13,7 +13,7 @@ from uavctl.mavlink.handover_guards import (
     Progress,
     against_engaging,
     evaluate,
-    habits_of,
+    profile_of,
     silent,
 )
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
@@ -208,7 +208,7 @@ class HandOver:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
         if self.state not in LEAVING or view.vehicle is None:
             return True
-        return habits_of(view.vehicle).climbs_on_arming
+        return profile_of(view.vehicle).climbs_on_arming
 
     def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverView) -> None:
         now = self._now
@@ -231,7 +231,7 @@ class HandOver:
             self.failure = self.failure or sight.why
 
     def _ask(self, view: HandoverView) -> RequestKind | None:
-        climbs = view.vehicle is not None and habits_of(view.vehicle).climbs_on_arming
+        climbs = view.vehicle is not None and profile_of(view.vehicle).climbs_on_arming
         external = view.vehicle is not None and view.vehicle.external
         asks = {
             HandoverState.MODE: RequestKind.TAKE_OFF_MODE,

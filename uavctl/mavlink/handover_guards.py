@@ -13,7 +13,7 @@ import msgspec
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.profile import HABITS, AutopilotProfile
+from uavctl.mavlink.profile import PROFILES, AutopilotProfile
 from uavctl.mavlink.requests import PendingRequest
 from uavctl.records import Command, Order, VehicleStatus
 
@@ -97,9 +97,9 @@ def silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
     return vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS
 
 
-def habits_of(vehicle: VehicleStatus) -> AutopilotProfile:
-    """The autopilot's habits; those of PX4 for one that is not known, which is never asked for a mode."""
-    return HABITS.get(vehicle.autopilot, HABITS["px4"])
+def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
+    """The autopilot's profile; those of PX4 for one that is not known, which is never asked for a mode."""
+    return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
 def ordered(view: HandoverView, order: Order) -> bool:
@@ -109,7 +109,7 @@ def ordered(view: HandoverView, order: Order) -> bool:
 
 def fails(vehicle: VehicleStatus) -> bool:
     """Whether a failsafe of its own has chosen its mode: it says that one acts, in a mode that they choose."""
-    return vehicle.failsafe and vehicle.mode in habits_of(vehicle).failsafes
+    return vehicle.failsafe and vehicle.mode in profile_of(vehicle).failsafes
 
 
 def against_engaging(state: HandoverState, view: HandoverView) -> str:
@@ -117,7 +117,7 @@ def against_engaging(state: HandoverState, view: HandoverView) -> str:
     vehicle = view.vehicle
     if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
-    if vehicle is None or silent(view.at_ns, vehicle) or vehicle.autopilot not in HABITS:
+    if vehicle is None or silent(view.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
         return "no vehicle is heard that could be flown"
     if not vehicle.armed or vehicle.landed:
         return "the vehicle is not in the air"
@@ -179,7 +179,7 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
 def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
     """Why the vehicle's failsafe is not waited for any longer; empty while it is."""
     vehicle, config = view.vehicle, progress.config
-    lands = vehicle is not None and vehicle.mode in habits_of(vehicle).landing
+    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
     begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
     if progress.resumes and not lands and progress.climb_ns is not None:
         begun_ns = progress.climb_ns
@@ -195,7 +195,7 @@ def _never_ready(progress: Progress, view: HandoverView) -> str:
     vehicle, limit_s = view.vehicle, progress.config.ground_s
     if progress.ordered_ns is None:
         return ""
-    if vehicle is not None and vehicle.autopilot not in HABITS:
+    if vehicle is not None and vehicle.autopilot not in PROFILES:
         return f"take-off: how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
     if vehicle is not None and not vehicle.alone:
         return _ANOTHER
@@ -212,7 +212,9 @@ def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> G
     ready = progress.state is HandoverState.READY and not (view.unfit or view.stop)
     if ready and progress.ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
-            GuardResult(HandoverEvent.TAKE_OFF) if vehicle.autopilot in HABITS else GuardResult(HandoverEvent.DISARMED)
+            GuardResult(HandoverEvent.TAKE_OFF)
+            if vehicle.autopilot in PROFILES
+            else GuardResult(HandoverEvent.DISARMED)
         )
     if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
@@ -240,15 +242,15 @@ def _has_started_since(progress: Progress, view: HandoverView) -> bool:
 def _for_mode(_progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     if vehicle.armed:
         return GuardResult(HandoverEvent.OTHER)
-    there = vehicle.alone and vehicle.mode == habits_of(vehicle).take_off
+    there = vehicle.alone and vehicle.mode == profile_of(vehicle).take_off
     return GuardResult(HandoverEvent.GRANTED if there else HandoverEvent.PENDING)
 
 
 def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    habits, granted_ns = habits_of(vehicle), progress.request.granted_ns
-    if vehicle.mode not in habits.climbing:
+    profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
+    if vehicle.mode not in profile.climbing:
         return GuardResult(HandoverEvent.FAILSAFE if vehicle.armed and fails(vehicle) else HandoverEvent.OTHER)
-    if habits.climbs_on_arming and granted_ns is not None:  # it climbs already
+    if profile.climbs_on_arming and granted_ns is not None:  # it climbs already
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
     return GuardResult(HandoverEvent.GRANTED if vehicle.armed else HandoverEvent.PENDING)
 
@@ -256,11 +258,11 @@ def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus)
 def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     if not (vehicle.armed or progress.shows_the_past(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
-    habits = habits_of(vehicle)
-    if vehicle.mode not in habits.climbing:
+    profile = profile_of(vehicle)
+    if vehicle.mode not in profile.climbing:
         return GuardResult(HandoverEvent.FAILSAFE if fails(vehicle) else HandoverEvent.OTHER)
-    share = _climbed(progress, view, LOOK_AHEAD_S if habits.climbs_on_arming else 0.0)
-    ended = habits.climbs_on_arming and vehicle.mode != habits.take_off  # below the height: as high as it goes
+    share = _climbed(progress, view, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
+    ended = profile.climbs_on_arming and vehicle.mode != profile.take_off  # below the height: as high as it goes
     return GuardResult(
         HandoverEvent.GRANTED if share >= (LOW if ended else progress.config.reached) else HandoverEvent.PENDING
     )
@@ -280,7 +282,7 @@ def _for_external(progress: Progress, _view: HandoverView, vehicle: VehicleStatu
     if vehicle.external or granted_ns is not None:
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
     engaging = progress.state is HandoverState.ENGAGING
-    if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in habits_of(vehicle).climbing):
+    if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in profile_of(vehicle).climbing):
         return GuardResult(HandoverEvent.PENDING)
     return GuardResult(HandoverEvent.FAILSAFE if engaging and fails(vehicle) else HandoverEvent.OTHER)
 
@@ -293,10 +295,10 @@ def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus)
         )
     if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
-    habits = habits_of(vehicle)
-    if progress.resumes and vehicle.mode in habits.climbing:
+    profile = profile_of(vehicle)
+    if progress.resumes and vehicle.mode in profile.climbing:
         return GuardResult(HandoverEvent.GRANTED)
-    stays = not habits.returns and vehicle.mode == progress.left_mode
+    stays = not profile.returns and vehicle.mode == progress.left_mode
     # The external mode is not taken up again unasked: nobody knows whose doing it is.
     return GuardResult(HandoverEvent.PENDING if vehicle.external or fails(vehicle) or stays else HandoverEvent.OTHER)
 
@@ -305,18 +307,18 @@ def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus)
     news = vehicle.at_ns > progress.since_ns
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED if news else HandoverEvent.PENDING)
-    habits, asking = habits_of(vehicle), progress.state is HandoverState.LANDING
+    profile, asking = profile_of(vehicle), progress.state is HandoverState.LANDING
     ours = progress.ordered_ns is not None
-    if vehicle.mode in habits.landing:
+    if vehicle.mode in profile.landing:
         # A failsafe lands only until it ends: what we took off is to land whatever comes.
         for_us = not (ours and fails(vehicle)) or progress.request.granted_ns is not None
         return GuardResult(HandoverEvent.GRANTED if asking and for_us else HandoverEvent.PENDING)
-    if ours and not asking and habits.climbs_on_arming and vehicle.mode == habits.take_off:
+    if ours and not asking and profile.climbs_on_arming and vehicle.mode == profile.take_off:
         return GuardResult(
             HandoverEvent.FAILSAFE if vehicle.at_ns > progress.since_ns + SHOWN_NS else HandoverEvent.PENDING
         )
     # Asked for in the middle of a climb, any mode of the climb may still be shown.
-    passing = vehicle.external or vehicle.mode in habits.climbing or (ours and fails(vehicle))
+    passing = vehicle.external or vehicle.mode in profile.climbing or (ours and fails(vehicle))
     return GuardResult(HandoverEvent.PENDING if passing or not news else HandoverEvent.OTHER)
 
 

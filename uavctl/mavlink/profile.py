@@ -1,7 +1,12 @@
-"""Flight modes by name and by number, and how each autopilot takes off, flies setpoints and lands."""
+"""One profile of each autopilot that is flown: its modes by name and number, take-off, landing, failsafes, messages.
+
+Another autopilot is a row of `PROFILES` here, as docs/extending.md shows; a simulated one is another row, in
+`sim.autopilot.profile`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -49,6 +54,17 @@ _COPTER = {
 }
 
 
+def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
+    del vehicle_type
+    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+    name = _PX4_MAIN.get(main, f"MODE_{main}")
+    return f"AUTO.{_PX4_AUTO.get(sub, sub)}" if name == "AUTO" else name
+
+
+def _copter_mode(vehicle_type: int, custom_mode: int) -> str:
+    return _COPTER.get(custom_mode, f"MODE_{custom_mode}") if vehicle_type in _COPTER_TYPES else ""
+
+
 @dataclass(frozen=True)
 class AutopilotProfile:
     """How one autopilot gets into the air and out of it, by its own names of modes."""
@@ -66,10 +82,13 @@ class AutopilotProfile:
     wants_place: bool  # without GPS it has to be told a place on the globe before it arms
     moves_stamps: bool  # it moves the stamps of positions by what it has asked with TIMESYNC
     number: int  # MAV_AUTOPILOT of its heartbeats
+    inertial: tuple[int, int]  # the messages that show how it turns, and its acceleration
+    # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known
+    mode_name: Callable[[int, int], str]
     modes: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
 
 
-HABITS = {
+PROFILES = {
     # Recorded: AUTO.TAKEOFF is given on the ground, arming starts the climb to MIS_TAKEOFF_ALT, then it holds.
     "px4": AutopilotProfile(
         external="OFFBOARD",
@@ -83,6 +102,8 @@ HABITS = {
         wants_place=False,
         moves_stamps=True,
         number=mavlink.MAV_AUTOPILOT_PX4,
+        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
+        mode_name=_px4_mode,
         modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
     # It climbs in GUIDED; a setpoint would end the climb.
@@ -98,6 +119,8 @@ HABITS = {
         wants_place=True,
         moves_stamps=False,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
+        mode_name=_copter_mode,
         modes={"GUIDED": (4, 0)},
     ),
 }
@@ -105,7 +128,7 @@ HABITS = {
 
 def autopilot_name(autopilot: int) -> str:
     """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
-    return next((name for name, habits in HABITS.items() if habits.number == autopilot), "unknown")
+    return next((name for name, profile in PROFILES.items() if profile.number == autopilot), "unknown")
 
 
 def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
@@ -114,11 +137,8 @@ def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[
     Numbers mean something else on every autopilot, and on ArduPilot on every kind of vehicle; what is
     not known here never counts as external.
     """
-    if autopilot == "px4":
-        main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
-        name = _PX4_MAIN.get(main, f"MODE_{main}")
-        return (f"AUTO.{_PX4_AUTO.get(sub, sub)}" if name == "AUTO" else name), name == "OFFBOARD"
-    if autopilot == "ardupilot" and vehicle_type in _COPTER_TYPES:
-        name = _COPTER.get(custom_mode, f"MODE_{custom_mode}")
-        return name, name == "GUIDED"
-    return f"MODE_{custom_mode}", False
+    profile = PROFILES.get(autopilot)
+    name = "" if profile is None else profile.mode_name(vehicle_type, custom_mode)
+    if profile is None or not name:
+        return f"MODE_{custom_mode}", False
+    return name, name == profile.external

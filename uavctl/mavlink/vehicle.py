@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Quaternion, from_euler, rotate
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
-from uavctl.mavlink.profile import HABITS, autopilot_name, describe_mode
+from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
 # A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
@@ -281,7 +281,7 @@ class VehicleWatch:
                 self._turns(message, at_ns)
                 return (*anew, *self._moves(at_ns, attitude=angles_rad))
             case Inertial(raw=raw) if message.component == self.address[1]:
-                known = HABITS.get(self.autopilot)
+                known = PROFILES.get(self.autopilot)
                 return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
             case Text(severity=severity, text=text):
                 if "failsafe" in text.lower():

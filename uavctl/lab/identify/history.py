@@ -20,6 +20,7 @@ from uavctl.errors import RecordingError
 from uavctl.loop import MOCAP, make_links
 from uavctl.mavlink.clocksync import ClockSource
 from uavctl.mavlink.framing import scan
+from uavctl.mavlink.profile import PROFILES, autopilot_name
 from uavctl.records import Datagram, PositionSample, Record, Setpoint, StepInput
 
 # The TIMESYNC exchange of a recorded client: what tells a vehicle's clock though nobody asks any more.
@@ -189,7 +190,6 @@ _NO_POSITION_NO_VELOCITY = 0x03F  # bits of type_mask: ignored
 _MASK = 0x3FF  # of position, velocity, acceleration, and of acceleration as a force; whatever yaw does
 _LOCAL_NED = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_OFFSET_NED)
 
-_AUTOPILOTS = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
 _SHORTEST = 10  # bytes of the longer head
 _STAMPED = {  # positions that begin with their time [µs]
     mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE,
@@ -231,8 +231,8 @@ class VehicleWords:
         """Read what a datagram, or a packet, holds."""
         for frame in scan(data, final=True).frames:
             if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                kind = self._parser.decode(bytearray(frame.data)).autopilot
-                self.autopilot = _AUTOPILOTS.get(kind, self.autopilot)
+                name = autopilot_name(self._parser.decode(bytearray(frame.data)).autopilot)
+                self.autopilot = name if name in PROFILES else self.autopilot
             elif frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
                 message = self._parser.decode(bytearray(frame.data))
                 if message.param_id.startswith("PSC_") and math.isfinite(message.param_value):
