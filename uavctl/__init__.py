@@ -1,3 +1,3 @@
 """uavctl: stochastic predictive flight control over links that lose packets."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

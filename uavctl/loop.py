@@ -167,7 +167,7 @@ class ControlLoop:
 
     @property
     def plant(self) -> Plant:
-        """The model that the estimate is one of."""
+        """The model by which the vehicle's state is estimated."""
         return self._controller.plant
 
     @property
@@ -209,7 +209,7 @@ class ControlLoop:
         return Received(answers, from_vehicle, from_source)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
-        """Take the word of a connection that it has dropped something unread.
+        """Take note that a connection has dropped datagrams unread.
 
         Where that was the vehicle's, it may have been that the pilot has taken over: nothing that moves the vehicle is
         sent until it is heard again.
