@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+from logs.recording.summary import FlightSummary
+from logs.report.flight_page import write_report
 from uavctl.loop import ControlLoop
 
 CACHE = "UAVCTL_CACHE"
@@ -59,6 +63,16 @@ def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 @pytest.fixture
 def control_may_fail() -> None:
     """For tests of what happens when the controller fails."""
+
+
+@pytest.fixture(autouse=True)
+def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process for each would load matplotlib again and again; test_loopback.py draws one as it is."""
+
+    def draw(path: Path, summary: FlightSummary, page: Path) -> None:
+        write_report(FlightData.from_records(read(path), path), summary, page)
+
+    monkeypatch.setattr("uavctl.cli.flying.draw_page", draw)
 
 
 @pytest.fixture

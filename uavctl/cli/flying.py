@@ -324,7 +324,7 @@ def stop_limit_s(config: Config, *, takes_off: bool) -> float:
 
 
 def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
-    """Read the recording back, sum it up and write the page beside it.
+    """Read the recording back, sum it up and have the page drawn beside it; one that cannot be is told, and no more.
 
     Args:
         path: of the recording, which is closed.
@@ -347,7 +347,10 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
         recorder_dropped=0 if status.ok else _lacking(status),
         ending=None if ending is None else final(ending, status),
     )
-    draw_page(path, summary, page)
+    try:
+        draw_page(path, summary, page)
+    except UavctlError as error:  # the flight and its recording are as they are
+        messages().print(f"[yellow]warning:[/] no page: {escape(str(error))}", soft_wrap=True)
     return summary
 
 

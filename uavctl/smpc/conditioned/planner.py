@@ -177,6 +177,9 @@ class ConditionedSolver:
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.of(None)[max(0, counts - 1)]
         self._far = np.maximum(self._transit.rest[-1], float(quantile(np.array(allowed / many))) * oldest)
+        # With plain limits, which nearly every plan has: up to where a target leaves room, and is in nobody's way.
+        self._plain_far = (self._b - self._far)[self._resting]
+        self._plain_near = (self._b - self._near.rest[0])[self._resting]
         self._last: tuple[tuple[bool, int, bytes], _Margins] | None = None
 
     @property
@@ -264,8 +267,9 @@ class ConditionedSolver:
         """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides."""
         if outlook.path is not None:
             return self._near
-        sides = limits if limits.ndim == 1 else limits.min(axis=0)
-        kept = (sides - self._far)[self._resting]
+        kept = self._plain_far
+        if limits is not self._b:
+            kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._resting]
         return self._transit if (self._placed.dot(target[self._rests.held]) <= kept).all() else self._near
 
     def _margins(self, spread: _Spread, outlook: Preview) -> _Margins:
@@ -278,8 +282,11 @@ class ConditionedSolver:
 
     def _reference(self, target: Array, limits: Array) -> Array:
         """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
-        sides = limits if limits.ndim == 1 else limits.min(axis=0)
-        short = self._placed.dot(target[self._rests.held]) > (sides - self._near.rest[0])[self._resting]
+        sides, kept = limits, self._plain_near
+        if limits is not self._b:
+            sides = limits if limits.ndim == 1 else limits.min(axis=0)
+            kept = (sides - self._near.rest[0])[self._resting]
+        short = self._placed.dot(target[self._rests.held]) > kept
         count = np.count_nonzero(short)
         if not count:
             return target
