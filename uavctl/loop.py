@@ -128,11 +128,11 @@ class ControlLoop:
 
     @property
     def ending(self) -> Ending:
-        """How the flight ended, or would if it ended now."""
+        """End of the flight, or the one that it would have now."""
         return replace(self.course.ending(over=self.finished), relay=self._relayed())
 
     def _relayed(self) -> str:
-        """What became of the positions for the vehicle, for a person."""
+        """Return a text for a person on the positions passed on to the vehicle."""
         stats = self.relay
         if stats is None or stats.last_ns is None:
             return "" if stats is None else "no position was passed on to the vehicle"
@@ -157,7 +157,7 @@ class ControlLoop:
 
     @property
     def relay(self) -> RelayStats | None:
-        """What has become of the positions for the vehicle; None where none are passed on."""
+        """Counts of the positions passed on to the vehicle; None where none are passed on."""
         if not self._relays:
             return None
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
@@ -172,17 +172,17 @@ class ControlLoop:
 
     @property
     def failure(self) -> str:
-        """What the vehicle was asked for and did not do, with its own reason; empty if it did all."""
+        """Request that the vehicle did not carry out, with its own reason; empty if it did all."""
         return self._hand_over.failure
 
     @property
     def let_go(self) -> str:
-        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
         return "" if self._state.breach is None else self._state.breach.text
 
     @property
     def who_flies(self) -> HandoverState:
-        """Where the hand-over stands."""
+        """State of the hand-over."""
         return self._hand_over.state
 
     @property
@@ -257,7 +257,7 @@ class ControlLoop:
         self._record_stats(at_ns)
 
     def _decide(self, inp: StepInput) -> StepOutput:
-        """What the core makes of a tick; one that has failed is not asked again, and what it flew has to land."""
+        """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
         if not self.course.died:
             try:
                 self._state, out = step(self._state, inp, self._controller)
@@ -398,7 +398,7 @@ class ControlLoop:
             self.news.append(event)
 
     def _command(self, inp: StepInput, out: StepOutput) -> Iterator[Outgoing]:
-        """What the vehicle is told: a setpoint, a request, or nothing."""
+        """Yield what the vehicle is sent: a setpoint, a request, or nothing."""
         at_ns = inp.at_ns
         told = self._hand_over.update(self._view(inp, out))
         if told.passage is not None:
@@ -437,7 +437,7 @@ class ControlLoop:
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
     def _view(self, inp: StepInput, out: StepOutput) -> HandoverView:
-        """What the hand-over may know."""
+        """Return the inputs of the hand-over in this tick."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
         if estimate is not None and "down" in plant.axes:

@@ -1,4 +1,4 @@
-"""How a flight ended, told once: console, `ctl status`, health, summary, page, JSON and exit code take it from here.
+"""End of a flight, told once: console, `ctl status`, health, summary, page, JSON and exit code take it from here.
 
 The control loop notes what happens along the way; whoever ends it adds why. Pure: nothing here decides anything.
 """
@@ -94,7 +94,7 @@ def make_ending(cause: Cause, what: str, *, as_ordered: bool | None = None, exit
 
 @dataclass
 class FlightCourse:
-    """What happened along the way, as far as it bears upon the end."""
+    """Course of a flight, as far as it bears upon its end."""
 
     takes_off: bool = False  # the flight begins on the ground, by our order
     in_flight: bool = False  # it is to end in the air, as simulated flights do
@@ -140,7 +140,7 @@ class FlightCourse:
         self._airborne = self._airborne or (vehicle is not None and vehicle.armed)
 
     def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
-        """What the controller decided in a tick."""
+        """Note what the controller decided in a tick."""
         self._positions = self._positions or estimated
         before, self._mode = self._mode, decision.mode
         if decision.mode is ControlMode.TRACK:
@@ -186,7 +186,7 @@ class FlightCourse:
             self._asked = Cause.ORDERED
 
     def ending(self, *, over: bool | None = None) -> Ending:
-        """How it ended, or would if it ended now; `over`: nothing more was to be sent, if that is known better."""
+        """Return how it ended, or would end now; `over`: nothing more was to be sent, if that is known better."""
         cause, why = self._told(self.over if over is None else over)
         where = "" if cause is Cause.IN_FLIGHT else self._where()
         what = f"{cause.value}{f': {why}' if why else ''}"
@@ -294,7 +294,7 @@ class FlightCourse:
         return Cause.NOT_FLOWN, "the pilot has not switched to the mode that takes setpoints"
 
     def _where(self) -> str:
-        """Where the vehicle is, as far as it has told."""
+        """Return in words where the vehicle is, as far as it has told."""
         vehicle = self._vehicle
         if vehicle is None:
             return ""

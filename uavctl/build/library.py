@@ -292,7 +292,7 @@ def library_for(design: Design, advance: Advance | None = None, tell: Tell | Non
 
 
 def cache_file(design: Design) -> Path:
-    """Where the library of a design is kept: below `$UAVCTL_CACHE`, else the user's cache folder.
+    """Return the file that keeps the library of a design: below `$UAVCTL_CACHE`, else the user's cache folder.
 
     Raises:
         RuntimeError: There is no such folder, because the user has no home.

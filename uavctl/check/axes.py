@@ -68,7 +68,7 @@ class Evidence:
     tolerance_m: float  # root of the mean square of e - v that a right set-up keeps
 
     def misfit(self, matrix: Array) -> float:
-        """How badly e = M v holds, in tolerances; up to 1 it may be so."""
+        """Return the error of e = M v, in tolerances; up to 1 the relation may hold."""
         off = self.seen - self.own @ matrix.T
         # What the vehicle does not know of v counts as often as the set-up multiplies it.
         scale = max(1.0, float(np.cbrt(abs(np.linalg.det(matrix)))))
@@ -99,7 +99,7 @@ def turn(angle_deg: float) -> Array:
 
 
 def explain(evidence: Sequence[Evidence]) -> str:
-    """What is wrong, for evidence that does not fit I: a usual mistake, a turn, or what the best similarity shows."""
+    """Return the error that explains evidence which does not fit I: a usual mistake, a turn, or the best similarity."""
     usual = possible(evidence)
     angle = yaw_deg(evidence)
     if len(usual) > 1:

@@ -32,7 +32,7 @@ from uavctl.records import LinkStats, PositionSample, Vec3
 
 
 class ItemState(StrEnum):
-    """How it stands with an item."""
+    """Verdict on an item of the check."""
 
     GOOD = "good"
     NOTE = "note"  # flyable, and worth knowing
@@ -100,7 +100,7 @@ class Sample:
 
 @dataclass
 class Heard:
-    """What was heard."""
+    """Record of all that was heard while the check listened."""
 
     begun_ns: int  # when listening began
     samples: list[Sample] = field(default_factory=list)  # positions of the cameras, as they arrived

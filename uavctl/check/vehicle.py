@@ -40,7 +40,7 @@ def clock_items(seen: Heard, config: Config) -> list[Item]:
 
 
 def _of_vehicle(config: Config) -> tuple[ItemState, str]:
-    """How bad it is that the vehicle does not answer, and what to do."""
+    """Return how bad it is that the vehicle does not answer, and what to do."""
     if config.relay.enabled:
         return (
             ItemState.BAD,
@@ -86,7 +86,7 @@ _ANY = "any value"
 
 
 class ParameterVerdict(NamedTuple):
-    """How a value is, and what is wanted in its place with the other parameters as they are."""
+    """Verdict on a parameter's value, and what is wanted in its place with the other parameters as they are."""
 
     state: ItemState
     want: str
@@ -162,7 +162,7 @@ def _copter_threshold(value: float, _get: Get, config: Config) -> ParameterVerdi
 
 
 def _without_positions(config: Config) -> ItemState:
-    """How bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
+    """Return how bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
     return ItemState.BAD if config.relay.enabled else ItemState.NOTE
 
 

@@ -257,7 +257,7 @@ def check(security: SecurityConfig) -> Iterator[ConfigProblem]:
 
 
 def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
-    """What is open to strangers in a configuration that is not wrong; for people, before a flight."""
+    """Return warnings of what a valid configuration leaves open to strangers; for people, before a flight."""
     urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
     if daemon.vehicle == daemon.mocap:
         del urls["mocap"]

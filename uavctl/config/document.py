@@ -1,4 +1,4 @@
-"""Where each key of a TOML document stands: key path -> line number.
+"""Line numbers of the keys of a TOML document: key path -> line number.
 
 Parsers give values without places, or places without paths; a message that names the line of a
 wrong key needs both. The document must be valid TOML (the parser has seen it first).
@@ -109,7 +109,7 @@ def _problem(path: str, value: object, depth: int) -> ConfigProblem | None:
 
 
 class DataFileError(Exception):
-    """What is wrong with a file: one reason a line, each with file and line."""
+    """Errors in a file: one reason per line, each with file and line."""
 
     def __init__(self, reasons: tuple[str, ...]) -> None:
         super().__init__("\n".join(reasons))
@@ -313,7 +313,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 @dataclass(frozen=True)
 class Source:
-    """Where a configuration came from: enough to say where each key stands."""
+    """Origin of a configuration: enough to say where each key stands."""
 
     file: str  # the file, as a person finds it
     lines: Mapping[str, int]  # key path -> line in the file
@@ -394,7 +394,7 @@ def description(field: FieldInfo) -> str:
 
 
 def _unit(annotation: Any) -> str:
-    """What a length counts."""
+    """Return the unit that the length of a value counts."""
     return "characters" if annotation is str else "entries"
 
 

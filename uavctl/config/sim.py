@@ -123,7 +123,7 @@ class InertialConfig(Section, frozen=True, kw_only=True):
 
 
 class ChecksConfig(Section, frozen=True, kw_only=True):
-    """What the simulated autopilot doubts of itself though nothing is wrong (docs/autopilots.md)."""
+    """False alarms of the simulated autopilot: checks that fail though nothing is wrong (docs/autopilots.md)."""
 
     flicker_s: Annotated[
         float,

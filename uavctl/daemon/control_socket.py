@@ -47,7 +47,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     position_m: Vec3 | None = None  # local NED; with goto only
 
     def problem(self) -> str | None:
-        """What is wrong with it as such; None if nothing is."""
+        """Error in the request by itself; None if there is none."""
         if (self.ask == "goto") != (self.position_m is not None):
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
@@ -56,7 +56,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """What was decided on an order, or the flight as it is."""
+    """Reply to a request: what was decided on an order, or the flight as it is."""
 
     ok: bool
     text: str
@@ -83,7 +83,7 @@ def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ)
 
 
 def socket_path(folder: Path, name: str) -> Path:
-    """Where the daemon of this name listens.
+    """Return the path of the socket on which the daemon of this name listens.
 
     Raises:
         UsageError: the path is too long for a socket.
@@ -103,7 +103,7 @@ _REQUEST = msgspec.json.Decoder(ControlRequest)
 
 
 class Orderly(Protocol):
-    """What takes orders: the control loop."""
+    """Receiver of orders: the control loop."""
 
     answers: tuple[tuple[Command, Event], ...]  # the orders that the last tick took, each with its answer
 

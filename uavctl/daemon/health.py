@@ -82,7 +82,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Flight(Protocol):
-    """What is looked at of a control loop."""
+    """Control loop as far as its health is looked at."""
 
     decision: Decision | None
     estimate: Estimate | None
@@ -93,17 +93,17 @@ class Flight(Protocol):
 
     @property
     def who_flies(self) -> HandoverState:
-        """Where the hand-over stands."""
+        """State of the hand-over."""
         ...
 
     @property
     def relay(self) -> RelayStats | None:
-        """What has become of the positions for the vehicle; None where none are passed on."""
+        """Counts of the positions passed on to the vehicle; None where none are passed on."""
         ...
 
     @property
     def let_go(self) -> str:
-        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
         ...
 
 

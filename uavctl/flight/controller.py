@@ -1,4 +1,4 @@
-"""What is constant in a flight, and what one tick leaves to the next."""
+"""Constants of a flight, and the state that one tick leaves to the next."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Controller:
 
 
 class ControlState(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next."""
+    """State of the controller that one tick leaves to the next."""
 
     history: FilterHistory | None = None  # the estimator; None before the first tick
     decided_step: int | None = None  # step of the last boundary that was seen

@@ -1,4 +1,4 @@
-"""Who flies in a tick: operator orders, plan, fallback."""
+"""Decision of a tick on what flies: operator orders, plan, fallback."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _OURS = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
 
 def mode_of(state: ControlState) -> ControlMode:
-    """What flies."""
+    """Return the control mode of a state."""
     if state.fallback is not None:
         return state.fallback.mode
     return ControlMode.WAIT if state.plan is None else ControlMode.TRACK
@@ -141,7 +141,7 @@ SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgErro
 
 
 class SolveOutcome(msgspec.Struct, frozen=True):
-    """How a solve ended; `plan` is there only if it may fly."""
+    """Outcome of a solve; `plan` is there only if it may fly."""
 
     status: SolveStatus
     plan: Plan | None
@@ -231,7 +231,7 @@ class Tick(msgspec.Struct, frozen=True, eq=False):
 
 
 class Choice(msgspec.Struct, frozen=True, eq=False):
-    """What a tick decided."""
+    """Decision of a tick, with the state after it."""
 
     state: ControlState
     reason: str
@@ -274,7 +274,7 @@ def place(state: ControlState, inp: StepInput, history: FilterHistory, controlle
 
 
 def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
-    """Who flies: nobody yet, the plan, or the fallback."""
+    """Decide what flies: nothing yet, the plan, or the fallback."""
     if state.fallback is not None and state.fallback.ended:
         return _fall(state, state.fallback, tick, inp, controller, "handed over")
     why_not = unready(inp.vehicle)
@@ -339,7 +339,7 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
 
 
 def _begins(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Belief | None:
-    """What a plan begins with: what is believed of where the first input that is sent now begins to act."""
+    """Return the belief that a plan begins with: for the time at which an input that is sent now begins to act."""
     if inp.at_ns == tick.boundary_ns and not controller.dead_ns:
         return tick.belief
     return belief_ahead(controller.kalman, tick.history, state.coming, tick.boundary_ns, controller.dead_ns)
@@ -457,7 +457,7 @@ def reckons(fallback: Fallback, tick: Tick) -> bool:
 
 
 def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Vec3:
-    """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
+    """Return the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
     bias = fb.learnt(state.biases)
     # A bias of while no position came may be an error of the inertial data, and would be flown for seconds: it counts
     # where the vehicle's own velocity would contradict.
@@ -506,7 +506,7 @@ def seen_of(
     *,
     braking: bool = False,
 ) -> envelope.Observation:
-    """What the envelope may know of a tick."""
+    """Return the data of a tick that the envelope is checked against."""
     position, speed = None, (math.nan, math.nan, math.nan)
     if tick.estimate is not None:
         mean = tick.estimate.mean
@@ -523,7 +523,7 @@ def seen_of(
 
 
 def back_mps2(state: ControlState, tick: Tick, controller: Controller) -> Vec3:
-    """What brings a vehicle that holds by its inertial data back to where it began to; else zero."""
+    """Return the acceleration [m/s²] that brings a vehicle back to where its hold by inertial data began; else zero."""
     fallback, estimate = state.fallback, tick.estimate
     if fallback is None or fallback.mode is not ControlMode.HOLD or state.held_m is None or estimate is None:
         return ZERO

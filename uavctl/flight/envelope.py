@@ -76,7 +76,7 @@ _TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 @dataclass(frozen=True)
 class EnvelopeParameters:
-    """What is possible; vectors are north, east, down."""
+    """Bounds of what is physically possible in flight; vectors are north, east, down."""
 
     axes: tuple[bool, ...]  # which axes the plant has; the others are not looked at
     lower_m: Vec3  # position limits; minus infinity where there is none
@@ -91,7 +91,7 @@ class EnvelopeParameters:
 
 
 class Breach(msgspec.Struct, frozen=True):
-    """What cannot be: an event's code, and the cause in words."""
+    """Observation that is physically impossible: an event's code, and the cause in words."""
 
     code: str
     text: str
@@ -101,7 +101,7 @@ ABSURD = Breach(OUTSIDE, "all positions are further out than any can be, as if t
 
 
 class Observation(msgspec.Struct, frozen=True):
-    """What the envelope may know of a tick."""
+    """Data of a tick that the envelope is checked against."""
 
     at_ns: int  # the tick [ns]
     samples: Sequence[PositionSample]  # positions that were believed in this tick
@@ -122,7 +122,7 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next while we fly."""
+    """State of the envelope check that one tick leaves to the next while we fly."""
 
     observer: Observer | None = None  # None before the first position
     tick_ns: int | None = None  # the last tick
@@ -227,7 +227,7 @@ def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
 
 
 def _gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
-    """What gusts can have made of a velocity meanwhile."""
+    """Return how far gusts can have changed a velocity in `for_s` [m/s]."""
     return GUSTS * parameters.unexplained_mps2 * for_s
 
 
@@ -473,7 +473,7 @@ def _compared(
 
 
 def _unresolved(watching: Watching, seen: Observation) -> Breach | None:
-    """What is to be made of velocities that contradicted each other where no position comes that tells any more."""
+    """Return a breach if velocities contradicted each other and no position has come for too long to settle it."""
     if watching.apart_ns is None or seen.at_ns - watching.apart_ns < UNRESOLVED_NS:
         return None
     return Breach(VELOCITY, "positions moved otherwise than the vehicle itself says, and none has come since")
@@ -506,9 +506,10 @@ def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameter
 
 
 def _explained(apart: Array, way: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...]) -> Array:
-    """What is left of a difference of velocities (3,) once as much of it as stamps that are late make is taken away.
+    """Return a difference of velocities (3,) without the part that late stamps explain.
 
-    They make the acceleration meanwhile, by the way that the vehicle says it has flown, times how late they are.
+    Late stamps make a difference of the acceleration meanwhile, by the way that the vehicle says it has flown, times
+    how late they are.
     """
     (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
     begin, middle, end = (_flown(way, at_ns) for at_ns in (begin_ns, (begin_ns + end_ns) // 2, end_ns))

@@ -35,7 +35,7 @@ _KEY = attrgetter("key")
 
 
 class Node(msgspec.Struct, frozen=True, eq=False):
-    """What is known after an entry: the belief (None before the first sample) and the input that acts.
+    """State of the filter after an entry: the belief (None before the first sample) and the input that acts.
 
     The input is None while others fly the vehicle.
     """
@@ -65,7 +65,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def newest(self) -> Node:
-        """What is known after everything."""
+        """State of the filter after all entries."""
         return self.entries[-1].after if self.entries else self.anchor
 
     @property
@@ -238,7 +238,7 @@ def estimate(kalman: Kalman, history: FilterHistory, at_ns: int) -> Estimate | N
 
 
 def estimated(kalman: Kalman, belief: Belief) -> Estimate:
-    """What a belief says to others."""
+    """Return a belief as the estimate that leaves the filter, biases within their bounds."""
     bias, largest = kalman.bias, np.array(kalman.bias_bounds)
     return Estimate(
         at_ns=belief.at_ns,
@@ -280,7 +280,7 @@ def coasted(kalman: Kalman, history: FilterHistory, belief: Belief, at_ns: int) 
 
 
 def _known(history: FilterHistory, at_ns: int) -> Node:
-    """What was known after all that had happened by `at_ns`."""
+    """Return the state of the filter after all that had happened by `at_ns`."""
     for entry in reversed(history.entries):  # one of the newest, as a rule
         if entry.key[0] <= at_ns:
             return entry.after
@@ -317,7 +317,7 @@ def _trimmed(history: FilterHistory, horizon_ns: int) -> FilterHistory:
 
 
 def _after(kalman: Kalman, origin_ns: int, node: Node, entry: FilterEvent, belief: Belief | None = None) -> Node:
-    """What is known after an entry; `belief` is the prediction for it, if that has been asked."""
+    """Return the state of the filter after an entry; `belief` is the prediction for it, if it is there already."""
     if belief is None and node.belief is not None:
         belief = predicted(kalman, origin_ns, node.belief, node.input, entry.key[0])
     if entry.sample is not None:

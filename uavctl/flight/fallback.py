@@ -1,4 +1,4 @@
-"""What flies when no plan may: brake, zero acceleration, the vehicle's own landing.
+"""Fallback that flies when no plan may: brake, zero acceleration, the vehicle's own landing.
 
 A state machine of four modes, each with a time limit:
 
@@ -41,7 +41,7 @@ LATELY_NS = 3_000_000_000  # as far as it has been there for all of this time
 
 @dataclass(frozen=True)
 class FallbackParameters:
-    """How the fallback acts."""
+    """Parameters of the fallback."""
 
     brake_gain_1ps: float  # deceleration per predicted speed [1/s]
     brake_s: float  # longest time of braking [s]
@@ -52,7 +52,7 @@ class FallbackParameters:
 
 
 class FallbackEnd(IntEnum):
-    """What the fallback ends in; a greater one overrides a smaller one, and there is no way back to a smaller one."""
+    """End of the fallback; a greater one overrides a smaller one, and there is no way back to a smaller one."""
 
     RECOVER = auto()  # plans, once positions are back; until then as configured
     BARRED = auto()  # positions are not believed any more: as configured, and plans never again

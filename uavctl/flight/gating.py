@@ -46,7 +46,7 @@ _FRESH_PART = 3
 
 
 class SourceHealth(msgspec.Struct, frozen=True, eq=False):
-    """What is known of the sources."""
+    """Health of the position sources: what is known and suspected of them."""
 
     suspect: OutlierTrack | None = None  # samples that the vehicle cannot have come to and that agree; None without any
     absurd: OutlierTrack | None = (
@@ -59,7 +59,7 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
 
 
 class MeasurementUpdate(msgspec.Struct, frozen=True, eq=False):
-    """What came of a tick's samples."""
+    """Result of looking at a tick's samples."""
 
     history: FilterHistory  # the estimator with them
     trust: SourceHealth  # what is known of the sources
@@ -134,7 +134,7 @@ def _fresh_in_row(
 
 
 class _Believed(msgspec.Struct, frozen=True, eq=False):
-    """What came of samples that were looked at one after another; the fields are those of `MeasurementUpdate`."""
+    """Result of looking at samples one after another; the fields are those of `MeasurementUpdate`."""
 
     history: FilterHistory
     trust: SourceHealth
@@ -179,7 +179,7 @@ def _believe(kalman: Kalman, reach: Reach, history: FilterHistory, trust: Source
 
 
 def _said_since(source: str, first_ns: int) -> Callable[[PositionSample], bool]:
-    """What a source has said since `first_ns`, and then."""
+    """Return a test for samples that `source` captured at `first_ns` or later."""
     return lambda sample: sample.source == source and captured_ns(sample) >= first_ns
 
 
@@ -201,7 +201,7 @@ def _unstuck(
 
 
 class _Distrust(msgspec.Struct, frozen=True, eq=False):
-    """What is known of the sources with one more sample."""
+    """Health of the sources after one more sample, and whether that sample is believed."""
 
     trust: SourceHealth  # that
     reason: str | None  # why the sample is not believed; None if it is
@@ -217,7 +217,7 @@ def _distrust(
     sample: PositionSample,
     belief: Belief,
 ) -> _Distrust:
-    """What is known of the sources with one more sample; `belief` is the prediction for its capture time."""
+    """Return the health of the sources after one more sample; `belief` is the prediction for its capture time."""
     at_ns = captured_ns(sample)
     values, variances = shown_by(kalman, sample)
     off = values - belief.mean[kalman.shown[: len(values)]]
@@ -254,7 +254,7 @@ def _flies(vehicle: VehicleStatus | None) -> bool:
 
 
 def _moved_ns(before_ns: Moved, inp: StepInput, at_rest_mps: float) -> Moved:
-    """When it last moved, as far as it says so; a vehicle that says nothing moves."""
+    """Return when the vehicle last moved in each axis, by its own word; one that says nothing counts as moving."""
     velocity = own_words(inp.motion, inp.at_ns) or (math.inf,) * 3
     rows = zip(before_ns, velocity, strict=True)
     north, east, down = (ns if abs(v) < at_rest_mps else inp.at_ns for ns, v in rows)

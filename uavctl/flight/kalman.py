@@ -113,7 +113,7 @@ RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may hav
 
 @dataclass(frozen=True)
 class EstimatorParameters:
-    """What the filter believes of its samples."""
+    """Parameters of the estimator: what it assumes of samples, biases and inertial data."""
 
     position_std_m: float  # least standard deviation of a position sample, each axis [m]; a sample may claim more
     velocity_std_mps: float  # standard deviation of a velocity sample, each axis [m/s]
@@ -160,7 +160,7 @@ class Kalman:
 
     @property
     def bias(self) -> slice:
-        """Where the biases are among the states."""
+        """Slice of the biases among the states."""
         return slice(self.n_x - self.n_felt - self.n_bias, self.n_x - self.n_felt)
 
 

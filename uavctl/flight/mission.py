@@ -1,4 +1,4 @@
-"""Where to fly to, step by step: waypoints, a trajectory, limits that change in time. Pure.
+"""Mission of a flight, step by step: waypoints, a trajectory, limits that change in time. Pure.
 
 Time counts from the first decision with a vehicle that takes setpoints, and runs on from there. That decision is at a
 Δt boundary, and so is every other: a trajectory is met at its own samples only.
@@ -51,7 +51,7 @@ class Fence:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Where the plant may rest, and where it comes to rest."""
+    """Places where the plant may rest, and the place where a state comes to rest."""
 
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
     lower: Array  # least place to rest at of each axis (n_axes,) [m]: the terminal set fits the limits there
@@ -99,7 +99,7 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """What is asked for in a flight; constant."""
+    """Mission of a flight as configured; constant."""
 
     waypoints: tuple[Waypoint, ...]  # at least one; a trajectory takes their place
     accept_m: float  # A waypoint is reached when the estimate is this near [m]
@@ -126,7 +126,7 @@ class Lead:
 
 @dataclass(frozen=True)
 class MissionState:
-    """How far a mission has come."""
+    """Progress of a mission."""
 
     start_ns: int  # its time zero [ns]
     waypoint: int = 0  # number of the waypoint flown to, from 0
@@ -376,7 +376,7 @@ def along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower: Arr
 
 
 def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
-    """Where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
+    """Return where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
 
     Args:
         lower: Least place to rest at of each axis (n_axes,) [m].
@@ -398,7 +398,7 @@ def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
 
 
 def _reach(plant: Plant, steps: int) -> Array:
-    """What inputs u_0 … u_{steps-1} do to the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
+    """Return how inputs u_0 … u_{steps-1} act on the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
     reach = np.zeros((steps + 1, plant.n_x, steps * plant.n_u))
     for t in range(steps):
         reach[t + 1] = plant.a @ reach[t]

@@ -33,7 +33,7 @@ _HORIZONS = 2  # the vehicle may be anywhere after that many horizons of silence
 
 @dataclass(frozen=True)
 class GateParameters:
-    """How far positions are believed."""
+    """Parameters of the gate for positions."""
 
     sigma: float  # half-width of the set in standard deviations, beside what inputs can do
     margin_m: float  # and beside both, for what no model says [m]
@@ -102,7 +102,7 @@ def radius(reach: Reach, kalman: Kalman, belief: Belief, variances: Array, doubt
 
 
 def doubt(reach: Reach, belief: Belief, off_m: Array) -> Array:
-    """How wrong the velocity may be (n_axes,) [m/s] once a sample that was `off_m` the prediction has been believed.
+    """Return how wrong the velocity may be (n_axes,) [m/s] after believing a sample `off_m` away from the prediction.
 
     A filter that knows its inputs takes what is off for a velocity that disturbances made; inputs that it does not know
     of may have made the position and none of that velocity, as far as they can.
@@ -115,7 +115,7 @@ def doubt(reach: Reach, belief: Belief, off_m: Array) -> Array:
 
 
 def _far(reach: Reach, belief: Belief) -> Array:
-    """How far inputs can have carried positions, then velocities, since the newest sample of a belief."""
+    """Return how far inputs can have carried positions, then velocities, since the newest sample of a belief."""
     ticks = -(-(belief.at_ns - belief.captured_ns) // reach.tick_ns)
     return reach.far[ticks] if ticks < len(reach.far) else np.full(reach.far.shape[1], np.inf)
 
@@ -192,7 +192,7 @@ Moved = tuple[int, int, int]  # when the vehicle last moved north, east and down
 
 
 class Watch(msgspec.Struct, frozen=True, eq=False):
-    """What a source has said."""
+    """Record of what one source has said."""
 
     at_ns: int  # capture time of its newest sample [ns]
     position_m: Vec3  # what that said
@@ -260,7 +260,7 @@ Watches = Mapping[str, Watch]
 
 
 def observe(watches: Watches, kalman: Kalman, history: FilterHistory, sample: PositionSample, off_m: Array) -> Watches:
-    """What the sources have said, with one more sample; those that come late say nothing.
+    """Return the records of the sources with one more sample; samples that come late change nothing.
 
     Args:
         history: The estimator before the sample.

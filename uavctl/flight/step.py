@@ -79,7 +79,7 @@ def at_bound(bias: Sequence[float], bounds: Sequence[float], told: Sequence[int]
 
 
 def bias_events(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_ns: int) -> tuple[Event, ...]:
-    """What has become of it: an event if more inputs are at their bounds than before, and one if none is any more.
+    """Return a warning if the bias of a further input is at its bound, and a note once none is any more.
 
     Args:
         push_mps2: the bias as an acceleration, local NED [m/s²].
@@ -113,7 +113,7 @@ _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
 class StepOutput(msgspec.Struct, frozen=True):
-    """What a tick gives to the outside."""
+    """Output of a tick."""
 
     estimate: Estimate | None  # state estimate at the tick; None before the first sample
     plan: Plan | None  # A new plan, only if this tick made one
@@ -381,7 +381,7 @@ def _link(
 
 
 def _alarms(link: LinkEstimate, told: tuple[str, ...]) -> tuple[str, ...]:
-    """What holds of the link; what was told holds until the estimate is on the good side, or it would be told often."""
+    """Return the link alarms that hold; one already told holds on until the estimate is on the good side again."""
     holds = {
         "link-bursts": (link.bursts, link.burst_statistic > 0.0),
         "link-below-promise": (link.below_promise, link.arrival_mean < link.promised),
@@ -413,7 +413,7 @@ ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for 
 
 
 def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> str:
-    """How it is with the vehicle's inertial data, as an event's code; empty where that is nothing to us."""
+    """Return the state of the vehicle's inertial data as an event code; empty if none are used or we do not fly."""
     belief, flown = tick.history.newest.belief, mode_of(state) not in _NOT_FLOWN and _is_ours(inp.vehicle)
     if not controller.kalman.n_felt or belief is None or not flown:
         return ""
@@ -424,7 +424,7 @@ def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Contr
 
 
 def _inertial_events(before: str, now: str, at_ns: int) -> tuple[Event, ...]:
-    """What has become of the vehicle's inertial data; that they are used is told only where they were not."""
+    """Return the event for a change in the use of inertial data; "used" is told only where they were not before."""
     if now in ("", before) or (now == "inertial-used" and not before):
         return ()
     severity, text = _INERTIAL[now]

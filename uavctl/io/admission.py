@@ -1,4 +1,4 @@
-"""Who may speak to a connection, and how much work each may make: counted before anything looks into a datagram."""
+"""Admission to a connection: who may send, and how much work each may make, before anything looks into a datagram."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HEARTBEATS = 8  # of a backlog of the vehicle's; what looks like one may be non
 
 @dataclass(frozen=True)
 class Rules:
-    """What a UDP connection lets in."""
+    """Rules for what a UDP connection lets in."""
 
     allow: tuple[str, ...] = ()  # addresses and networks; none lets anybody in
     max_per_s: float = 2000.0  # datagrams a second of one sender
@@ -62,16 +62,17 @@ class AllowList:
 
 
 def frames_in(data: bytes) -> int:
-    """How many frames a datagram can make us look at, at most: no checksum and no hash is taken more often.
+    """Return the most frames that a datagram can make us look at: no checksum and no hash is taken more often.
 
-    Each begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given up.
+    Each frame begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given
+    up.
     """
     return max(1, min(data.count(MAGIC[0]) + data.count(MAGIC[1]), len(data) // SHORTEST_FRAME + MAX_TRIES + 1))
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """How much one may send: datagrams, frames and bytes."""
+    """Amount that a sender may send: datagrams, frames and bytes."""
 
     per_s: tuple[float, float, float]  # of each, a second
     burst: tuple[float, float, float]  # of each, at once
@@ -99,7 +100,7 @@ def _times(factor: float, those: tuple[float, float, float]) -> tuple[float, flo
 
 
 class _Budget:
-    """What may still be sent now."""
+    """Budget of what a sender may still send now."""
 
     __slots__ = ("_allowance", "_at_ns", "bytes", "datagrams", "frames")
 

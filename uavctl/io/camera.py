@@ -47,7 +47,7 @@ class Camera(Protocol):
 
     @property
     def awaits(self) -> str:
-        """What it lacks while it is not ready, for people."""
+        """Text for people on what it lacks while it is not ready."""
         ...
 
     @property
@@ -57,7 +57,7 @@ class Camera(Protocol):
 
     @property
     def dropped(self) -> Counter[str]:
-        """What came and gave no position, by reason."""
+        """Counts of datagrams that gave no position, by reason."""
         ...
 
     def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
@@ -69,7 +69,7 @@ class Camera(Protocol):
         ...
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """What is to be sent to the server now."""
+        """Return the datagrams to send to the server now."""
         ...
 
     def ask_time(self, token: int) -> bytes:

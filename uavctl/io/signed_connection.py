@@ -116,7 +116,7 @@ LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in m
 
 
 def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where stamps are kept: systemd's state directory, else the user's."""
+    """Return the folder where stamps are kept: systemd's state directory, else the user's."""
     systemd, xdg = environment.get("STATE_DIRECTORY"), environment.get("XDG_STATE_HOME")
     if systemd:
         return Path(systemd.partition(":")[0])

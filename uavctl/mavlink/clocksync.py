@@ -35,7 +35,7 @@ class StampRefusal(StrEnum):
 
 
 class ClockSource(StrEnum):
-    """Where the offset comes from."""
+    """Source of a clock offset."""
 
     TIMESYNC = "timesync"
     MINIMUM = "minimum"
@@ -93,7 +93,7 @@ class RoundTrips:
 
     @property
     def drift_ppm(self) -> float | None:
-        """What our clock gains on the peer's [millionths]; None before enough answers."""
+        """Gain of our clock on the peer's [millionths]; None before enough answers."""
         return self._slope * 1e6 if self._settled else None
 
     @property

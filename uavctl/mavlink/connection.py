@@ -121,7 +121,7 @@ class Streams:
 
 
 class Globe:
-    """When to tell an ArduPilot that flies by external positions a place on the globe: without one it does not arm.
+    """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
 
     Its source of positions is read first: with GPS a place of ours would be wrong.
     """
@@ -233,12 +233,12 @@ class MavlinkConnection:
 
     @property
     def attitude(self) -> Quaternion | None:
-        """How the body of the newest sample was turned: body axes forward, right, down to NED (w, x, y, z)."""
+        """Attitude of the body in the newest sample: body axes forward, right, down to NED (w, x, y, z)."""
         return self._intake.attitude
 
     @property
     def clock_source(self) -> ClockSource:
-        """Where the time of the newest sample's capture comes from."""
+        """Source of the newest sample's capture time."""
         return self._intake.clock_source
 
     @property
@@ -264,7 +264,7 @@ class MavlinkConnection:
         return self.vehicle is not None and self.vehicle[0] in self._askers
 
     def vehicle_up_s(self, at_ns: int) -> float | None:
-        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         return self._vehicle.up_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> tuple[Item, ...]:
@@ -280,7 +280,7 @@ class MavlinkConnection:
         return (*items, *self._tell(at_ns))
 
     def answers(self) -> tuple[bytes, ...]:
-        """What the last datagram has to be answered with, at once: a TIMESYNC that waits measures the wait."""
+        """Answers to the last datagram, to be sent at once: a TIMESYNC that waits measures the wait."""
         return tuple(self._answers)
 
     def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
@@ -290,7 +290,7 @@ class MavlinkConnection:
         return self._tell(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """What is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
+        """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
         out = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
@@ -343,7 +343,7 @@ class MavlinkConnection:
         return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.modes[name]))
 
     def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
-        """What an ArduPilot without GPS has to be told before it arms; to be called while it is to be armed.
+        """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
 
         Args:
             place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
@@ -434,7 +434,7 @@ class MavlinkConnection:
         return items
 
     def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        """What the vehicle tells of itself."""
+        """Take a message of the vehicle and return what it tells of itself."""
         if isinstance(message, Text):
             whole = self._texts.take(message, at_ns)
             return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
@@ -476,7 +476,7 @@ class MavlinkConnection:
             self._untold[reason] += count
 
     def _tell(self, at_ns: int) -> tuple[Event, ...]:
-        """What was dropped, as one event a second, and new clocks as they are found."""
+        """Return events: what was dropped, one a second, and new clocks as they are found."""
         events = []
         if self._intake.resyncs > self._resyncs_told:
             self._resyncs_told = self._intake.resyncs

@@ -47,7 +47,7 @@ class RawFrame(msgspec.Struct, frozen=True):
 
 
 class Scan(msgspec.Struct):
-    """What a scan found."""
+    """Result of a scan."""
 
     frames: list[RawFrame] = []  # whole frames in order
     bad: dict[str, int] = {}  # skips by reason
@@ -60,7 +60,7 @@ class Scan(msgspec.Struct):
 
 
 class _Shape(msgspec.Struct, frozen=True):
-    """What the first bytes of a frame promise."""
+    """Length and kind of a frame, as its first bytes announce them."""
 
     length: int
     message_id: int
@@ -201,7 +201,7 @@ _SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
 
 
 class Fields(Protocol):
-    """What a frame says: the fields of its message by their names, an array as a tuple, a text as its bytes."""
+    """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
 
     msgname: str
     src_system: int
@@ -211,7 +211,7 @@ class Fields(Protocol):
 
 
 class MessageLayout:
-    """How one kind of message lies in a frame."""
+    """Layout of one kind of message in a frame."""
 
     def __init__(self, kind: Any) -> None:
         self._name, self._id = kind.msgname, kind.id.to_bytes(3, "little")

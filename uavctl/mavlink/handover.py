@@ -52,7 +52,7 @@ class Passage(msgspec.Struct, frozen=True):
 
 
 class HandoverStep(msgspec.Struct, frozen=True):
-    """What a tick makes of it."""
+    """Result of a tick of the hand-over."""
 
     sending: Sending  # what may be streamed
     ask: RequestKind | None = None  # what to ask the vehicle for now, if anything
@@ -61,7 +61,7 @@ class HandoverStep(msgspec.Struct, frozen=True):
 
 
 class HandOver:
-    """Who flies one vehicle.
+    """State machine that decides who flies one vehicle.
 
     Args:
         sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle

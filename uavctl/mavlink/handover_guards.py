@@ -1,4 +1,4 @@
-"""What a tick of the hand-over sees of the vehicle, in the words of the table of `handover_states.py`.
+"""Guards of the hand-over: the event that a tick sees, in the words of the table of `handover_states.py`.
 
 Pure: all that it goes by is an argument.
 """
@@ -43,7 +43,7 @@ _LEFT = "a daemon before this one has left the vehicle in flight: nothing is sen
 
 
 class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
-    """What the hand-over knows in a tick."""
+    """Inputs of the hand-over in a tick."""
 
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
@@ -60,7 +60,7 @@ class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(kw_only=True)
 class Progress:
-    """How far the hand-over has come."""
+    """Progress of the hand-over."""
 
     config: HandOverConfig  # times and bounds
     request: PendingRequest  # what is asked for, or waited for
@@ -85,7 +85,7 @@ class Progress:
 
 
 class GuardResult(msgspec.Struct, frozen=True):
-    """What is seen, and why, where that has to be told."""
+    """Event that is seen, with the reason where that has to be told."""
 
     seen: HandoverEvent  # in the words of the table
     why: str = ""  # why something failed
@@ -142,7 +142,7 @@ def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
 
 
 def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
-    """What a tick sees; of several things the first in the order of `Seen`."""
+    """Return the event that a tick sees; of several the first in the order of `HandoverEvent`."""
     vehicle, state = view.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
         return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")

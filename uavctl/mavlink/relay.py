@@ -70,7 +70,7 @@ class Relay:
     def due(
         self, at_ns: int, *, offset_ns: int | None, asks: bool, refused: Sequence[PositionSample]
     ) -> tuple[Pose, ...]:
-        """What goes to the vehicle in this tick, in order of capture.
+        """Return the positions that go to the vehicle in this tick, in order of capture.
 
         Args:
             offset_ns: (our time - the vehicle's) from round trips; None if it does not answer.

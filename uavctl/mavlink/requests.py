@@ -16,7 +16,7 @@ _MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal
 
 
 class RequestKind(StrEnum):
-    """What the vehicle is asked for; the value is how a person would say it."""
+    """Request to the vehicle; the value is how a person would say it."""
 
     TAKE_OFF_MODE = "the mode to take off in"
     ARM = "arming"
@@ -83,9 +83,9 @@ class PendingRequest:
                 self._next_ns = at_ns + self._patience.retry_ns
 
     def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
-        """What to send now, if anything; `held` says why it must not be sent yet.
+        """Return the request to send now, if any; `held` says why it must not be sent yet.
 
-        `blind`: nothing is made again now, as it is not known what the vehicle does meanwhile.
+        `blind`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
         """
         self._held = held
         if blind and self._tries:
@@ -125,7 +125,7 @@ class PendingRequest:
 
     @property
     def words(self) -> str:
-        """What the vehicle has said meanwhile, to be added to a reason."""
+        """The vehicle's texts since the request, quoted, to be added to a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
     def _effort(self, at_ns: int) -> str:

@@ -44,7 +44,7 @@ class BootClock:
         self._newest: _Reading | None = None
 
     def up_s(self, at_ns: int) -> float | None:
-        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         newest = self._newest
         return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
 
@@ -117,7 +117,7 @@ class _Begun(msgspec.Struct):
     at_ns: int
 
     def so_far(self) -> Text:
-        """What has come of it."""
+        """Return the text as far as it has come, with a mark for the part that is missing."""
         return _plain(self.first, self.said + LOST)
 
 
@@ -296,11 +296,11 @@ class VehicleWatch:
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
     def up_s(self, at_ns: int) -> float | None:
-        """How long ago it started, by its own clock [s]; None if it does not tell."""
+        """Return the time since it started, by its own clock [s]; None if it does not tell."""
         return self._clock.up_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
-        """What turns a specific force of that time into local NED (w, x, y, z); None where it is old or unknown."""
+        """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
         if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
             return None
         return from_euler(self._turned[0])
@@ -321,7 +321,7 @@ class VehicleWatch:
     def _moves(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
     ) -> tuple[VehicleMotion, ...]:
-        """How it moves, with what it just said of that."""
+        """Return the vehicle's motion, updated with what it has just said of it."""
         if velocity is not None:
             self._motion = msgspec.structs.replace(self._motion, velocity_mps=velocity, velocity_ns=at_ns)
         if attitude is not None:

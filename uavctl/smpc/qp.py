@@ -256,7 +256,7 @@ def pairs_of(c: Array) -> tuple[Pair, ...]:
 
 @dataclass(frozen=True)
 class VariableLayout:
-    """Where each kind of variable sits."""
+    """Places of each kind of variable in the vector of all variables."""
 
     v: slice
     theta: slice

@@ -29,7 +29,7 @@ SELDOM = 0.05  # of the allowed risk: what the oldest ages may use up that keep 
 
 @dataclass(frozen=True, eq=False)
 class AgeRisk:
-    """How the risk of a time is spread over the ages of the information that its plan may be based on."""
+    """Spread of a time's risk over the ages of the information that its plan may be based on."""
 
     weights: Array  # π_t (H,), of information t = 1 … H steps old
     beyond: float  # probability that it is older than H: no plan is left then, and all of it counts as outside
@@ -38,7 +38,7 @@ class AgeRisk:
 
     @property
     def shares(self) -> Array:
-        """What plans spread over their rows (H,): no bound where ε̄_t is 1, as nothing is more often than always."""
+        """Risk that plans spread over their rows (H,); infinite where ε̄_t is 1, for then nothing is asked."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
@@ -274,7 +274,7 @@ def rest_backoffs(
     most: int,
     seen: Plant | None = None,
 ) -> Array:
-    """What plans that rest keep from the rows `c` (m, n_x), where 1 … `most` of them share the risk (most, m).
+    """Return the distances (most, m) that plans at rest keep from rows `c` (m, n_x), where 1 … `most` share the risk.
 
     Args:
         risk: How the risk is spread over the ages.
@@ -294,7 +294,7 @@ def rest_backoffs(
 
 @dataclass(frozen=True, eq=False)
 class _RestingRows:
-    """What is known of the rows, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
+    """Data of the rows for plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
 
     risk: AgeRisk  # how the risk is spread over the ages
     late: int  # age of most positions when they come [steps]
@@ -304,7 +304,7 @@ class _RestingRows:
     news: Array  # deviations of the rows (L, H, m) in the stages of a new plan that news make, before its inputs
 
     def distance(self, row: int, share: int, allowed: float) -> float:
-        """What a row is kept that shares the risk with `share` - 1 others."""
+        """Return the distance to keep from a row that shares the risk with `share` - 1 others."""
         weights, sigma = self.risk.weights[self.late :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.late + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
         backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
@@ -356,7 +356,7 @@ def _powers(matrix: Array, most: int) -> Array:
 
 
 def _reach(problem: ControlProblem, slew: SlewRows, seen: Array) -> Array:
-    """How far inputs bring the rows away from their limits in 1 … H steps (H, m), from an input of zero.
+    """Return how far inputs bring the rows away from their limits in 1 … H steps (H, m), from an input of zero.
 
     Args:
         slew: How far setpoints may go in a step.

@@ -70,7 +70,7 @@ _OPEN = np.array([OPEN])
 
 @dataclass(frozen=True, eq=False)
 class _Margins:
-    """What a covariance and an age ask of the rows, in each stage."""
+    """Margins that a covariance and an age ask of the rows, in each stage."""
 
     sigma: Array  # standard deviations (H, m)
     budgets: Array  # ε̄ of the stages (H,), infinite where nothing is asked
@@ -80,7 +80,7 @@ class _Margins:
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """How the risk is spread over the ages, and what follows from it, by how late [steps] a position was."""
+    """Spread of the risk over the ages, and what follows from it, by how late [steps] a position was."""
 
     risk: AgeRisk  # the spread
     budgets: Array  # ε̄ of the stages (H, H)

@@ -206,7 +206,7 @@ BREAKDOWN = "Breakdown"  # the numbers overflow, or the solver panics
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the solver gave back."""
+    """Result of the solver."""
 
     status: str  # name of Clarabel's status, or BREAKDOWN
     variables: Array  # (n,), not necessarily finite
@@ -216,7 +216,7 @@ class Solution:
 
 
 def unless_panic(call: Callable[[], Result]) -> Result | None:
-    """What `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
+    """Return what `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
     try:
         return call()
     except BaseException as error:

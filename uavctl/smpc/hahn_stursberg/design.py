@@ -55,7 +55,7 @@ MOST_CANDIDATES = 500
 
 @dataclass(frozen=True, eq=False)
 class DesignSpec:
-    """What a design is asked for; the fields are those of the configuration of the same name."""
+    """Specification of a design; the fields are those of the configuration of the same name."""
 
     plant: Plant
     state_set: Polytope

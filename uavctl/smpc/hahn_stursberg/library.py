@@ -94,7 +94,7 @@ class Region:
         return target + _SPREAD * rng.random() * self._root @ rng.standard_normal(target.size), target
 
     def ahead(self, rng: np.random.Generator) -> Preview:
-        """What the whole plant knows ahead, as far as this component goes: mostly nothing."""
+        """Draw what is known ahead of the whole plant, as far as this component goes: mostly nothing."""
         kind, design, part = rng.random(), self._design, self._part
         if kind < _FOLLOWS:  # a free motion, which the plant can follow
             state = _SPREAD * self._root @ rng.standard_normal(part.a.shape[0])

@@ -28,7 +28,7 @@ _RANK = 1e-9
 
 
 class RowKind(IntEnum):
-    """What a row limits."""
+    """Quantity that a row limits."""
 
     INPUT = 0
     STATE = 1

@@ -41,7 +41,7 @@ LARGEST_RADIUS = 1.0 - 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Weight:
-    """What is weighed: Q_x (n_x, n_x) and Q_u (n_u, n_u)."""
+    """Weights of the cost: Q_x (n_x, n_x) and Q_u (n_u, n_u)."""
 
     x: Array
     u: Array
@@ -145,7 +145,7 @@ _LARGEST_DISCOUNT, _LEAST_DISCOUNT = 0.05, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class GainTask:
-    """What is minimised for one independent part of the plant, and within what."""
+    """Cost and limits that a gain is sought for, of one independent part of the plant."""
 
     loop: DelayedLoop  # the delayed loop
     weight: Weight  # Q_x, Q_u
