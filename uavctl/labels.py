@@ -106,7 +106,7 @@ def severity(names: Names, one: GaveWay) -> tuple[bool, float]:
 
 
 def excess(names: Names, one: GaveWay) -> float:
-    """By how much a constraint gave way, in the unit of its state."""
+    """Return by how much a constraint gave way, in the unit of its state."""
     return one.amount / (1.0 if one.constraint in _OF_NO_ROW else names.rows[one.index][2])
 
 

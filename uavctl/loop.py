@@ -290,7 +290,7 @@ class ControlLoop:
         return StepOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
     def _die(self, error: Exception, at_ns: int) -> None:
-        """The controller has failed: no setpoint is sent any more, and the positions for the vehicle go on."""
+        """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle."""
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
         self.course.died = self.course.died or f"{type(error).__name__}: {error}{where}"
@@ -307,7 +307,7 @@ class ControlLoop:
         return True
 
     def against(self, order: Order) -> str:
-        """Why an order of where to fly would come to nothing now; empty if it may be taken, or is another one."""
+        """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
         return against_moving(self.who_flies, self.vehicle) if moves else ""
 
@@ -479,7 +479,7 @@ class ControlLoop:
 
 
 def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
-    """So many samples as a tick may look at, in order: a source that says much takes nothing of another's."""
+    """Return as many samples as a tick may look at, in order; a source that sends many takes no room of another's."""
     if len(samples) <= MAX_SAMPLES:
         return tuple(samples)
     behind: Counter[str] = Counter()  # newer samples of the same source

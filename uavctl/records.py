@@ -134,7 +134,7 @@ class Setpoint(Record, frozen=True, kw_only=True):
 
 
 class Decision(Record, frozen=True, kw_only=True):
-    """Everything that a tick knew and chose."""
+    """Decision of a tick, with all that it knew."""
 
     tick: int
     at_ns: int
@@ -316,7 +316,7 @@ class LinkStats(Record, frozen=True, kw_only=True):
     bad: dict[str, int]  # reason -> count
     clock_offset_ns: int | None
     clock_source: str  # "timesync", "minimum" or "none"
-    # TIMESYNC with the source of positions; with the vehicle on a link that carries none
+    # TIMESYNC with the source of positions, or with the vehicle on a link that carries no positions
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
     clock_drift_ppm: float | None = None  # what our clock gains on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated

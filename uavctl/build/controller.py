@@ -34,7 +34,7 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope, equilibria
 
-# The paper's scheme is loaded where it is flown: it takes a tenth of the time in which the rest is.
+# The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
     from uavctl.smpc.hahn_stursberg.library import Library
@@ -210,7 +210,7 @@ def _innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
 def _position_age_s(config: Config) -> float:
     """Age of a step's position at its end, up to a step [s]."""
     link, dt_s = config.link, config.plant.dt_s
-    # It may be from the very begin, unless others follow it.
+    # It may be from the very beginning of the step, unless others follow it.
     since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
     return min(dt_s, since_s + link.delay_s + link.jitter_s)
 

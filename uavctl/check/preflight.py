@@ -261,7 +261,7 @@ class Preflight:
 
     @property
     def _is_safe(self) -> bool:
-        """Nobody is sent near propellers that turn, or might."""
+        """Whether a person may be sent near the vehicle: not to propellers that turn, or might."""
         return self._seen.heartbeat is not None and not is_armed(self._seen)
 
     def _hear(self, message: Message, at_ns: int) -> None:

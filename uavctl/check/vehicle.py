@@ -109,7 +109,7 @@ def _wanted(want: str, *, good: bool, otherwise: ItemState = ItemState.NOTE) -> 
 
 
 def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerdict:
-    """A want that holds under a condition alone; without it any value will do, and that is what is said."""
+    """Judge a want that holds only under a condition; without it any value will do, and the verdict says so."""
     return _wanted(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {unless}")
 
 

@@ -110,7 +110,7 @@ class FrameConfig(Section, frozen=True, kw_only=True):
 
 
 class SourceConfig(Section, frozen=True, kw_only=True):
-    """Which messages count as external positions."""
+    """Messages that count as external positions."""
 
     messages: Annotated[
         tuple[
@@ -277,13 +277,13 @@ def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
 
 
 def roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
-    """A camera system flies nothing."""
+    """Check that a camera system is not given as the vehicle."""
     if daemon.vehicle.startswith(CAMERAS):
         yield ConfigProblem("daemon.vehicle", f'"{daemon.vehicle}" is a camera system', "give it as daemon.mocap")
 
 
 def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
-    """Its positions have to be among those that count."""
+    """Check that a camera system's positions are among those that count."""
     if not daemon.mocap.startswith(CAMERAS):
         return
     if CAMERA_MESSAGE not in source.messages:
@@ -299,7 +299,7 @@ def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem
 
 
 def signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
-    """It cannot sign."""
+    """Check that no signatures are asked of a camera system, which cannot sign."""
     if daemon.mocap.startswith(CAMERAS) and security.key_file and "mocap" in security.require:
         yield ConfigProblem(
             "security.require",

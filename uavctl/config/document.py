@@ -66,7 +66,7 @@ def excess(text: str) -> tuple[int, str] | None:
 
 
 def oversized(table: dict[str, Any]) -> Iterator[ConfigProblem]:
-    """The first things in a document that no key takes: depths, lengths, whole numbers; without calls in calls."""
+    """Yield the first values in a document that no key takes, by depth, length or whole number; without recursion."""
     todo: list[tuple[str, object, int]] = [("", table, 0)]
     found = 0
     while todo and found < _TOLD:
@@ -117,7 +117,7 @@ class DataFileError(Exception):
 
 
 def read_text(path: Path) -> str:
-    """Its text; a byte order mark is passed over.
+    """Return the text of a file; a byte order mark is passed over.
 
     Raises:
         DataFileError: It cannot be read, is no file (a pipe would be waited for, a device has no end), is too long, or
@@ -145,7 +145,7 @@ def read_text(path: Path) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Its lines.
+    """Return the lines of a file.
 
     Raises:
         DataFileError: As `read_text`.

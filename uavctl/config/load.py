@@ -136,7 +136,7 @@ def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> Config:
 
 
 def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """The same from TOML text; `file` is the name that messages show.
+    """Load a configuration from TOML text; `file` is the name that messages show.
 
     Raises:
         ConfigError: With all problems found.

@@ -112,7 +112,7 @@ class Orderly(Protocol):
         ...
 
     def against(self, order: Order) -> str:
-        """Why an order would come to nothing now; empty if it may be given."""
+        """Return why an order would have no effect now; empty if it may be given."""
         ...
 
 
@@ -145,7 +145,7 @@ class ControlServer:
             self._serve(client, due.at_ns)
 
     def close(self) -> None:
-        """End the service; who still waits is told so."""
+        """End the service; clients that still wait are told so."""
         for client, _ in self._waiting:
             self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
         for client in self._clients:
@@ -220,7 +220,7 @@ class ControlServer:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
     def _misplaced(self, request: ControlRequest) -> str | None:
-        """In which coordinates a place is outside the limits; None if it is inside, or there is none."""
+        """Return in which coordinates a place is outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
             return None
         config = self._config

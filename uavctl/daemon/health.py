@@ -158,7 +158,7 @@ class HealthWatch:
             self._tell(line(health))
 
     def _alarm(self, recorder: RecorderHealth) -> None:
-        """Say once what has become of the recording, in a line of its own."""
+        """Report each change of the recording's health once, in a line of its own."""
         now = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
         if now == self._recording:
             return

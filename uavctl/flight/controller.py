@@ -23,7 +23,7 @@ from uavctl.smpc.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """Everything constant that `step` needs.
+    """Constants of a flight that `step` needs.
 
     Raises:
         ValueError: If the ticks do not divide Δt, or a target has not one entry a state.
@@ -75,7 +75,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     order: Command | None = None  # what the operator ordered of the mission and no decision has taken up yet
     link: LinkBelief = NOTHING_SEEN  # what the boundaries so far have shown of the link
     link_alarms: tuple[str, ...] = ()  # what was told of the link and still holds, by event code
-    # How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly
+    # State of the vehicle's inertial data, by event code; empty where none are used or we do not fly
     inertial: str = ""
     at_bounds: tuple[int, ...] = ()  # inputs whose bias was told to be as large as what is flown against it
     watching: Watching = NOT_WATCHING  # what the envelope knows of this flight

@@ -77,7 +77,7 @@ def take_orders(state: ControlState, inp: StepInput, controller: Controller) -> 
 
 
 def obey(mission: Mission, state: MissionState, order: Command | None, estimate: Vector, at_ns: int) -> MissionState:
-    """The mission at a boundary (of the estimate (n_x,)) once an order is taken up."""
+    """Return the mission at a boundary, with estimate (n_x,), once an order is taken up."""
     if order is None:
         return state
     if mission.room is None or order.order is Order.RESUME:
@@ -87,14 +87,14 @@ def obey(mission: Mission, state: MissionState, order: Command | None, estimate:
 
 
 def told(command: Command) -> str:
-    """An order in words."""
+    """Return an order in words."""
     if command.position_m is None:
         return command.order.value
     return f"{command.order.value} {_place(command.position_m)}"
 
 
 def unready(vehicle: VehicleStatus | None) -> str:
-    """Why the vehicle does not take setpoints; empty if it does."""
+    """Return why the vehicle does not take setpoints; empty if it does."""
     if vehicle is None:
         return "no vehicle is heard"
     if not vehicle.armed:
@@ -253,7 +253,7 @@ _FINAL = {
 
 
 def place(state: ControlState, inp: StepInput, history: FilterHistory, controller: Controller) -> Tick:
-    """The tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt).
+    """Place a tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt).
 
     The age counts what had been captured by the boundary, also in a tick after it: a boundary that was missed is
     decided as it would have been then.
@@ -310,7 +310,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
 
 
 def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
-    """The decision of a Δt boundary, with a vehicle that takes setpoints."""
+    """Decide at a Δt boundary, with a vehicle that takes setpoints."""
     at_ns = inp.at_ns
     if tick.age_steps is None:
         never = tick.estimate is None
@@ -443,7 +443,7 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
 
 
 # Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
-# nothing would tell that they err. Of positions five times a second of which 60 % are lost one in ten is older.
+# nothing would tell that they err. With five positions a second and 60 % of them lost, one in ten is older.
 PLANNED_NS = 1_000_000_000
 RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 
@@ -459,7 +459,7 @@ def reckons(fallback: Fallback, tick: Tick) -> bool:
 def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Vec3:
     """Return the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
     bias = fb.learnt(state.biases)
-    # A bias of while no position came may be an error of the inertial data, and would be flown for seconds: it counts
+    # A bias learnt without positions may be an error of the inertial data, and would be flown for seconds: it counts
     # where the vehicle's own velocity would contradict.
     told = envelope.witness(state.watching, inp.motion, inp.at_ns) is not None
     if told and tick.estimate is not None and reckons(fallback, tick):

@@ -1,4 +1,4 @@
-"""The envelope in flight: what is believed is held against what is possible, whoever estimates and whoever plans.
+"""The envelope in flight: checks the estimate against what is physically possible, whoever estimates and whoever plans.
 
 Each tick of a flight, four questions:
 
@@ -253,7 +253,7 @@ def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
 
 
 def own_words(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
-    """The vehicle's own velocity; None where it is silent, or says what is no number."""
+    """The vehicle's own velocity; None where it is silent or not finite."""
     if motion is None or motion.velocity_mps is None or motion.velocity_ns is None:
         return None
     fresh = at_ns - motion.velocity_ns <= MOTION_NS
@@ -296,7 +296,7 @@ def _flown_on(watching: Watching, tick_ns: int | None, seen: Observation, parame
 def _position(
     watching: Watching, sample: PositionSample, seen: Observation, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
-    """Take one believed position, if it is newer than those before by enough to tell something."""
+    """Take one believed position, if it is enough newer than those before to tell something."""
     at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
     before = watching.observer
     if before is None or seen.at_ns - before.at_ns >= TOLD_NS:
@@ -388,7 +388,7 @@ def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec
 
 
 def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Take a position; an innovation counts up to a bound, and whether it was beyond."""
+    """Take a position, its innovation clipped to a bound; return too whether it was beyond."""
     noise = max(std_m, POSITION_STD_M) ** 2
     variance = float(observer.cov[0, 0]) + noise
     bound = CLIP * math.sqrt(variance)
@@ -403,7 +403,7 @@ def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Obser
 
 
 def _unexplained(observer: Observer) -> Array:
-    """Unexplained acceleration (3,) once as much of it as can be drag is taken away."""
+    """Return the unexplained acceleration (3,) without the part that can be drag."""
     _, velocity, unexplained = observer.mean
     along = float(velocity @ velocity)
     drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
@@ -444,7 +444,7 @@ def lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] | None:
 def _compared(
     watching: Watching, at_ns: int, position: Array, hinted: bool, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
-    """Compare the way that positions have come with the one that the vehicle says it has flown.
+    """Compare the way that positions show with the one that the vehicle says it has flown.
 
     Where the observer too has a hint of something amiss, that has not to persist.
     """
@@ -482,7 +482,7 @@ def _unresolved(watching: Watching, seen: Observation) -> Breach | None:
 def _off(
     places: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters
 ) -> tuple[tuple[float, Array] | None, tuple[tuple[int, Array], ...]]:
-    """In which time (s) positions have left the vehicle's own way too far, and how far (3,) [m]; and the places."""
+    """Return over which time [s] positions left the vehicle's own way too far, and how far (3,) [m]; and the places."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
     place: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
     places = places[bisect_right(places, at_ns - WAYS_NS, key=_TIME) :]

@@ -26,7 +26,7 @@ TOO_OLD = "sample-too-old"
 # further off says nothing of the capture. A constant, as a tick may be of any length.
 LATEST_STAMP_NS = 20_000_000
 
-# Order of what happens at one instant; a sample sees the input before its change, which is the same state.
+# Order of what happens at one instant; a sample comes before a change of input, which leaves the state the same.
 _SAMPLE, _FELT, _INPUT, _MARK = 0, 1, 2, 3
 
 Coming = tuple[tuple[int, Array | None], ...]  # (when it begins to act [ns], input), oldest first
@@ -123,7 +123,7 @@ def absorb(
 
 
 def feel(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
-    """Take the inertial data of a tick as what they are in the mean, at the mean of their times.
+    """Take the mean of a tick's inertial data, at the mean of their times.
 
     One that is no number, or that says to the last bit what the one before did, says nothing.
     """

@@ -41,7 +41,7 @@ from uavctl.records import PositionSample, StepInput, VehicleStatus
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
 
-# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves it most of them.
+# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves most of them to it.
 _FRESH_PART = 3
 
 
@@ -262,7 +262,7 @@ def _moved_ns(before_ns: Moved, inp: StepInput, at_rest_mps: float) -> Moved:
 
 
 def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:
-    """Why a sample does not count, as an event's code; None if it does.
+    """Return why a sample does not count, as an event's code; None if it does.
 
     Args:
         sample: The sample, after frame and clock conversion.

@@ -122,7 +122,7 @@ def _correlation(belief: LinkBelief) -> float:
     return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
 
 
-# How well a share of losses is known that come in runs.
+# Precision of a share of losses where they come in runs.
 
 
 def loss_std(missing: NDArray[np.int64]) -> float:

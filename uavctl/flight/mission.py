@@ -60,7 +60,7 @@ class Room:
     stop: Array  # place (n_axes, n_x) at which a state comes to rest by inputs that brake, as a linear map of it
 
     def refusal(self, position_m: Vec3) -> str:
-        """Why nothing may rest at a place; empty if it may."""
+        """Return why nothing may rest at a place; empty if it may."""
         for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
             if not lower <= position_m[axis] <= upper:
                 return f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
@@ -268,10 +268,10 @@ def hold(
 # A motion that the plant can make, nearest to positions over time, and plans along it that end at rest.
 
 
-# What a change of input costs beside a miss of the position that it makes within a step. Without it the inputs
+# Cost of a change of input beside a miss of the position that it makes within a step. Without it the inputs
 # would ring: a sampled plant with more than two integrations cannot follow every sample with a steady hand.
 _CALM = 1e-2
-# Keeps the system regular where a state is seen by nothing; moves nothing that is.
+# Keeps the system regular where nothing shows a state; moves nothing that is shown.
 _REGULAR = 1e-12
 _FIRM = 1e3  # metres of a missed position that a unit of a state is worth that a motion begins without
 # A plan along a motion has to end at rest, and is to leave the motion late: what it does in a stage costs this many
@@ -330,7 +330,7 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Pl
 
 
 def _of_loops(plant: Plant) -> NDArray[np.bool_]:
-    """Which states (n_x,) are of the vehicle's own loops.
+    """Return which states (n_x,) belong to the vehicle's own loops.
 
     They end by themselves: a motion cannot choose to begin with them, and inputs that made them zero at a given stage
     would be large.
@@ -362,7 +362,7 @@ def along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower: Arr
     later = _LATER ** min(plant.dt_s / _STEP_S, 1.0)
     cost = np.asarray(np.kron(np.diag(later ** -np.arange(rest, dtype=np.float64)), np.eye(n_u)))
     rest_x, rest_u = _equilibria(plant)
-    # At rest wherever it comes to be: the part of x_N that is no equilibrium is to vanish.
+    # At rest, wherever that is: the part of x_N that is no equilibrium has to vanish.
     moving, seen = _moving(plant, rest_x), ~_of_loops(plant)
     braked = states[:, rest] - states[:, rest] @ (reach[rest] @ _least(cost, moving @ reach[rest]) @ moving).T
     places = np.clip(braked[:, list(plant.position_index)], lower, upper)

@@ -283,7 +283,7 @@ def _lies(state: ControlState, tick: Tick, inp: StepInput, controller: Controlle
         return False
     if belief.doubted_ns is not None or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
         return False
-    # Both of one time: what the vehicle said a quarter of a second ago is no word on how it moves now.
+    # Both of the same time: what the vehicle said a quarter of a second ago does not tell how it moves now.
     then = belief_at(controller.kalman, tick.history, min(motion.velocity_ns, inp.at_ns))
     if then is None:
         return False
@@ -321,7 +321,7 @@ def _cleaned(intake: MeasurementUpdate, clean_ns: int, controller: Controller) -
 
 
 def _outdated(plan: Plan | None, clean_ns: int | None, *, afresh: bool) -> Plan | None:
-    """The plan that is flown; where it was made of what has been taken back, any estimate is news beside it.
+    """Return the plan that is flown; if it was made from samples now taken back, any estimate is news beside it.
 
     So it is for some steps (`afresh`): the setpoint was far from where the new plan begins, and is slew-limited.
     """
@@ -447,7 +447,7 @@ def _setpoint(
         want = (brake[0] + held[0] + back[0], brake[1] + held[1] + back[1], brake[2] + held[2] + back[2])
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
-    # Level at once where what is seen cannot be: each tick of slewing would be flown on nobody knows what.
+    # Level at once where what is seen cannot be: each tick of slewing would be flown on unknown data.
     before = ZERO if state.fallback is not None and state.fallback.end is fb.FallbackEnd.LET_GO else state.accel_mps2
     accel, limited = gate(want, before, controller.tick_ns * 1e-9, controller.limits)
     setpoint = Setpoint(at_ns=inp.at_ns, accel_mps2=accel, source=source, limited=limited)

@@ -79,7 +79,7 @@ class Allowance:
 
     @staticmethod
     def of(rules: Rules, times: float, burst: tuple[float, float, float]) -> Allowance:
-        """So many times what the rules give one sender."""
+        """Return `times` times what the rules give one sender."""
         return Allowance(_times(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
 
@@ -118,12 +118,12 @@ class _Budget:
 
     @property
     def spent(self) -> float:
-        """Share of the burst that is used, of whichever is scarcest: who has sent least lately has least."""
+        """Share of the burst that is used, of whichever is scarcest; the least for whoever has sent least lately."""
         burst = self._allowance.burst
         return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
 
     def refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
-        """Why a datagram does not fit; None if it does.
+        """Return why a datagram does not fit; None if it does.
 
         Args:
             keep: share of the burst that has to be left afterwards.
@@ -195,24 +195,24 @@ class Budgets:
         self._meet_strangers(FIRST_BURST)
 
     def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
-        """Give those who are not known budgets with this burst, and twice that together."""
+        """Give unknown senders budgets with this burst, and twice that together."""
         self._strangers.clear()
         self._stranger = Allowance.of(self._rules, 1.0, burst)
         self._all_strangers = _Budget(Allowance.of(self._rules, 1.0, _times(2.0, burst)), 0)
 
     def _know_somebody(self) -> None:
-        """Take little of strangers from now on."""
+        """Accept little from strangers from now on, if this is the first sender that is known."""
         if self._vehicle is None and not self._known:
             self._meet_strangers(STRANGER_BURST)
 
     def answer(self, sender: Address, now_ns: int) -> None:
-        """Take a sender for the flown vehicle's."""
+        """Note that a sender is the flown vehicle."""
         self._know_somebody()
         if self._vehicle is None or self._vehicle[0] != sender:
             self._vehicle = sender, _Sender(self._of_vehicle, now_ns)
 
     def trust(self, sender: Address, now_ns: int) -> None:
-        """Take a sender for one that the flight needs; who was so longest ago gives its place."""
+        """Note that the flight needs a sender; the one noted longest ago makes room."""
         self._know_somebody()
         known = self._known.pop(sender, None) or _Sender(self._trusted, now_ns)
         if len(self._known) >= MAX_TRUSTED:
@@ -220,7 +220,7 @@ class Budgets:
         self._known[sender] = known
 
     def take(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
-        """Which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
+        """Return which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
 
         Args:
             senders: of the datagrams, in the order in which they came.

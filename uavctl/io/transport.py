@@ -195,7 +195,7 @@ class UdpIn(_Udp):
         self._keep(sender, now_ns)
 
     def _keep(self, sender: Address, now_ns: int) -> None:
-        """Give a sender a socket of its own, if there is room; who has fallen silent makes room."""
+        """Give a sender a socket of its own, if there is room; a sender that has fallen silent makes room."""
         self._trusted_ns[sender] = now_ns
         if sender in self._own:
             return

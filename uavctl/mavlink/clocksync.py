@@ -27,7 +27,7 @@ REMEMBERED_TRIPS = 60
 
 
 class StampRefusal(StrEnum):
-    """Why a stamp gives no time of capture."""
+    """Reason why a stamp gives no time of capture."""
 
     FUTURE = "future-stamp"
     LEAP = "stamp-leap"

@@ -95,14 +95,14 @@ class Streams:
                 self._feels = self._felt_tries > 0
 
     def restart(self) -> None:
-        """The vehicle has started anew and may have forgotten them."""
+        """Ask anew: the vehicle has restarted and may have forgotten the requests."""
         self._seen.clear()
         self._feels = False
         self._next_ns, self._tries = None, 0
         self._felt_next_ns, self._felt_tries = 0, 0
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
-        """(message id, rate [1/s]) of what is to be asked for now; to be called once a vehicle is heard."""
+        """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
         wanted: dict[int, float] = {}
         if self._next_ns is None:
             self._next_ns = at_ns + SETTLE_NS
@@ -162,8 +162,8 @@ TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
 FIRST_REQUESTS = 10  # sent faster, until the first answer
 OPEN_REQUESTS = 8  # requests whose answers are still taken
-# Requests that are answered within a time, of the vehicle's and of others' each: a flood of them makes none of answers,
-# and takes no tick its time.
+# Requests that are answered within a time, for the vehicle and for others each: a flood of them neither makes a flood
+# of answers nor costs a tick its time.
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers

@@ -25,7 +25,7 @@ _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
 class BadBytes(StrEnum):
-    """Why bytes were skipped."""
+    """Reason why bytes were skipped."""
 
     CRC = "crc"  # a frame with a wrong checksum
     TRUNCATED = "truncated"  # a frame that the data ends in
@@ -164,7 +164,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
 
 
 def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tuple[int | None, str]:
-    """The same where signatures are asked for: no frame without one is believed in anything but its length."""
+    """Try for a frame where signatures are required: of a frame without one only the length is believed."""
     at = result.consumed
     end = at + shape.length
     frame = data[at:end]

@@ -41,7 +41,7 @@ HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
 
 
 class Passage(msgspec.Struct, frozen=True):
-    """A way in the table that was gone."""
+    """Transition of the table that was made."""
 
     before: HandoverState  # the state that was left
     seen: HandoverEvent  # why
@@ -182,7 +182,7 @@ class HandOver:
         return events
 
     def _against(self, command: Command, view: HandoverView) -> str:
-        """Why an order is refused; empty if it is taken."""
+        """Return why an order is refused; empty if it is taken."""
         if command.order is Order.ENGAGE:
             return against_engaging(self.state, view)
         if command.order is Order.STAND_BY:
@@ -267,7 +267,7 @@ class HandOver:
         return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
 
     def _see_to_disarming(self, view: HandoverView) -> None:
-        """A vehicle that stands on the ground after a flight of ours and stays armed is asked to disarm."""
+        """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
         vehicle = view.vehicle
         if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
             self._landed_ns = None

@@ -113,7 +113,7 @@ def fails(vehicle: VehicleStatus) -> bool:
 
 
 def against_engaging(state: HandoverState, view: HandoverView) -> str:
-    """Why the external mode must not be asked for again; empty if it may."""
+    """Return why the external mode must not be asked for again; empty if it may."""
     vehicle = view.vehicle
     if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
@@ -125,7 +125,7 @@ def against_engaging(state: HandoverState, view: HandoverView) -> str:
 
 
 def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
-    """Why an order of where to fly would come to nothing; empty if it is we who fly."""
+    """Return why an order of where to fly would have no effect; empty if it is we who fly."""
     if state is HandoverState.ENGAGED:
         return ""
     if state is HandoverState.WAITING or vehicle is None:
@@ -177,7 +177,7 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
 
 
 def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
-    """Why the vehicle's failsafe is not waited for any longer; empty while it is."""
+    """Return why the vehicle's failsafe is not waited for any longer; empty while it is."""
     vehicle, config = view.vehicle, progress.config
     lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
     begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
@@ -191,7 +191,7 @@ def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
 
 
 def _never_ready(progress: Progress, view: HandoverView) -> str:
-    """Why an ordered take-off will not begin; empty if it may, or none was ordered."""
+    """Return why an ordered take-off will not begin; empty if it may, or none was ordered."""
     vehicle, limit_s = view.vehicle, progress.config.ground_s
     if progress.ordered_ns is None:
         return ""
@@ -208,7 +208,7 @@ def _never_ready(progress: Progress, view: HandoverView) -> str:
 
 
 def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    """Before, between and after flights."""
+    """Return the event seen before, between and after flights."""
     ready = progress.state is HandoverState.READY and not (view.unfit or view.stop)
     if ready and progress.ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
@@ -269,7 +269,7 @@ def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) ->
 
 
 def _climbed(progress: Progress, view: HandoverView, ahead_s: float) -> float:
-    """Share of the height that will have been reached in a moment, by fresh positions."""
+    """Return the share of the height that will be reached `ahead_s` from now, by fresh positions."""
     if view.up_m is None or progress.ground_up_m is None or view.unfit:
         return 0.0
     return (view.up_m + ahead_s * view.up_mps - progress.ground_up_m) / progress.height_m
@@ -288,7 +288,7 @@ def _for_external(progress: Progress, _view: HandoverView, vehicle: VehicleStatu
 
 
 def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    """On a flight that we began; that the pilot may take over is no different from any other time."""
+    """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
     if not vehicle.armed:
         return GuardResult(
             HandoverEvent.DISARMED, f"the vehicle's own failsafe ({progress.left_mode}) has landed it{progress.words}"

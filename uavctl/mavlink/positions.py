@@ -224,7 +224,7 @@ class PositionDecoder:
 
 
 def _key(message: Position) -> tuple[Address, bool]:
-    """Whose clock stamps it, and which of its clocks."""
+    """Return whose clock stamps a message, and which of its clocks."""
     return (message.system, message.component), message.boot_ms
 
 

@@ -58,7 +58,7 @@ class Relay:
         return self._config.enabled
 
     def take(self, sample: PositionSample, attitude: Quaternion | None) -> None:
-        """Take a sample as it arrives, with the body's attitude in NED; an estimator of yaw cannot do without."""
+        """Take a sample as it arrives, with the body's attitude in NED, which an estimator of yaw cannot do without."""
         if not self.enabled:
             return
         if attitude is None:
@@ -99,7 +99,7 @@ class Relay:
         return tuple(out)
 
     def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
-        """Why a pose is kept; None if it goes."""
+        """Return why a pose is kept back; None if it goes."""
         same = self._last == (sample.position_m, attitude)
         self._last, self._same = (sample.position_m, attitude), self._same + 1 if same else 0
         newest_ns = self._newest_ns

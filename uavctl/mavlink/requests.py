@@ -100,7 +100,7 @@ class PendingRequest:
         return self.ask
 
     def given_up(self, at_ns: int) -> str:
-        """Why nothing more is to be expected; empty while there is hope."""
+        """Return why the request is given up; empty while it may still succeed."""
         over = at_ns - self._begun_ns >= self._patience.limit_ns
         out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):

@@ -35,7 +35,7 @@ Stream = tuple[int, int, int]
 
 
 class SignatureRefusal(StrEnum):
-    """Why a frame is not taken."""
+    """Reason why a frame is not taken."""
 
     FORGED = "forged"  # made without the key, or damaged
     REPLAYED = "replayed"  # not newer than the newest of its stream, or than all before the start
@@ -142,7 +142,7 @@ class Signing:
         return refusal
 
     def _keep(self, stream: Stream, stamp: int) -> None:
-        """Keep a stream's stamp. The oldest one gives its place, and nothing that is older is taken for new again."""
+        """Keep a stream's stamp. The oldest one makes room, and nothing that is older is taken for new again."""
         if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
             oldest = min(self._newest, key=lambda one: self._newest[one])
             self._floor = max(self._floor, self._newest.pop(oldest))

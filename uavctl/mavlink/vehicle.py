@@ -82,7 +82,7 @@ class BootClock:
 
 
 def _advance_ms(before: _Reading, after: _Reading) -> int:
-    """By how much a clock went on, the shorter way around its wrap [ms]."""
+    """Return by how much a clock went on, the shorter way around its wrap [ms]."""
     return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
 
 
@@ -100,7 +100,7 @@ def _is_young(before: _Reading, after: _Reading) -> bool:
     return after.boot_ms <= _passed_ms(before, after) + AHEAD_MS
 
 
-# STATUSTEXT in one piece again: a vehicle says what is longer than 50 characters in several.
+# STATUSTEXT joined again: a vehicle sends what is longer than 50 characters in several pieces.
 
 
 WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
@@ -252,7 +252,7 @@ class VehicleWatch:
 
     @property
     def autopilot(self) -> str:
-        """Which autopilot it is; empty before its first heartbeat."""
+        """Name of its autopilot; empty before its first heartbeat."""
         return "" if self._status is None else self._status.autopilot
 
     def take(
@@ -371,7 +371,7 @@ class VehicleWatch:
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
     def _begin(self, address: tuple[int, int], at_ns: int) -> None:
-        """Follow a vehicle; of another than before nothing is known, and nothing is armed yet."""
+        """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
         if self.address is not None:
             self._reboot()
             self._battery_v = None

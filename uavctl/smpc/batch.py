@@ -142,7 +142,7 @@ class Tally:
 
     @classmethod
     def zero(cls, runs: int) -> Self:
-        """Nothing met yet."""
+        """Return counts of zero."""
         decisions, infeasible, slack_used, fallbacks = np.zeros((4, runs), dtype=np.intp)
         return cls(decisions, infeasible, slack_used, fallbacks, np.zeros(runs))
 

@@ -1,4 +1,4 @@
-"""Which rows a program begins with: a guess at those that bind, by where the fastest inputs lead.
+"""Rows that a program begins with: a guess at those that bind, by where the fastest inputs lead.
 
 An active-set method ends at the same optimum from any rows, and takes fewer iterations the nearer they are to those
 that bind there. Plans in transit are alike: as fast as the slew rows let it to where a state row still can be kept,

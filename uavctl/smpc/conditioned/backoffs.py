@@ -137,7 +137,7 @@ def spent(room: Array, sigma: Array) -> Array:
 
 
 def binding(backoff: Array, room: Array, sigma: Array) -> Flags:
-    """Which rows are at their back-offs, or beyond."""
+    """Return which rows are at their back-offs, or beyond."""
     return np.asarray(room <= backoff + _BINDS * sigma)
 
 

@@ -269,7 +269,7 @@ class ConditionedSolver:
         return self._transit if (self._placed.dot(target[self._rests.held]) <= kept).all() else self._near
 
     def _margins(self, spread: _Spread, outlook: Preview) -> _Margins:
-        """Those of an outlook; the last ones are kept, by the very bits that they are made of."""
+        """Return the margins of an outlook; the last ones are cached, by the exact bits that they are made of."""
         key = spread is self._transit, outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)

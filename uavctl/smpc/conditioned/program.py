@@ -57,7 +57,7 @@ class SlewRows:
             self._nearest = QuadraticProgram(np.eye(n), input_set.c.copy(), hard, np.zeros(m), np.zeros(m))
 
     def own(self, inputs: Index) -> Index:
-        """Which rows have to do with some inputs."""
+        """Return which rows involve some inputs."""
         return np.flatnonzero(np.any(self.d[:, inputs] != 0.0, axis=1))
 
     def first(self, sent: Array) -> tuple[Array, Array]:

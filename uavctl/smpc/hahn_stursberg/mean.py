@@ -153,7 +153,7 @@ class MeanProblem:
         return self.question_of(self.parameters(x, target), outlook)
 
     def question_of(self, p: Array, outlook: Preview) -> Question:
-        """The same for parameters p (n_p,)."""
+        """Return a question in numbers for parameters p (n_p,)."""
         f, constant = self.cost(p, outlook)
         upper, lower = self.sides(outlook)
         return Question(f, constant, self.r @ p, np.minimum(upper, OPEN), np.maximum(lower, -OPEN), p)
