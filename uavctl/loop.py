@@ -109,13 +109,13 @@ class ControlLoop:
         self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
-        self._unsure_since_ns: int | None = None  # what the vehicle said then was lost unread
+        self._unsure_since_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
         self.vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
         self.link: LinkEstimate | None = None
-        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; who tells them takes them
+        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; whoever tells them takes them
         self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
         self.notices: deque[Event] = deque(
             maxlen=MAX_NOTICES
@@ -124,7 +124,7 @@ class ControlLoop:
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
         self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands = config.fallback.land or config.relay.enabled
-        self.course = FlightCourse()  # what happened on the way, as far as it bears upon the end
+        self.course = FlightCourse()  # course of the flight, as far as it bears upon the end
 
     @property
     def ending(self) -> Ending:
@@ -328,7 +328,7 @@ class ControlLoop:
         )
 
     def _gather(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
-        """All that the tick may know; recorded first, so that a replay knows when the tick ran."""
+        """Gather the inputs of the tick; they are recorded first, so that a replay knows when the tick ran."""
         samples, heard, self._heard = self._take_due(at_ns)
         inp = StepInput(
             tick=tick,
@@ -406,7 +406,7 @@ class ControlLoop:
         self.answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
-            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # who orders is answered
+            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # whoever ordered gets the answer
                 self.notices.append(event)
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None

@@ -223,11 +223,11 @@ class Command(Record, frozen=True, kw_only=True):
     order: Order
     position_m: Vec3 | None = None  # local NED
     height_m: float | None = None  # of the climb, above the ground
-    flown_ns: int | None = None  # when the daemon before this one took the vehicle over
+    flown_ns: int | None = None  # time at which the daemon before this one took the vehicle over
 
 
 class StepInput(Record, frozen=True, kw_only=True):
-    """All that one control tick may know; recorded, and enough to replay the tick."""
+    """Inputs of one control tick; recorded, and enough to replay the tick."""
 
     tick: int
     at_ns: int  # the tick's place on the grid, not the moment it ran
@@ -292,7 +292,7 @@ class Ending(Record, frozen=True, kw_only=True):
     as_ordered: bool  # by the operator, the mission or the pilot
     sentence: str  # for a person, with where the vehicle was then
     exit_code: int  # of the program
-    relay: str = ""  # what became of the positions that were passed on to the vehicle; empty where none were
+    relay: str = ""  # text on the positions passed on to the vehicle; empty where none were
 
 
 class RelayStats(Record, frozen=True, kw_only=True):
@@ -300,8 +300,8 @@ class RelayStats(Record, frozen=True, kw_only=True):
 
     at_ns: int
     sent: int
-    kept: dict[str, int]  # that were not passed on, by reason
-    last_ns: int | None  # when the last one went
+    kept: dict[str, int]  # positions not passed on, by reason
+    last_ns: int | None  # time at which the last one went
     alone: bool  # nothing else is sent: control has ended, or failed
 
 
@@ -318,7 +318,7 @@ class LinkStats(Record, frozen=True, kw_only=True):
     clock_source: str  # "timesync", "minimum" or "none"
     # TIMESYNC with the source of positions, or with the vehicle on a link that carries no positions
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
-    clock_drift_ppm: float | None = None  # what our clock gains on the peer's
+    clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
 
 
@@ -333,7 +333,7 @@ class Truth(Record, frozen=True, kw_only=True):
     sent: int  # positions sent so far
     lost: int  # of which the channel lost
     mode: str
-    faults: tuple[str, ...] = ()  # what is amiss
+    faults: tuple[str, ...] = ()  # faults that act now
 
 
 class Header(Record, frozen=True, kw_only=True):
@@ -362,7 +362,7 @@ class LinkEstimate(Record, frozen=True, kw_only=True):
     credible: float
     burst_statistic: float  # about N(0, 1) if losses are independent, large if they come in bursts
     bursts: bool
-    promised: float  # what the design counts on for p
+    promised: float  # least p that the design counts on
     below_promise: bool  # p is below `promised` with probability `credible` at least
 
 

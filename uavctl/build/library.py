@@ -84,9 +84,9 @@ class StoredLibrary:
     library: Library  # the library
     library_id: str  # hash of its design's hash and all its numbers
     data: bytes  # its bytes, as `decode` reads them
-    names: tuple[str, ...]  # what each component, fresh and late, is called
-    check: LibraryCheck  # what it achieves on states that it was not grown on
-    made_s: float  # how long it took to make it [s]
+    names: tuple[str, ...]  # name of each component, fresh and late
+    check: LibraryCheck  # its answers from states that it was not grown on
+    made_s: float  # time that making it took [s]
     path: Path | None = None  # its file in the cache; None if it is in none
     cached: bool = False  # whether it was found in the cache
 

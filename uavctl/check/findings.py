@@ -43,10 +43,10 @@ class ItemState(StrEnum):
 class Item(msgspec.Struct, frozen=True, kw_only=True):
     """One line of a check."""
 
-    name: str  # what was looked at; `check.accept` takes it
+    name: str  # name of the item, as `check.accept` takes it
     ok: bool  # nothing speaks against flying; false only for a `bad` state
-    value: str  # what was found
-    want: str  # what is wanted
+    value: str  # value that was found
+    want: str  # value that is wanted
     hint: str  # what to do; empty if nothing is to be done
     state: ItemState  # the whole answer: `good`, `note`, `undetermined` or `bad`
 

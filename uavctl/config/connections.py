@@ -72,10 +72,10 @@ class CameraSystem:
     """A camera system that is listened to without a bridge to MAVLink."""
 
     camera: str  # `module:Class` of its `uavctl.io.camera.Camera`, made with the body's name and the axis that is up
-    package: str  # what that imports beyond ours; empty for nothing
-    extra: str  # of ours, that installs the package
+    package: str  # package that it imports beyond ours; empty for none
+    extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none
-    advice: str  # where no answer comes
+    advice: str  # what to check if no answer comes
 
 
 # By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY. Another one is a line here and its class.

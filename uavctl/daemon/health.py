@@ -51,7 +51,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
 
     sent: int  # since the start
     sent_hz: float  # in the last second
-    kept: dict[str, int]  # that were not passed on, by reason
+    kept: dict[str, int]  # positions not passed on, by reason
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
 
@@ -76,8 +76,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     missed_ticks: int  # since the start
     vehicle: VehicleHealth | None
     recorder: RecorderHealth
-    who_flies: str = ""  # where the hand-over stands
-    ending: str = ""  # how the flight ends or has ended, in the words of its end; empty while nothing ends it
+    who_flies: str = ""  # state of the hand-over
+    ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
     relay: RelayHealth | None = None  # None where no positions are passed on
 
 

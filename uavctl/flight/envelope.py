@@ -81,8 +81,8 @@ class EnvelopeParameters:
     axes: tuple[bool, ...]  # which axes the plant has; the others are not looked at
     lower_m: Vec3  # position limits; minus infinity where there is none
     upper_m: Vec3  # the same, infinity where there is none
-    outside_m: Vec3  # how far beyond them the vehicle may be
-    brake_mps2: Vec3  # what it can brake with
+    outside_m: Vec3  # distance beyond them that the vehicle may be at
+    brake_mps2: Vec3  # largest deceleration when braking
     lag_s: Vec3  # time constant from setpoint to acceleration
     unexplained_mps2: float  # acceleration that positions may show beside what was sent: wind, and the model's error
     disagreement_mps: float  # difference between the velocity that positions show and the vehicle's own
@@ -108,7 +108,7 @@ class Observation(msgspec.Struct, frozen=True):
     sent_mps2: Vec3  # setpoint that acts since the tick before
     position_m: Vec3 | None  # estimated position; NaN in axes that the plant has not
     velocity_mps: Vec3  # estimated velocity, the same
-    motion: VehicleMotion | None  # what the vehicle itself says
+    motion: VehicleMotion | None  # motion by the vehicle's own estimate
     braking: bool  # whether the fallback brakes
 
 
@@ -118,7 +118,7 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
     at_ns: int  # its capture time [ns]
     mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
     cov: Array  # (3, 3) of one axis; those of all axes are alike
-    accel_mps2: Array  # what the setpoints so far make the vehicle accelerate by, behind its lag (3,)
+    accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
@@ -162,7 +162,7 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
     """Take a tick in which we fly.
 
     Args:
-        watching: What the tick before left; `NOT_WATCHING` where a flight begins.
+        watching: State that the tick before left; `NOT_WATCHING` where a flight begins.
     """
     seen = _shown(seen, parameters)
     watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
@@ -178,7 +178,7 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
 def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
     """The vehicle's own velocity where it may be braked on; None where it does not come, or nothing speaks for it.
 
-    For it speak positions that agreed with it, the velocity that is predicted, and what was sent since a flight began.
+    Evidence for it: positions that agreed with it, the predicted velocity, and what was sent since a flight began.
 
     Args:
         seen: The tick; with the velocity that is predicted.
@@ -337,7 +337,7 @@ def _position(
 def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: EnvelopeParameters) -> Observer:
     """The observer at a first position: with the velocity that was sent since the flight began.
 
-    After a long silence, of which not all that was sent is remembered, nobody knows what gusts have made of it either.
+    After a silence too long for all setpoints to be remembered, the effect of gusts is not known either.
     """
     mean, accel = np.zeros((3, 3)), np.zeros(3)
     speed_mps = parameters.unexplained_mps2
@@ -368,7 +368,7 @@ def _predicted(
             continue
         s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
         gone = np.exp(-s / lag_s)
-        behind = (accel - u) * lag_s * (1.0 - gone)  # what the lag adds to the velocity
+        behind = (accel - u) * lag_s * (1.0 - gone)  # velocity that the lag adds
         position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lag_s * ((accel - u) * s - behind)
         velocity = velocity + s * (u + unexplained) + behind
         accel = u + (accel - u) * gone
@@ -446,7 +446,7 @@ def _compared(
 ) -> tuple[Watching, Breach | None]:
     """Compare the way that positions show with the one that the vehicle says it has flown.
 
-    Where the observer too has a hint of something amiss, that has not to persist.
+    Where the observer too has a hint of something amiss, a difference need not persist.
     """
     flown = _flown(watching.way, at_ns)
     kept = (one for one in watching.offsets if one[0] > at_ns - parameters.window_ns)

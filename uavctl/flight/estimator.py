@@ -60,8 +60,8 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 
     origin_ns: int  # A boundary of the Δt grid [ns]
     horizon_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
-    anchor: Node  # what was known at the horizon
-    entries: tuple[FilterEvent, ...] = ()  # what happened since, sorted by key
+    anchor: Node  # state of the filter at the horizon
+    entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
 
     @property
     def newest(self) -> Node:
@@ -125,7 +125,7 @@ def absorb(
 def feel(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
     """Take the mean of a tick's inertial data, at the mean of their times.
 
-    One that is no number, or that says to the last bit what the one before did, says nothing.
+    Data that are not finite, or equal to the last bit to the ones before, are ignored.
     """
     told = [one for one, before in zip(samples, (None, *samples), strict=False) if _says_something(one, before)]
     if not told or not kalman.n_felt:

@@ -67,7 +67,7 @@ class Fallback:
 
     mode: ControlMode  # BRAKE, HOLD, LAND or STOPPED
     since_ns: int  # when this mode was entered [ns]
-    end: FallbackEnd = FallbackEnd.RECOVER  # what it ends in
+    end: FallbackEnd = FallbackEnd.RECOVER  # end of the fallback
     held_ns: int | None = None  # when it first held [ns]; None before
 
     @property

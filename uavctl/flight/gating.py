@@ -54,7 +54,7 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     )
     # How wrong the velocity may be, each axis of the plant [m/s]; None before it was held against one
     doubt_mps: Array | None = None
-    watches: Watches = msgspec.field(default_factory=dict)  # what each source has said
+    watches: Watches = msgspec.field(default_factory=dict)  # record of each source
     moved_ns: Moved = (0, 0, 0)  # when the vehicle last moved north, east and down, as far as it says so [ns]
 
 
@@ -62,12 +62,12 @@ class MeasurementUpdate(msgspec.Struct, frozen=True, eq=False):
     """Result of looking at a tick's samples."""
 
     history: FilterHistory  # the estimator with them
-    trust: SourceHealth  # what is known of the sources
+    trust: SourceHealth  # health of the sources
     moved: bool  # A source has moved: positions are not to be believed any more
     absurd: bool  # it says what cannot be for so long that the same holds, for whoever flies
     accepted: tuple[PositionSample, ...]  # the samples taken
     refused: tuple[tuple[PositionSample, str], ...]  # those that were not, each with the reason (an event's code)
-    clean_ns: int | None  # what was captured after this was believed and has been taken back; None if nothing was [ns]
+    clean_ns: int | None  # samples captured after this have been taken back; None if none were [ns]
     fresh: int  # fresh samples in a row, up to now
 
 
@@ -82,7 +82,7 @@ def take(
     Here this is seen of boundaries between two captures (their ticks may have been missed), in `step` of the last one.
 
     Args:
-        trust: What is known of the sources, before.
+        trust: Health of the sources, before.
         horizon: H, the steps that a plan bridges.
         fresh: Fresh samples in a row, before.
     """
@@ -203,9 +203,9 @@ def _unstuck(
 class _Distrust(msgspec.Struct, frozen=True, eq=False):
     """Health of the sources after one more sample, and whether that sample is believed."""
 
-    trust: SourceHealth  # that
+    trust: SourceHealth  # health of the sources
     reason: str | None  # why the sample is not believed; None if it is
-    stuck_ns: int | None = None  # when its source first said what it says, where that is to be taken back [ns]
+    stuck_ns: int | None = None  # time at which its source first gave this value, where that is to be taken back [ns]
 
 
 def _distrust(

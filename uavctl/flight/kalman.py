@@ -147,8 +147,8 @@ class Kalman:
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
     shown: NDArray[np.intp]  # state index of each axis' position, then of each axis' velocity
     parameters: EstimatorParameters  # noise and window
-    felt_z: Array  # what inertial data show of z (n_felt, n_x + n_w)
-    felt_u: Array  # what they show of the input (n_felt, n_u)
+    felt_z: Array  # measurement matrix of inertial data for z (n_felt, n_x + n_w)
+    felt_u: Array  # the same for the input (n_felt, n_u)
     felt_noise: Array  # covariance of their noise (n_felt, n_felt)
     pushed: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
     identity: Array  # of the size of z

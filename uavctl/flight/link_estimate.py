@@ -128,7 +128,7 @@ def _correlation(belief: LinkBelief) -> float:
 def loss_std(missing: NDArray[np.int64]) -> float:
     """Standard error of the share of losses, each run of arrivals with the losses after it counted as one draw.
 
-    Losses in bursts tell less than as many that are each by themselves.
+    Losses in bursts tell less than as many single ones.
 
     Args:
         missing: how many are missing after each one that came.

@@ -107,7 +107,7 @@ class Mission:
     limits: Array  # right sides of the state set's rows (m_x,)
     horizon: int  # H [steps]
     dt_ns: int  # δt [ns]
-    room: Room | None  # where the operator may send the vehicle to; None if the plant cannot rest wherever it is sent
+    room: Room | None  # places that the operator may send the vehicle to; None if the plant cannot rest everywhere
     trajectory: Trajectory | None = None  # the motion to follow; None to fly to the waypoints
     fences: tuple[Fence, ...] = ()  # moving limits
     land: bool = False  # whether to land at the end; else the last place is held
@@ -134,7 +134,7 @@ class MissionState:
     stay: Vector | None = None  # equilibrium (n_x,) that the operator ordered instead; None on the mission
     left_ns: int | None = None  # when the mission was left for that [ns]; None on the mission
     paused_ns: int = 0  # time that a trajectory has stood still for orders [ns]; fences move on all the same
-    led: Lead | None = None  # how the first motion began; None before it
+    led: Lead | None = None  # beginning of the first motion; None before it
 
 
 def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:

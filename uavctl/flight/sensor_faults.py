@@ -157,8 +157,8 @@ def judge(
 #
 # The resolution is the smallest change that the source has shown.
 #
-# Of a vehicle that says itself that it is at rest cameras that round say the same again and again: they are believed,
-# as of one on the ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of what
+# Cameras that round repeat their value while a vehicle is at rest by its own word: they are believed,
+# as with one on the ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of what
 # they say (where we know that, it is not asked at all).
 #
 # Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
@@ -224,7 +224,7 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
     def stale_since_ns(self) -> int:
         """Capture time from which on it said what was no news [ns].
 
-        The value that first came may be an older one already, which was lost when it was new; not where no sample was.
+        The value's first sample may itself be a repeat, if one before it was lost; not where no sample was lost.
         """
         known = self.changes + self.repeats > _SPACINGS
         return self.first_ns + (known and self.gap_ns < _GAP * self.spacing_ns)
@@ -236,11 +236,11 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def grain_m(self) -> float:
-        """The resolution; of a few changes only as far as no motion is taken for it [m]."""
+        """The resolution; after only a few changes it is bounded, so that no motion is taken for it [m]."""
         return self.resolution_m if self.changes >= _ENOUGH else min(self.resolution_m, _GRAIN_M)
 
     def still_since_ns(self, moved_ns: Moved) -> int | None:
-        """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has.
+        """Return since which capture time an axis, moved by noise until then, has stood still [ns]; None if none has.
 
         One that has rested since then, by the vehicle's own word, may stand still.
         """

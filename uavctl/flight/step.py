@@ -83,7 +83,7 @@ def bias_events(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_n
 
     Args:
         push_mps2: the bias as an acceleration, local NED [m/s²].
-        before: inputs of which was told that they are at their bounds.
+        before: inputs that were already told to be at their bounds.
     """
     if set(now) - set(before):
         pushes = ", ".join(f"{value:+.2f}" for value in push_mps2)
@@ -119,10 +119,10 @@ class StepOutput(msgspec.Struct, frozen=True):
     plan: Plan | None  # A new plan, only if this tick made one
     decision: Decision  # everything that the tick knew and chose
     setpoint: Setpoint | None  # what to send; None for nothing
-    events: tuple[Event, ...]  # what is worth telling
+    events: tuple[Event, ...]  # events worth telling
     land: bool  # ask for the vehicle's own landing, once
     refused: tuple[PositionSample, ...] = ()  # samples that were not believed
-    link: LinkEstimate | None = None  # what is believed of the link; at boundaries that were not missed
+    link: LinkEstimate | None = None  # link estimate; at boundaries that were not missed
 
 
 def initial_state() -> ControlState:

@@ -143,7 +143,7 @@ class Globe:
     def due(self, at_ns: int) -> tuple[bool, bool]:
         """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
 
-        It is told from the second time on: by then an origin that is there has been answered with.
+        The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
         """
         if self._known or at_ns < self._next_ns or self._tries >= ORIGIN_TRIES:
             return False, False

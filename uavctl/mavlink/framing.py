@@ -113,7 +113,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
         data: a datagram, or what has come of a stream.
         final: whether the data ends here. If not, a frame that it ends in is left for later.
         in_step: whether the first byte should begin a frame (see `Scan`).
-        verify: takes only frames whose signature it likes, in place of the checksum; frames of ids that the dialect
+        verify: takes only frames whose signature it accepts, in place of the checksum; frames of ids that the dialect
             has not are verified too, and then counted and dropped.
 
     Returns:

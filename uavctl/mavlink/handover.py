@@ -47,17 +47,17 @@ class Passage(msgspec.Struct, frozen=True):
     seen: HandoverEvent  # why
     after: HandoverState  # the state that was entered
     why: str = ""  # more about it, where something failed
-    ask: RequestKind | None = None  # what the vehicle had been asked for
+    ask: RequestKind | None = None  # request to the vehicle at that time
     granted: bool = False  # it had said yes to that
 
 
 class HandoverStep(msgspec.Struct, frozen=True):
     """Result of a tick of the hand-over."""
 
-    sending: Sending  # what may be streamed
-    ask: RequestKind | None = None  # what to ask the vehicle for now, if anything
-    events: tuple[Event, ...] = ()  # what there is to tell
-    passage: Passage | None = None  # the way in the table that was gone, if one was
+    sending: Sending  # setpoints that may be streamed
+    ask: RequestKind | None = None  # request to make now, if any
+    events: tuple[Event, ...] = ()  # events to tell
+    passage: Passage | None = None  # transition that was made, if one was
 
 
 class HandOver:
@@ -105,7 +105,7 @@ class HandOver:
     def carries(self) -> bool:
         """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
 
-        One that is not heard any more gets them for the time of a landing.
+        A vehicle that is not heard any more gets them for the time of a landing.
         """
         return self._sees_it_down and self._aloft_ns is not None
 

@@ -48,12 +48,12 @@ class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
     ready: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
-    up_s: float | None = None  # how long ago it started [s]; None if it does not tell
+    up_s: float | None = None  # time since it started [s]; None if it does not tell
     land: bool = False  # the controller asks for landing
     stop: bool = False  # the operator asks for the end
     unfit: str = ""  # why nothing may be armed now; empty if it may
     up_m: float | None = None  # height of the estimate in local NED [m]; None without one
-    up_mps: float = 0.0  # how fast it climbs [m/s]
+    up_mps: float = 0.0  # its rate of climb [m/s]
     heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
@@ -63,20 +63,20 @@ class Progress:
     """Progress of the hand-over."""
 
     config: HandOverConfig  # times and bounds
-    request: PendingRequest  # what is asked for, or waited for
+    request: PendingRequest  # request that is made, or waited for
     state: HandoverState = HandoverState.WAITING  # place in the table
     since_ns: int = 0  # when it was entered [ns]
     ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
     height_m: float = 0.0  # height of the climb that was ordered [m]
     ground_up_m: float | None = None  # height of the estimate before it was armed [m]
     left_mode: str = ""  # the mode that is to be left for the external one, after a release; or that a failsafe chose
-    climb_ns: int | None = None  # when the climb began first [ns]; None before
+    climb_ns: int | None = None  # time at which the climb first began [ns]; None before
     resumes: bool = False  # the failsafe that acts ended the climb, not the flight
-    words: str = ""  # what the vehicle said before its failsafe acted
+    words: str = ""  # texts of the vehicle from before its failsafe acted
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # times that the vehicle had started anew by the last tick
     stands_by: bool = False  # A vehicle that is found armed is left alone
-    flown_ns: int | None = None  # when the flight that it is left from began [ns]; None if that is not known
+    flown_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
     heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
 
     def shows_the_past(self, vehicle: VehicleStatus) -> bool:

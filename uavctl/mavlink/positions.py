@@ -43,7 +43,7 @@ class SourceTable(Generic[Key, Kept]):
     So no source is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
 
     Args:
-        bad: told when a source loses its place that is not silent.
+        bad: called when a source that is not silent loses its place.
     """
 
     def __init__(self, most: int, bad: Callable[[], None]) -> None:

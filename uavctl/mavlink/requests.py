@@ -54,7 +54,7 @@ class PendingRequest:
     """
 
     def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
-        self.ask = ask  # what is asked for; None for a wait in which nothing is said
+        self.ask = ask  # the request; None for a wait in which nothing is sent
         self._patience = patience
         self._begun_ns = at_ns
         self._next_ns = at_ns

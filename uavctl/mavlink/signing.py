@@ -1,7 +1,7 @@
 """MAVLink 2 signing, sans IO: who holds the key, and whether a frame is newer than the last one.
 
 Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked at,
-so that who has not the key changes nothing here: with the other order one forged frame with a stamp from the future
+so that nobody without the key changes anything here: in the other order one forged frame with a stamp from the future
 locks the true peer out.
 """
 

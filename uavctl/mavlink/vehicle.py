@@ -62,7 +62,7 @@ class BootClock:
         elif doubted is not None and at_ns - doubted.at_ns <= AGREE_NS and _goes_on(doubted, reading):
             del self._doubted[kind]
             anew = known.confirmed and (_advance_ms(known, reading) < 0 or _is_young(known, reading))
-            if anew:  # what the others have told is of the time before
+            if anew:  # the others' readings are from before the restart
                 self._known.clear()
                 self._doubted.clear()
             self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=True))
@@ -219,7 +219,7 @@ class Punctual:
 class VehicleWatch:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
-    One that has fallen silent on the ground, disarmed, gives its place to another.
+    A vehicle that has fallen silent on the ground, disarmed, gives way to another.
 
     Args:
         bad: counter that heartbeats of other vehicles are added to.

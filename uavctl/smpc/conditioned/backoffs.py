@@ -296,7 +296,7 @@ def rest_backoffs(
 class _RestingRows:
     """Data of the rows for plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
 
-    risk: AgeRisk  # how the risk is spread over the ages
+    risk: AgeRisk  # spread of the risk over the ages
     late: int  # age of most positions when they come [steps]
     gaps: Array  # q_t (L,)
     sigma: Array  # deviations of the rows (H, m) in the stages of a plan

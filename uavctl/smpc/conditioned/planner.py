@@ -86,7 +86,7 @@ class _Spread:
     budgets: Array  # ε̄ of the stages (H, H)
     shared: Array  # quantiles of rows that share them equally (H, H, 1)
     distant: Array  # quantiles of rows at first which the regulator's plan is not near (H, H, 1)
-    rest: Array  # what a plan that rests keeps from each row (n, m), by how many rows are in the way of a target
+    rest: Array  # distance of a plan at rest from each row (n, m), by how many rows are in the way of a target
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,7 +458,7 @@ class ConditionedDesign:
         return max(1, round(_SETTLED * self.horizon))
 
 
-AnyDesign: TypeAlias = "Design | ConditionedDesign"  # what a flight is planned with, of either scheme
+AnyDesign: TypeAlias = "Design | ConditionedDesign"  # design of either scheme
 
 
 def conditioned_id(

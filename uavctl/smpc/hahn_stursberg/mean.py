@@ -41,7 +41,7 @@ class RowKind(IntEnum):
 class Row:
     """One direction c of a limit in one stage, both sides."""
 
-    kind: RowKind  # what it limits
+    kind: RowKind  # quantity that it limits
     t: int  # stage; of a reference row, N
     c: Array  # direction: of the state, the input, or y
     upper: int  # row of the set that limits +c, -1 for none
