@@ -34,7 +34,7 @@ def percent_above(share: float) -> str:
     return f"{number(math.ceil(percent / 10.0**place - _ROUNDING) * 10.0**place, 5)} %"
 
 
-# What limits and states are called when people are told of them.
+# Names of limits and states as people are told of them.
 
 
 _OF_NO_ROW = ("equilibrium", "slew")  # constraints that are no rows of the state set

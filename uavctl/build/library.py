@@ -28,7 +28,7 @@ from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary, Region, make_library
 from uavctl.smpc.plant import digest
 
-# What a policy library achieves: answers from states that it has not been grown on.
+# Quality of a policy library: answers from states that it has not been grown on.
 
 
 STATES = 200

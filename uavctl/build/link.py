@@ -24,7 +24,7 @@ from uavctl.smpc.link import (
     gilbert_elliott,
 )
 
-# Composition of the link: what a configuration says of it becomes the model that a design counts on.
+# Composition of the link: its configuration becomes the model that a design counts on.
 
 
 _ROUNDING = 1e-9

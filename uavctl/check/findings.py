@@ -73,7 +73,7 @@ def refusals(items: Iterable[Item], config: CheckConfig) -> tuple[Item, ...]:
     return tuple(one for one in items if one.state is ItemState.BAD and one.name not in config.accept)
 
 
-# What was heard of cameras and vehicle while a check listened.
+# Record of what cameras and vehicle said while a check listened.
 
 
 _MOST_PARAMETERS = 1000

@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from uavctl.config.document import LONGEST_PATH, LONGEST_URL, ConfigProblem, Position, Section
 
-# How the vehicle is asked for modes, arming and take-off, and how long its answers are waited for.
+# Requests to the vehicle for modes, arming and take-off, and how long to wait for its answers.
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
@@ -64,7 +64,7 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     ] = (47.397742, 8.545594, 488.0)
 
 
-# Whom the control loop talks to: frame and clock of the positions' source, and the connections.
+# Partners of the control loop: frame and clock of the positions' source, and the connections.
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     )
 
 
-# Who is believed: signing, and the addresses that are listened to.
+# Trust: signing, and the addresses that are listened to.
 
 
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this

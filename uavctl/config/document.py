@@ -30,7 +30,7 @@ class ConfigProblem(NamedTuple):
     todo: str
 
 
-# What no TOML document of ours exceeds, whatever its keys: looked at before and right after it is read.
+# Bounds that no TOML document of ours exceeds, whatever its keys: checked before and right after it is read.
 #
 # A document that nests deeper than the parsers' own calls can, or whose numbers and texts no key takes, is refused
 # with the place, before anything is made of it.
@@ -279,9 +279,9 @@ class _Scanner:
         self._at += 1
 
 
-# What all sections of the configuration are made of, and how large anything in them may be.
+# Base of all sections of the configuration, and the largest sizes in them.
 #
-# Every number has a range and every list and text a longest length: what is beyond is a slip, and would only come out
+# Every number has a range and every list and text a longest length: anything beyond is a slip, and would only show
 # as an overflow, or as work without end.
 
 
@@ -308,7 +308,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all sections."""
 
 
-# Where the keys of a configuration stand, to tell its problems.
+# Places of the keys of a configuration, for its problems.
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ def _outwards(key: str) -> Iterator[str]:
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
 
 
-# What the types of the keys say in words.
+# Types of the keys in words.
 
 
 _SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}

@@ -25,7 +25,7 @@ from uavctl.config.document import (
     refuse,
 )
 
-# Where to fly to in the course of a flight: waypoints or a trajectory, and limits that close in.
+# Mission of a flight: waypoints or a trajectory, and limits that close in.
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):

@@ -28,9 +28,9 @@ from uavctl.daemon.lock import runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Vec3
 
-# What is said on a daemon's control socket, and where its socket is.
+# Messages on a daemon's control socket, and the path of the socket.
 #
-# One JSON object a line in each direction: a `Request`, then its `Reply`.
+# One JSON object a line in each direction: a `ControlRequest`, then its `Reply`.
 
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"

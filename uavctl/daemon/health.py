@@ -18,7 +18,7 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
 from uavctl.records import ControlMode, Decision, Estimate, LinkEstimate, RelayStats, Vector, VehicleStatus
 
-# How a flight is doing, once a second: for a person, for `uavctl ctl status`, for the service manager.
+# State of a flight, once a second: for a person, for `uavctl ctl status`, for the service manager.
 
 
 PERIOD_NS = 1_000_000_000
@@ -242,7 +242,7 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-# The service manager's notification socket (sd_notify): ready, alive, what goes on.
+# The service manager's notification socket (sd_notify): ready, alive, status.
 #
 # The sign of life comes from the control loop and from nowhere else: a loop that hangs is a daemon that hangs.
 

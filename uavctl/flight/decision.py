@@ -38,7 +38,7 @@ from uavctl.records import (
 from uavctl.smpc.answer import Answer, Preview, Solver, all_finite
 from uavctl.smpc.plant import Plant
 
-# What the operator orders in flight: refused with a reason, or taken; a pure part of the tick.
+# Orders of the operator in flight: refused with a reason, or taken; a pure part of the tick.
 #
 # Landing begins in the tick of the order. The others wait for the next decision that makes a plan: they change where
 # the mission flies to. Of several that wait the last one counts.
@@ -136,7 +136,7 @@ def _place(position_m: Vec3) -> str:
 # One question to the solver, and what may fly of its answer.
 
 
-# What arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
+# Errors that arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
 
 
@@ -215,7 +215,7 @@ def _rows(values: Array) -> Matrix:
     return tuple(map(tuple, values.tolist()))
 
 
-# Who flies in a tick: nobody yet, a plan (fresh, or played out), or the fallback.
+# Choice of what flies in a tick: nothing yet, a plan (fresh, or played out), or the fallback.
 
 
 class Tick(msgspec.Struct, frozen=True, eq=False):
@@ -449,7 +449,7 @@ RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estima
 
 
 def reckons(fallback: Fallback, tick: Tick) -> bool:
-    """Whether the vehicle's own inertial data carry an estimate on that nothing speaks against."""
+    """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
     belief = tick.belief
     if belief is None or belief.felt_ns is None or belief.doubted_ns is not None or fallback.final:
         return False
@@ -485,12 +485,12 @@ def moving_mps(state: ControlState, tick: Tick, inp: StepInput, controller: Cont
 
 
 def _nonsense(state: ControlState) -> bool:
-    """Whether all that has come of late is further out than any position can be."""
+    """Whether all recent positions are further out than any position can be."""
     return state.trust.absurd is not None and state.trust.absurd.likely
 
 
 def _misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
-    """Whether a plan that plays out is made of what was not so."""
+    """Whether a plan that plays out was made from an estimate that proved wrong."""
     if controller.envelope is None or tick.estimate is None or (tick.age_steps or 0) < PLAYED_OUT_STEPS:
         return False
     seen = seen_of(tick, inp, state.accel_mps2, controller.plant)

@@ -150,7 +150,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def answered(self) -> bool:
-        """Whether positions have been held against a flight for so long that they are those of this vehicle."""
+        """Whether positions have agreed with the flight for so long that they must be those of this vehicle."""
         began_ns, tick_ns = self.began_ns, self.tick_ns
         return began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS
 
@@ -221,7 +221,7 @@ def witness(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> Vec
 
 
 def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
-    """Whether no axis is further apart, of those that are known."""
+    """Whether no known axis is further apart."""
     pairs = zip(velocity, known, strict=True)
     return all(abs(own - value) <= within_mps for own, value in pairs if not math.isnan(value))
 
@@ -576,7 +576,7 @@ def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
 
 
 def _braking(watching: Watching, seen: Observation) -> tuple[Watching, Breach | None]:
-    """Whether braking brakes, by the vehicle's own velocity."""
+    """Whether braking slows the vehicle down, by its own velocity."""
     velocity = own_words(seen.motion, seen.at_ns)
     if not seen.braking:
         return replace(watching, braking=None), None

@@ -282,7 +282,7 @@ def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters)
 
 
 def _far_out(sample: PositionSample, kalman: Kalman) -> bool:
-    """Whether a position is a number, and further out than any can be, as in another unit."""
+    """Whether a position is finite, but further out than any can be, as in another unit."""
     return all(map(math.isfinite, sample.position_m)) and not _plausible(
         sample.position_m, kalman.parameters.max_position_m
     )

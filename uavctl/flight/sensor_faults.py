@@ -68,7 +68,7 @@ class OutlierTrack:
         return self.count >= _SUSPECT_SAMPLES and self.last_ns - self.first_ns >= _SUSPECT_NS
 
     def moved(self, parameters: GateParameters) -> bool:
-        """Whether this is no chance any more: the source has moved, or the estimate is lost."""
+        """Whether chance is ruled out: the source has moved, or the estimate is lost."""
         return self.count >= _SAMPLES and self.last_ns - self.first_ns >= parameters.jump_ns
 
 
@@ -217,12 +217,12 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def as_usual(self) -> bool:
-        """Whether this source says its values so often."""
+        """Whether this source repeats its values that often as a rule."""
         return self.usual >= _USUAL and self.repeats < _REPEATS
 
     @property
     def stale_since_ns(self) -> int:
-        """Capture time from which on it said what was no news [ns].
+        """Capture time from which on its samples were repeats [ns].
 
         The value's first sample may itself be a repeat, if one before it was lost; not where no sample was lost.
         """
@@ -231,7 +231,7 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def unlike_it(self) -> bool:
-        """Whether the value has come again a few times, and this source does not do so."""
+        """Whether the value has come again a few times, which is unusual for this source."""
         return 0 < self.repeats <= _REPEATS and not self.as_usual
 
     @property
@@ -338,5 +338,5 @@ def doubtful(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: G
 
 
 def _noisy(watch: Watch, resolutions: float) -> bool:
-    """Whether what the source said was news so far, of so many resolutions at least."""
+    """Whether the source's samples have been news so far, of at least so many resolutions."""
     return bool(watch.resolution_m) and watch.news_m >= max(_LEAST_NEWS_M, resolutions * watch.resolution_m)

@@ -373,7 +373,7 @@ _LINK_TEXTS = {
 def _link(
     state: ControlState, tick: Tick, at_ns: int, controller: Controller
 ) -> tuple[LinkBelief, LinkEstimate | None]:
-    """Whether a position of the step that ends here has arrived, and what that makes one believe of the link."""
+    """Count the step that ends here for the link; return the counts, and the estimate if this is a boundary on time."""
     if not tick.boundary or tick.age_steps is None or at_ns != tick.boundary_ns:
         return state.link, None
     belief = observe(state.link, tick.age_steps == 0, controller.link)

@@ -13,7 +13,7 @@ from uavctl.errors import ConnectionSpecError, UavctlError
 from uavctl.frames import Quaternion, Up
 from uavctl.records import Vec3
 
-# What a camera system has to tell, whatever its protocol: the small interface that each one implements.
+# Interface of a camera system, whatever its protocol.
 
 
 class CameraError(UavctlError):
@@ -129,7 +129,7 @@ def _address(url: str, text: str) -> str:
         raise ConnectionSpecError(f"connection {url!r}: interface {error}; give this computer's address") from error
 
 
-# What daemon and camera process tell each other: the first byte of a message that is not MAVLink, and bounds.
+# Messages between daemon and camera process: the first byte of one that is not MAVLink, and bounds.
 
 
 READY, REFUSED, UNREACHABLE, COUNTS = b"R", b"E", b"T", b"C"

@@ -44,7 +44,7 @@ from uavctl.records import (
     VehicleStatus,
 )
 
-# What a real vehicle has to be asked for, or told, before it can be flown: its streams, and a place on the globe.
+# Requests and messages that a real vehicle needs before it can be flown: its streams, and a place on the globe.
 
 
 SECOND_NS = 1_000_000_000

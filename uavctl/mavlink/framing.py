@@ -181,7 +181,7 @@ def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tup
 
 
 def _between_frames(data: bytes, result: Scan, end: int) -> bool:
-    """Whether an unchecked length can be believed: what is before it was a frame, and another seems to follow."""
+    """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
     return result.in_step and (end >= len(data) or data[end] in _MAGIC)
 
 

@@ -233,7 +233,7 @@ def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> G
 
 
 def _has_started_since(progress: Progress, view: HandoverView) -> bool:
-    """Whether the vehicle has started after the flight that a daemon before left: it is on another one."""
+    """Whether the vehicle has started after the flight that an earlier daemon left: it is on another one."""
     if progress.flown_ns is None or view.up_s is None:
         return False
     return view.up_s / SLOWEST + LATEST_S < (view.at_ns - progress.flown_ns) / 1e9

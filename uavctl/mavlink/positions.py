@@ -185,7 +185,7 @@ class PositionDecoder:
         return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
     def _has_room(self, message: Position, received_ns: int) -> bool:
-        """Whether one more sample is looked at; of sources that are settled each is."""
+        """Whether one more sample is looked at; each sample of a settled source is."""
         self.settled = self._clocks.times(_key(message)) >= SETTLED
         if self.settled:
             self._settled_ns = received_ns

@@ -109,7 +109,7 @@ LOST = "…"  # stands for a piece that did not come
 
 
 class _Begun(msgspec.Struct):
-    """A text of which more is to come."""
+    """Text of which more pieces are to come."""
 
     first: Text
     said: str
@@ -197,7 +197,7 @@ class Punctual:
         self._values: Vec3 | None = None
 
     def takes(self, stamp_us: int, values: Vec3, at_ns: int) -> bool:
-        """Whether a message is of now.
+        """Whether a message is current.
 
         Args:
             stamp_us: when it was measured, by the sender's clock.

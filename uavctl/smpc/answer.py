@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 # A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
 INPUT_TOLERANCE = 1e-6
 
-# What still counts as a constraint kept (each in its own unit, or summed over a plan).
+# Tolerance up to which a constraint counts as kept (each in its own unit, or summed over a plan).
 KEPT = 1e-6
 
 

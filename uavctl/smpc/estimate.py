@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 
-# A plant with an unknown acceleration that stays: wind, drag that nobody compensates, an error of the hover thrust.
+# A plant with an unknown lasting acceleration: wind, uncompensated drag, an error of the hover thrust.
 #
 # The bias d acts where the input does and is a random walk; it becomes a state of a larger plant, which a filter of
 # the usual kind then estimates:
@@ -29,7 +29,7 @@ from uavctl.smpc.plant import Plant
 #
 # Between two boundaries d moves on a line, so B_d is the mean of B(t) over the step.
 #
-# A force acts at once, not through the lag of what steers: where accelerations are measured, that has to be told
+# A force acts at once, not through the lag of the inputs: where accelerations are measured, that has to be told
 # apart. With the acceleration of a lagging axis meaning all of it, the force's too, a change of d shows in it as it
 # happens, while its motion from then on is that of A, B as before; B_d has the mean of A(t) J beside it, with J the
 # steady acceleration of a unit of input.

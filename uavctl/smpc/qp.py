@@ -234,7 +234,7 @@ def _last(flags: Flags) -> int:
     return int(flags.size - 1 - flags[::-1].argmax())
 
 
-# Where each kind of variable of a component's program sits, and which rows share one.
+# Places of each kind of variable in a component's program, and the rows that share one.
 
 
 @dataclass(frozen=True)

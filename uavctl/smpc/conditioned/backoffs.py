@@ -112,7 +112,7 @@ def _ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, flo
     return weights, beyond, left
 
 
-# How a plan spreads the risk of an age over its rows: iterative risk allocation.
+# Spread of the risk of an age over the rows of a plan: iterative risk allocation.
 
 
 Flags = NDArray[np.bool_]
@@ -171,7 +171,7 @@ def shifted(
     return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0, kept, backoff)
 
 
-# What plans with risk conditioned on the age keep from a limit that they rest at.
+# Distances that plans with risk conditioned on the age keep from a limit that they rest at.
 #
 # A plan keeps its back-offs wherever its reference is: they are rows of the program. The reference decides how often
 # a new position leaves a plan that cannot keep them. So it keeps the larger of two distances from a limit. At the
@@ -335,7 +335,7 @@ def _asked(
     plant, steps = problem.plant, problem.horizon
     late = int(risk.weights.argmax())
     spread = unseen(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
-    # How long plans are flown, by how old what they are made from becomes in the share of time π.
+    # Share of plans that are still flown at each age of their information, from the shares of time π.
     flown = np.minimum.accumulate(risk.weights[late:] / risk.weights[late])
     gaps = flown - np.append(flown[1:], 0.0)
     news = spread[1 : gaps.size + 1] - spread[0]

@@ -172,7 +172,7 @@ class ConditionedSolver:
 
         self._near = spread(age_risk(link, self._pacing(), allowed, price, many))
         self._transit = spread(equal_risk(link, steps, allowed, many))
-        # Who rests there is seldom outside even at the oldest age that keeps something back, so limits matter on the
+        # A plan at rest there is seldom outside even at the oldest age with a back-off, so limits matter on the
         # way alone.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.of(None)[max(0, counts - 1)]
@@ -353,7 +353,7 @@ class ConditionedSolver:
         """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
         problem = self.problem
         if outlook.path is None:
-            # The regulator's own cost, and the square of what leaves it.
+            # The regulator's own cost, and the square of the deviation from it.
             cost = dx[0] @ self._tail @ dx[0] + sum(np.vdot(z, z) for _, z in found.left)
         else:
             last, dx, du = dx[-1], dx[:-1] - outlook.path.states, du - outlook.path.inputs
@@ -411,7 +411,7 @@ class ConditionedDecider:
         return gathered(answers, (problem.horizon, problem.plant.n_u))
 
 
-# What flights with risk conditioned on the age are planned with: the counterpart of a design, made at once.
+# Design for flights with risk conditioned on the age: the counterpart of a design, made at once.
 
 
 _SETTLED = 2.0 / 3.0  # of the horizon: a plan along a motion rests from there on, whatever that asks of the inputs

@@ -20,7 +20,7 @@ from scipy import sparse
 
 from uavctl.smpc.sets import Scale
 
-# How Clarabel is asked, by whoever asks it directly.
+# Settings of Clarabel for direct calls.
 
 
 # The optimum is to be right to 1e-7. With a smaller gap the linear algebra may run out of digits before the end.

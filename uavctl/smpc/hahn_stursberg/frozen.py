@@ -26,7 +26,7 @@ from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
 # limits. Rows whose room it takes whole are pinned to the middle. If the pinned mean QP is feasible, the multipliers
 # of the pinned rows stay within those of the policy, and no other row that depends on the gains has one, the KKT
 # conditions of the joint problem hold (theory notes, D). All components are prepared and judged in common, since
-# Python's time goes by calls.
+# Python's time grows with the number of calls.
 
 
 Array = NDArray[np.float64]

@@ -135,7 +135,7 @@ class DelayedLoop:
 
 # Share of the room that a terminal ellipsoid may fill: a design needs an interior around its target.
 MOST_FILLED = 0.99
-# What the optimiser is shown where there is no stationary cost (relative to the start's).
+# Cost shown to the optimiser where there is no stationary cost (relative to the start's).
 _WALL = 1e6
 _INPUT_WEIGHTS = tuple(10.0**power for power in range(9))
 _ROUNDING = 1e-8
