@@ -79,7 +79,7 @@ _NUMBERS = np.dtype("<f8")
 
 @dataclass(frozen=True, eq=False)
 class StoredLibrary:
-    """A library with what is told of it."""
+    """Library with the figures that are reported of it."""
 
     library: Library  # the library
     library_id: str  # hash of its design's hash and all its numbers

@@ -285,7 +285,7 @@ _NAMES = {3: "ArduPilot", 12: "PX4"}
 
 
 def vehicle_items(seen: Heard, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
-    """Items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
+    """Return the items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
     heartbeat = seen.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
     if heartbeat is None:

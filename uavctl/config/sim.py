@@ -256,7 +256,7 @@ _OF_KIND = {
 
 
 def spans(key: str, given: Spans) -> Iterator[ConfigProblem]:
-    """Yield problems of spans of time since the start: a negative start, or an end that is not after it."""
+    """Yield the spans of time since the start that are not valid: a negative start, or an end that is not after it."""
     for i, (start, end) in enumerate(given):
         if not 0 <= start < end:
             yield ConfigProblem(

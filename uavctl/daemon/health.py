@@ -57,7 +57,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
-    """The flight at one moment; SI units, local NED, axes that the plant has not are left out."""
+    """State of the flight at one moment; SI units, local NED, axes that the plant lacks are left out."""
 
     name: str
     url: str

@@ -535,12 +535,12 @@ def back_mps2(state: ControlState, tick: Tick, controller: Controller) -> Vec3:
 
 
 def position(estimated: Estimate | None, plant: Plant) -> Vec3:
-    """Predicted position, zero in the axes that the plant has not."""
+    """Return the predicted position, zero in the axes that the plant lacks."""
     return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.position_index, 0.0)
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
-    """Predicted velocity, zero in the axes that the plant has not."""
+    """Return the predicted velocity, zero in the axes that the plant lacks."""
     return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.velocity_index, 0.0)
 
 

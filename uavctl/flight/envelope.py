@@ -106,7 +106,7 @@ class Observation(msgspec.Struct, frozen=True):
     at_ns: int  # the tick [ns]
     samples: Sequence[PositionSample]  # positions that were believed in this tick
     sent_mps2: Vec3  # setpoint that acts since the tick before
-    position_m: Vec3 | None  # estimated position; NaN in axes that the plant has not
+    position_m: Vec3 | None  # estimated position; NaN in axes that the plant lacks
     velocity_mps: Vec3  # estimated velocity, the same
     motion: VehicleMotion | None  # motion by the vehicle's own estimate
     braking: bool  # whether the fallback brakes
@@ -216,7 +216,7 @@ def contradicts(watching: Watching, seen: Observation, age_s: float, parameters:
 
 
 def witness(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
-    """The vehicle's own velocity, where positions have agreed with it of late; else None."""
+    """Return the vehicle's own velocity where recent positions agree with it; else None."""
     return None if watching.contradicted or watching.apart_mps is None else own_words(motion, at_ns)
 
 

@@ -176,7 +176,7 @@ Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), o
 
 
 def learnt(biases: Biases) -> Vector:
-    """The part of a bias (n_u,) that has been there all the time of late; zero of one that is not known for long.
+    """Return the part of a bias (n_u,) that has lasted through recent time; zero if it has not been known for long.
 
     In the first seconds, and where the vehicle does not answer as the model says, an estimated bias comes and goes with
     what is flown; blind, its acceleration would be flown for seconds.

@@ -295,7 +295,7 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Pl
 
     Args:
         plant: The plant; its model without disturbances is kept exactly.
-        positions_m: (n, 3), local NED [m]; axes that the plant has not are ignored.
+        positions_m: (n, 3), local NED [m]; axes that the plant lacks are ignored.
         velocities_mps: (n, 3) [m/s], or None.
 
     """

@@ -123,7 +123,7 @@ def _far(reach: Reach, belief: Belief) -> Array:
 def judge(
     suspect: OutlierTrack | None, at_ns: int, off: Array, width: Array, n_axes: int
 ) -> tuple[bool, OutlierTrack | None]:
-    """Whether a sample may count, and who is suspected after it.
+    """Judge whether a sample may count, and which samples are suspected after it.
 
     Args:
         at_ns: Capture time of the sample [ns].

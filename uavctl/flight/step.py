@@ -131,7 +131,7 @@ def initial_state() -> ControlState:
 
 
 def disbelieves(state: ControlState) -> bool:
-    """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
+    """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
     jumped = state.fallback is not None and state.fallback.end is FallbackEnd.BARRED
     if jumped or state.breach is None:
         return jumped
@@ -335,7 +335,7 @@ def _outdated(plan: Plan | None, clean_ns: int | None, *, afresh: bool) -> Plan 
 
 
 def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
-    """The biases of late, without those of what has been taken back, and with that of a boundary with news."""
+    """Return the recent biases, without those from samples taken back, and with that of a boundary with news."""
     biases = state.biases
     if clean_ns is not None:
         biases = tuple(one for one in biases if one[0] <= clean_ns)
@@ -347,7 +347,7 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
 
 
 def remember(biases: fb.Biases, at_ns: int, bias: Vector) -> fb.Biases:
-    """The biases of late, with one more, from an estimate with a fresh position in it."""
+    """Return the recent biases with one more, from an estimate with a fresh position in it."""
     return (*(one for one in biases if at_ns - one[0] <= fb.LATELY_NS), (at_ns, bias))
 
 

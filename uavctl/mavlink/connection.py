@@ -183,7 +183,7 @@ class MavlinkConnection:
         daemon: our ids; the connection's URL tells a byte stream from datagrams.
         source: which messages and which system count as positions.
         estimator: standard deviation of a position, and what is absurd.
-        listen: hears every message of others that is understood, with its time of arrival; for who wants to know more
+        listen: hears every message of others that is understood, with its time of arrival; for callers that want more
             than the items tell.
     """
 

@@ -23,7 +23,7 @@ _WAITING = 64  # poses of one tick
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A body as an estimator is told of it."""
+    """Pose of a body as sent to the vehicle's estimator."""
 
     message: str  # as which message
     usec: int  # time of capture, in the clock that the vehicle expects [us]

@@ -192,7 +192,7 @@ class _Sight:
         )
 
     def after(self, p: Array, *, seen: bool) -> Array:
-        """P at the end of a step (n_x, n_x), from that at its begin."""
+        """P at the end of a step (n_x, n_x), from that at its beginning."""
         z = self._at_sample(p)
         if seen:
             gain = self._gain(z)
@@ -203,7 +203,7 @@ class _Sight:
         return np.asarray((z + z.T)[:n_x, :n_x] / 2.0)
 
     def effect(self, p: Array) -> Array:
-        """E (n_x, n_y) of ν = E ω, ω ~ N(0, I), from the covariance at the step's begin: L S^½ carried to its end."""
+        """E (n_x, n_y) of ν = E ω, ω ~ N(0, I), from the covariance at the step's start: L S^½ carried to its end."""
         z = self._at_sample(p)
         root = np.linalg.cholesky(self._innovation(z))
         return np.asarray((self.to_end @ self._gain(z) @ root)[: len(p)])
