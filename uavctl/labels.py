@@ -34,7 +34,7 @@ def percent_above(share: float) -> str:
     return f"{number(math.ceil(percent / 10.0**place - _ROUNDING) * 10.0**place, 5)} %"
 
 
-# What limits and states are called when people are told of them.
+# Names of limits and states as people are told of them.
 
 
 _OF_NO_ROW = ("equilibrium", "slew")  # constraints that are no rows of the state set
@@ -106,7 +106,7 @@ def severity(names: Names, one: GaveWay) -> tuple[bool, float]:
 
 
 def excess(names: Names, one: GaveWay) -> float:
-    """By how much a constraint gave way, in the unit of its state."""
+    """Return by how much a constraint gave way, in the unit of its state."""
     return one.amount / (1.0 if one.constraint in _OF_NO_ROW else names.rows[one.index][2])
 
 

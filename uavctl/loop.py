@@ -109,13 +109,13 @@ class ControlLoop:
         self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
         self._last_step_ns = 0
-        self._unsure_since_ns: int | None = None  # what the vehicle said then was lost unread
+        self._unsure_since_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
         self.vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self.decision: Decision | None = None
         self.estimate: Estimate | None = None
         self.link: LinkEstimate | None = None
-        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; who tells them takes them
+        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; whoever tells them takes them
         self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
         self.notices: deque[Event] = deque(
             maxlen=MAX_NOTICES
@@ -124,15 +124,15 @@ class ControlLoop:
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
         self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands = config.fallback.land or config.relay.enabled
-        self.course = FlightCourse()  # what happened on the way, as far as it bears upon the end
+        self.course = FlightCourse()  # course of the flight, as far as it bears upon the end
 
     @property
     def ending(self) -> Ending:
-        """How the flight ended, or would if it ended now."""
+        """End of the flight, or the one that it would have now."""
         return replace(self.course.ending(over=self.finished), relay=self._relayed())
 
     def _relayed(self) -> str:
-        """What became of the positions for the vehicle, for a person."""
+        """Return a text for a person on the positions passed on to the vehicle."""
         stats = self.relay
         if stats is None or stats.last_ns is None:
             return "" if stats is None else "no position was passed on to the vehicle"
@@ -157,7 +157,7 @@ class ControlLoop:
 
     @property
     def relay(self) -> RelayStats | None:
-        """What has become of the positions for the vehicle; None where none are passed on."""
+        """Counts of the positions passed on to the vehicle; None where none are passed on."""
         if not self._relays:
             return None
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
@@ -172,17 +172,17 @@ class ControlLoop:
 
     @property
     def failure(self) -> str:
-        """What the vehicle was asked for and did not do, with its own reason; empty if it did all."""
+        """Request that the vehicle did not carry out, with its own reason; empty if it did all."""
         return self._hand_over.failure
 
     @property
     def let_go(self) -> str:
-        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
         return "" if self._state.breach is None else self._state.breach.text
 
     @property
     def who_flies(self) -> HandoverState:
-        """Where the hand-over stands."""
+        """State of the hand-over."""
         return self._hand_over.state
 
     @property
@@ -257,7 +257,7 @@ class ControlLoop:
         self._record_stats(at_ns)
 
     def _decide(self, inp: StepInput) -> StepOutput:
-        """What the core makes of a tick; one that has failed is not asked again, and what it flew has to land."""
+        """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
         if not self.course.died:
             try:
                 self._state, out = step(self._state, inp, self._controller)
@@ -290,7 +290,7 @@ class ControlLoop:
         return StepOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
     def _die(self, error: Exception, at_ns: int) -> None:
-        """The controller has failed: no setpoint is sent any more, and the positions for the vehicle go on."""
+        """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle."""
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
         self.course.died = self.course.died or f"{type(error).__name__}: {error}{where}"
@@ -307,7 +307,7 @@ class ControlLoop:
         return True
 
     def against(self, order: Order) -> str:
-        """Why an order of where to fly would come to nothing now; empty if it may be taken, or is another one."""
+        """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
         return against_moving(self.who_flies, self.vehicle) if moves else ""
 
@@ -328,7 +328,7 @@ class ControlLoop:
         )
 
     def _gather(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
-        """All that the tick may know; recorded first, so that a replay knows when the tick ran."""
+        """Gather the inputs of the tick; they are recorded first, so that a replay knows when the tick ran."""
         samples, heard, self._heard = self._take_due(at_ns)
         inp = StepInput(
             tick=tick,
@@ -398,7 +398,7 @@ class ControlLoop:
             self.news.append(event)
 
     def _command(self, inp: StepInput, out: StepOutput) -> Iterator[Outgoing]:
-        """What the vehicle is told: a setpoint, a request, or nothing."""
+        """Yield what the vehicle is sent: a setpoint, a request, or nothing."""
         at_ns = inp.at_ns
         told = self._hand_over.update(self._view(inp, out))
         if told.passage is not None:
@@ -406,7 +406,7 @@ class ControlLoop:
         self.answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
-            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # who orders is answered
+            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # whoever ordered gets the answer
                 self.notices.append(event)
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
@@ -437,7 +437,7 @@ class ControlLoop:
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
     def _view(self, inp: StepInput, out: StepOutput) -> HandoverView:
-        """What the hand-over may know."""
+        """Return the inputs of the hand-over in this tick."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
         if estimate is not None and "down" in plant.axes:
@@ -479,7 +479,7 @@ class ControlLoop:
 
 
 def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
-    """So many samples as a tick may look at, in order: a source that says much takes nothing of another's."""
+    """Return as many samples as a tick may look at, in order; a source that sends many takes no room of another's."""
     if len(samples) <= MAX_SAMPLES:
         return tuple(samples)
     behind: Counter[str] = Counter()  # newer samples of the same source

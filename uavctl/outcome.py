@@ -1,4 +1,4 @@
-"""How a flight ended, told once: console, `ctl status`, health, summary, page, JSON and exit code take it from here.
+"""End of a flight, told once: console, `ctl status`, health, summary, page, JSON and exit code take it from here.
 
 The control loop notes what happens along the way; whoever ends it adds why. Pure: nothing here decides anything.
 """
@@ -21,7 +21,7 @@ SECOND_NS = 1_000_000_000
 
 
 class Cause(StrEnum):
-    """Why a flight ended; the value is a phrase for a table."""
+    """Cause of a flight's end; the value is a phrase for a table."""
 
     MISSION = "landed at the end of the mission"
     ORDERED = "landed as ordered"
@@ -59,7 +59,7 @@ class Cause(StrEnum):
     WAITING = "waiting"  # by an older recording, which does not say for what
 
 
-# What somebody wanted: the operator, the mission, or the pilot.
+# Ends that somebody wanted: the operator, the mission, or the pilot.
 WANTED = frozenset(
     {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT, Cause.PILOT, Cause.PILOT_LANDED}
 )
@@ -77,7 +77,7 @@ _FALLING = frozenset({ControlMode.BRAKE, ControlMode.HOLD})
 
 
 def lacking(ending: Ending, records: int, why: str) -> Ending:
-    """The ending of a flight whose recording lacks records, which makes it none that went as ordered."""
+    """Return the ending of a flight whose recording lacks records: it did not go as ordered."""
     if not records:
         return ending
     some = "1 record" if records == 1 else f"{records} records"
@@ -86,7 +86,7 @@ def lacking(ending: Ending, records: int, why: str) -> Ending:
 
 
 def make_ending(cause: Cause, what: str, *, as_ordered: bool | None = None, exit_code: int | None = None) -> Ending:
-    """An ending in one sentence; by its cause it is as ordered or not, if nothing else is said."""
+    """Make an ending of one sentence; whether it is as ordered follows from its cause, unless given."""
     good = cause in WANTED if as_ordered is None else as_ordered
     code = (0 if good else 1) if exit_code is None else exit_code
     return Ending(cause=cause.value, as_ordered=good, sentence=f"{what[:1].upper()}{what[1:]}.", exit_code=code)
@@ -94,7 +94,7 @@ def make_ending(cause: Cause, what: str, *, as_ordered: bool | None = None, exit
 
 @dataclass
 class FlightCourse:
-    """What happened along the way, as far as it bears upon the end."""
+    """Course of a flight, as far as it bears upon its end."""
 
     takes_off: bool = False  # the flight begins on the ground, by our order
     in_flight: bool = False  # it is to end in the air, as simulated flights do
@@ -104,17 +104,17 @@ class FlightCourse:
     flown: bool = False  # the controller has been in charge at a Δt boundary
     engaged: bool = False  # the vehicle has been flown by our setpoints
     over: bool = False  # nothing more will be sent
-    died: str = ""  # what failed in the controller; empty while nothing did
+    died: str = ""  # failure of the controller; empty while there is none
     _state: HandoverState = HandoverState.WAITING
-    _found: Cause | None = None  # what ended it first, if anything did
+    _found: Cause | None = None  # first cause of the end, if there is one
     _why: str = ""
     _failed: str = ""  # why the landing failed
-    _asked: Cause | None = None  # what the controller ends in by itself: an order to land, or the mission
+    _asked: Cause | None = None  # end that the controller flies to by itself: an order to land, or the mission's end
     _asked_ns: int | None = None
     _stop: Cause | None = None  # the end that was asked for from outside
     _closed: str = ""
     _signal: int = 0
-    _failsafes: int = 0  # that have ended by themselves
+    _failsafes: int = 0  # number of failsafes that have ended by themselves
     _airborne: bool = False  # it has been armed
     _vehicle: VehicleStatus | None = None
     _positions: bool = False  # there has been an estimate
@@ -123,24 +123,24 @@ class FlightCourse:
     _now_ns: int = 0
 
     def stop(self, cause: Cause) -> None:
-        """The end is asked for from outside: OPERATOR or TIME; the first one counts."""
+        """Note that the end is asked for from outside: OPERATOR or TIME; the first one counts."""
         self._stop = self._stop or cause
 
     def close(self, text: str) -> None:
-        """The vehicle's connection is closed."""
+        """Note that the vehicle's connection is closed."""
         self._closed = text
 
     def kill(self, number: int) -> None:
-        """A second signal ends it at once."""
+        """Note that a second signal ends the flight at once."""
         self._signal = number
 
     def see(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
-        """The vehicle at a tick."""
+        """Note the vehicle's state at a tick."""
         self._now_ns, self._vehicle = at_ns, vehicle
         self._airborne = self._airborne or (vehicle is not None and vehicle.armed)
 
     def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
-        """What the controller decided in a tick."""
+        """Note what the controller decided in a tick."""
         self._positions = self._positions or estimated
         before, self._mode = self._mode, decision.mode
         if decision.mode is ControlMode.TRACK:
@@ -159,7 +159,7 @@ class FlightCourse:
             self._find(self._asked or (Cause.SILENT if lost else landed), "" if self._asked else self._fell)
 
     def turn(self, one: Passage, vehicle: VehicleStatus | None) -> None:
-        """The hand-over goes from one state to another."""
+        """Note a transition of the hand-over."""
         self._state = one.after
         if one.after is HandoverState.ENGAGED or (
             one.before is HandoverState.FAILSAFE and one.after is HandoverState.CLIMBING
@@ -186,7 +186,7 @@ class FlightCourse:
             self._asked = Cause.ORDERED
 
     def ending(self, *, over: bool | None = None) -> Ending:
-        """How it ended, or would if it ended now; `over`: nothing more was to be sent, if that is known better."""
+        """Return how it ended, or would end now; `over`: nothing more was to be sent, if that is known better."""
         cause, why = self._told(self.over if over is None else over)
         where = "" if cause is Cause.IN_FLIGHT else self._where()
         what = f"{cause.value}{f': {why}' if why else ''}"
@@ -211,7 +211,7 @@ class FlightCourse:
         return self.ending(over=True).sentence if done else ""
 
     def _find(self, cause: Cause, why: str) -> None:
-        """The first one counts."""
+        """Note a cause of the end; the first one counts."""
         if self._found is None:
             self._found, self._why = cause, why
 
@@ -252,7 +252,7 @@ class FlightCourse:
             self._found = Cause.FAILSAFE_LANDED
 
     def _told(self, over: bool) -> tuple[Cause, str]:
-        """The cause that counts most, and more about it."""
+        """Return the cause that counts most, and the reason behind it."""
         if self._signal:
             return Cause.SIGNALLED, ""
         if self._closed:
@@ -271,7 +271,7 @@ class FlightCourse:
         return self._wished(over)
 
     def _wished(self, over: bool) -> tuple[Cause, str]:
-        """The cause of an end that nothing has brought about but somebody's will, if there was one."""
+        """Return the cause of an end that somebody wanted and nothing else brought about, if there was one."""
         asked = self._found or self._stop or self._asked
         if self.takes_off and not self.engaged:
             return Cause.NOT_ENGAGED, "" if asked is None else asked.value
@@ -294,7 +294,7 @@ class FlightCourse:
         return Cause.NOT_FLOWN, "the pilot has not switched to the mode that takes setpoints"
 
     def _where(self) -> str:
-        """Where the vehicle is, as far as it has told."""
+        """Return in words where the vehicle is, as far as it has told."""
         vehicle = self._vehicle
         if vehicle is None:
             return ""
@@ -311,7 +311,7 @@ class FlightCourse:
 
 
 def _reason(one: Passage) -> str:
-    """Why something was refused, without what the cause says already."""
+    """Return why something was refused, without what the cause says already."""
     asked = "" if one.ask is None else f"{one.ask.value}: "
     text = one.why
     for said in (asked, "take-off: ", "another vehicle is heard on this link: ", "the vehicle's own failsafe "):

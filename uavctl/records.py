@@ -24,7 +24,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class SolveStatus(StrEnum):
-    """How a solve ended; only OPTIMAL may fly."""
+    """Outcome of a solve; only OPTIMAL may fly."""
 
     OPTIMAL = "optimal"
     INFEASIBLE = "infeasible"
@@ -35,7 +35,7 @@ class SolveStatus(StrEnum):
 
 
 class ControlMode(StrEnum):
-    """What the controller is doing in a tick."""
+    """Mode of the controller in a tick."""
 
     WAIT = "wait"  # no estimate yet, or nobody to fly
     TRACK = "track"  # a plan is flown: fresh, or played out
@@ -46,7 +46,7 @@ class ControlMode(StrEnum):
 
 
 class SetpointSource(StrEnum):
-    """Where a setpoint comes from."""
+    """Source of a setpoint."""
 
     PLAN = "plan"
     BRAKE = "brake"
@@ -124,7 +124,7 @@ class Plan(Record, frozen=True, kw_only=True):
 
 
 class Setpoint(Record, frozen=True, kw_only=True):
-    """What is sent to the vehicle, after the last gate."""
+    """Setpoint sent to the vehicle, after the last gate."""
 
     at_ns: int
     accel_mps2: Vec3
@@ -134,7 +134,7 @@ class Setpoint(Record, frozen=True, kw_only=True):
 
 
 class Decision(Record, frozen=True, kw_only=True):
-    """Everything that a tick knew and chose."""
+    """Decision of a tick, with all that it knew."""
 
     tick: int
     at_ns: int
@@ -175,7 +175,7 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
 
 
 class VehicleMotion(Record, frozen=True, kw_only=True):
-    """How the vehicle itself says that it moves: the newest of each, with its time of arrival."""
+    """Velocity and attitude by the vehicle's own estimate: the newest of each, with its time of arrival."""
 
     velocity_mps: Vec3 | None = None  # local NED, by its own estimate
     velocity_ns: int | None = None
@@ -184,7 +184,7 @@ class VehicleMotion(Record, frozen=True, kw_only=True):
 
 
 class Severity(StrEnum):
-    """How bad an event is."""
+    """Severity of an event."""
 
     INFO = "info"
     WARNING = "warning"
@@ -202,7 +202,7 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class Order(StrEnum):
-    """What the operator may ask of a flight while it goes on."""
+    """Order that the operator may give while a flight goes on."""
 
     GOTO = "goto"  # fly to a place and stay there
     HOLD = "hold"  # stay where the vehicle comes to rest
@@ -223,11 +223,11 @@ class Command(Record, frozen=True, kw_only=True):
     order: Order
     position_m: Vec3 | None = None  # local NED
     height_m: float | None = None  # of the climb, above the ground
-    flown_ns: int | None = None  # when the daemon before this one took the vehicle over
+    flown_ns: int | None = None  # time at which the daemon before this one took the vehicle over
 
 
 class StepInput(Record, frozen=True, kw_only=True):
-    """All that one control tick may know; recorded, and enough to replay the tick."""
+    """Inputs of one control tick; recorded, and enough to replay the tick."""
 
     tick: int
     at_ns: int  # the tick's place on the grid, not the moment it ran
@@ -241,7 +241,7 @@ class StepInput(Record, frozen=True, kw_only=True):
 
 
 class Timing(Record, frozen=True, kw_only=True):
-    """What the shell measured; never an input of the core, never compared in a replay."""
+    """Times that the shell measured; never an input of the core, never compared in a replay."""
 
     tick: int
     at_ns: int
@@ -267,7 +267,7 @@ def raw_topic(link: str, *, outgoing: bool) -> str:
 
 
 class Refused(Record, frozen=True, kw_only=True):
-    """What a connection dropped before anything looked into it, since this was last told."""
+    """Counts of what a connection dropped unread since the last such record."""
 
     at_ns: int
     link: str
@@ -286,13 +286,13 @@ class Checked(Record, frozen=True, kw_only=True):
 
 
 class Ending(Record, frozen=True, kw_only=True):
-    """How the flight ended: the last word of the daemon, before its recording is closed."""
+    """End of the flight: the last word of the daemon, before its recording is closed."""
 
     cause: str  # one of a few phrases (`uavctl.outcome.Cause`)
     as_ordered: bool  # by the operator, the mission or the pilot
     sentence: str  # for a person, with where the vehicle was then
     exit_code: int  # of the program
-    relay: str = ""  # what became of the positions that were passed on to the vehicle; empty where none were
+    relay: str = ""  # text on the positions passed on to the vehicle; empty where none were
 
 
 class RelayStats(Record, frozen=True, kw_only=True):
@@ -300,8 +300,8 @@ class RelayStats(Record, frozen=True, kw_only=True):
 
     at_ns: int
     sent: int
-    kept: dict[str, int]  # that were not passed on, by reason
-    last_ns: int | None  # when the last one went
+    kept: dict[str, int]  # positions not passed on, by reason
+    last_ns: int | None  # time at which the last one went
     alone: bool  # nothing else is sent: control has ended, or failed
 
 
@@ -316,9 +316,9 @@ class LinkStats(Record, frozen=True, kw_only=True):
     bad: dict[str, int]  # reason -> count
     clock_offset_ns: int | None
     clock_source: str  # "timesync", "minimum" or "none"
-    # TIMESYNC with the source of positions; with the vehicle on a link that carries none
+    # TIMESYNC with the source of positions, or with the vehicle on a link that carries no positions
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
-    clock_drift_ppm: float | None = None  # what our clock gains on the peer's
+    clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
 
 
@@ -333,7 +333,7 @@ class Truth(Record, frozen=True, kw_only=True):
     sent: int  # positions sent so far
     lost: int  # of which the channel lost
     mode: str
-    faults: tuple[str, ...] = ()  # what is amiss
+    faults: tuple[str, ...] = ()  # faults that act now
 
 
 class Header(Record, frozen=True, kw_only=True):
@@ -352,7 +352,7 @@ class Header(Record, frozen=True, kw_only=True):
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):
-    """What is believed of the link that carries the positions, at a Δt boundary."""
+    """Estimate of the link that carries the positions, at a Δt boundary."""
 
     at_ns: int
     arrived: float  # steps with news, the older the less they count
@@ -362,7 +362,7 @@ class LinkEstimate(Record, frozen=True, kw_only=True):
     credible: float
     burst_statistic: float  # about N(0, 1) if losses are independent, large if they come in bursts
     bursts: bool
-    promised: float  # what the design counts on for p
+    promised: float  # least p that the design counts on
     below_promise: bool  # p is below `promised` with probability `credible` at least
 
 
@@ -390,7 +390,7 @@ class Outgoing(Record, frozen=True, kw_only=True):
 
 
 class Received(NamedTuple):
-    """What a datagram was, and what is to be sent at once because of it: never anything that moves the vehicle."""
+    """Origin of a datagram, and the answers to send at once: never anything that moves the vehicle."""
 
     answers: tuple[Outgoing, ...]  # to requests for our time
     from_vehicle: bool  # it came from the vehicle that is flown, not from others on the same port
@@ -398,7 +398,7 @@ class Received(NamedTuple):
 
 
 class Flyer(Protocol):
-    """What flies: bytes in, bytes out, time as an argument. The simulator is given one."""
+    """Controller that flies: bytes in, bytes out, time as an argument. The simulator is given one."""
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""

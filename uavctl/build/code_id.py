@@ -1,4 +1,4 @@
-"""Which code this is: hashes of the sources, and of the versions of what they compute with."""
+"""Identity of the code: hashes of the sources, and of the versions of what they compute with."""
 
 from __future__ import annotations
 

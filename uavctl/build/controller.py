@@ -34,7 +34,7 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope, equilibria
 
-# The paper's scheme is loaded where it is flown: it takes a tenth of the time in which the rest is.
+# The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
     from uavctl.smpc.hahn_stursberg.library import Library
@@ -89,7 +89,7 @@ def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
 
 
 def build_spec(config: Config) -> DesignSpec:
-    """What the configuration asks of a design.
+    """Return the specification that the configuration gives for a design.
 
     Raises:
         DesignError: A key of scheme `hahn-stursberg` is missing; see also `build_plant` and `build_delayed_link`.
@@ -167,7 +167,7 @@ def build_problem(config: Config) -> ControlProblem:
 def build_conditioned(
     config: Config, *, flown: bool = True, cov: NDArray[np.float64] | None = None
 ) -> ConditionedDesign:
-    """What flights of the scheme with risk conditioned on the age are planned with.
+    """Return the design that flights of the scheme with risk conditioned on the age are planned with.
 
     Args:
         flown: Whether the flight's own filter estimates, biases included, and the last gate limits how fast what is
@@ -210,13 +210,13 @@ def _innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
 def _position_age_s(config: Config) -> float:
     """Age of a step's position at its end, up to a step [s]."""
     link, dt_s = config.link, config.plant.dt_s
-    # It may be from the very begin, unless others follow it.
+    # It may be from the very beginning of the step, unless others follow it.
     since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
     return min(dt_s, since_s + link.delay_s + link.jitter_s)
 
 
 def _settled(config: Config, plant: Plant) -> NDArray[np.float64]:
-    """What the flight's filter does not know where a plan begins, with a position and inertial data in every step."""
+    """Return the filter's error covariance where a plan begins, with a position and inertial data in every step."""
     dt_ns = round(plant.dt_s * NANOSECONDS)
     kalman = make_kalman(plant, build_estimator(config), dt_ns)
     dead_ns = round(config.plant.dead_time_s * NANOSECONDS)
@@ -224,7 +224,7 @@ def _settled(config: Config, plant: Plant) -> NDArray[np.float64]:
 
 
 def design_of(config: Config) -> AnyDesign:
-    """What a flight is planned with, by `smpc.scheme`.
+    """Return the design that a flight is planned with, by `smpc.scheme`.
 
     Raises:
         DesignError: There is none, naming key, reason and what to do.
@@ -306,7 +306,7 @@ def _promised(config: Config) -> float:
 
 
 def build_estimator(config: Config) -> EstimatorParameters:
-    """What the filter believes of its samples."""
+    """Return the parameters of the estimator."""
     estimator = config.estimator
     return EstimatorParameters(
         position_std_m=estimator.position_std_m,
@@ -325,14 +325,14 @@ def build_estimator(config: Config) -> EstimatorParameters:
 
 
 def _bias_bounds(config: Config) -> tuple[float, ...]:
-    """What of each input may be spent against a bias: a share of its authority, and what plans leave free at least."""
+    """Return how much of each input may be spent against a bias: a share of its authority, at least `bias_max`."""
     sets, estimator = config.sets, config.estimator
     half = [0.5 * (high - low) for low, high in zip(sets.input_lower, sets.input_upper, strict=True)]
     return tuple(max(estimator.bias_max, estimator.bias_share * each) for each in half)
 
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
-    """What is possible in flight, by the limits, the plant and the last gate."""
+    """Return the bounds of what is possible in flight, by the limits, the plant and the last gate."""
     sets, envelope, limits = config.sets, config.envelope, config.limits
     places = dict(zip(plant.axes, plant.position_index, strict=True))
     lower = [sets.state_lower[places[axis]] if axis in places else -math.inf for axis in AXES]

@@ -28,7 +28,7 @@ from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary, Region, make_library
 from uavctl.smpc.plant import digest
 
-# What a policy library achieves: answers from states that it has not been grown on.
+# Quality of a policy library: answers from states that it has not been grown on.
 
 
 STATES = 200
@@ -79,14 +79,14 @@ _NUMBERS = np.dtype("<f8")
 
 @dataclass(frozen=True, eq=False)
 class StoredLibrary:
-    """A library with what is told of it."""
+    """Library with the figures that are reported of it."""
 
     library: Library  # the library
     library_id: str  # hash of its design's hash and all its numbers
     data: bytes  # its bytes, as `decode` reads them
-    names: tuple[str, ...]  # what each component, fresh and late, is called
-    check: LibraryCheck  # what it achieves on states that it was not grown on
-    made_s: float  # how long it took to make it [s]
+    names: tuple[str, ...]  # name of each component, fresh and late
+    check: LibraryCheck  # its answers from states that it was not grown on
+    made_s: float  # time that making it took [s]
     path: Path | None = None  # its file in the cache; None if it is in none
     cached: bool = False  # whether it was found in the cache
 
@@ -292,7 +292,7 @@ def library_for(design: Design, advance: Advance | None = None, tell: Tell | Non
 
 
 def cache_file(design: Design) -> Path:
-    """Where the library of a design is kept: below `$UAVCTL_CACHE`, else the user's cache folder.
+    """Return the file that keeps the library of a design: below `$UAVCTL_CACHE`, else the user's cache folder.
 
     Raises:
         RuntimeError: There is no such folder, because the user has no home.

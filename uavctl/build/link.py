@@ -24,7 +24,7 @@ from uavctl.smpc.link import (
     gilbert_elliott,
 )
 
-# Composition of the link: what a configuration says of it becomes the model that a design counts on.
+# Composition of the link: its configuration becomes the model that a design counts on.
 
 
 _ROUNDING = 1e-9
@@ -170,7 +170,7 @@ def build_delayed_link(config: Config) -> LinkModel:
 
 
 def build_ages(config: Config) -> AgeModel:
-    """How old the positions are in the long run: all that scheme `age-conditioned` asks of a link, with any delay.
+    """Return the long-run ages of positions: all that scheme `age-conditioned` asks of a link, with any delay.
 
     Where the losses of each step are known ahead, its budgets are those of the worst of them, for every step.
 

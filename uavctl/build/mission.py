@@ -65,7 +65,7 @@ def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
 
 
 def build_names(design: AnyDesign) -> Names:
-    """What the design's rows and states are called."""
+    """Return the names of the design's rows and states."""
     plant = design.plant
     return names_of(
         design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.further
@@ -172,7 +172,7 @@ def _fence(number: int, given: FenceConfig, design: AnyDesign, rests: Array) -> 
 
 
 def _check_room(key: str, row: int, least: float, design: AnyDesign, rests: Array) -> None:
-    """Where no place to rest changes a state, as with a velocity, its limit has to leave room for plans that rest."""
+    """Check that a limit leaves room for plans at rest, if its state is the same at every place, as a velocity is."""
     plant = design.plant
     # Weights choose among the inputs that hold a place, and not among the places.
     weights = np.eye(plant.n_x), np.eye(plant.n_u)

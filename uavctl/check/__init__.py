@@ -1,1 +1,1 @@
-"""What can be known before a vehicle is armed: bytes and times in, items out; no socket, no clock, nothing armed."""
+"""Checks before a vehicle is armed: bytes and times in, items out; no socket, no clock, nothing armed."""

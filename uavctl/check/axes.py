@@ -16,7 +16,7 @@ from uavctl.config.types import Config
 from uavctl.frames import Quaternion, from_euler, multiply, to_euler
 from uavctl.records import Vec3
 
-# What turns the vehicle's axes into the cameras': right, or which of the usual mistakes; least squares on pairs.
+# Turn of the vehicle's axes into the cameras': right, or one of the usual mistakes; least squares on pairs.
 #
 # Every pair (v, e) is a vector as the vehicle knows it and as the cameras see it after `[frame]`. A set-up is a matrix
 # M with e = M v; the right one is I. A mistake is *excluded* by pairs that it does not fit; what no pair excludes
@@ -68,7 +68,7 @@ class Evidence:
     tolerance_m: float  # root of the mean square of e - v that a right set-up keeps
 
     def misfit(self, matrix: Array) -> float:
-        """How badly e = M v holds, in tolerances; up to 1 it may be so."""
+        """Return the error of e = M v, in tolerances; up to 1 the relation may hold."""
         off = self.seen - self.own @ matrix.T
         # What the vehicle does not know of v counts as often as the set-up multiplies it.
         scale = max(1.0, float(np.cbrt(abs(np.linalg.det(matrix)))))
@@ -99,7 +99,7 @@ def turn(angle_deg: float) -> Array:
 
 
 def explain(evidence: Sequence[Evidence]) -> str:
-    """What is wrong, for evidence that does not fit I: a usual mistake, a turn, or what the best similarity shows."""
+    """Return the error that explains evidence which does not fit I: a usual mistake, a turn, or the best similarity."""
     usual = possible(evidence)
     angle = yaw_deg(evidence)
     if len(usual) > 1:
@@ -213,7 +213,7 @@ def _axes(
         if abs(angle) > config.check.yaw_deg:
             hint = f"frame.yaw_deg is {angle:.0f} deg too large, if the vehicle's heading is right"
             return item("axes", ItemState.BAD, f"turned by {angle:.0f} deg about the vertical", _WANT, hint)
-    # What the vehicle believes because these very positions told it shows nothing.
+    # An estimate of the vehicle's that comes from these very positions shows nothing.
     shown = evidence_of([], asked, config)[0] if config.relay.enabled else evidence
     left = _left(possible(shown), seen, config, heading_agrees=heading_agrees and not config.relay.enabled)
     how = ", ".join(word for word, there in (("at rest", not moved and not asked), ("moved", moved or asked)) if there)
@@ -231,7 +231,7 @@ def _left(mistakes: list[Mistake], seen: Heard, config: Config, *, heading_agree
 
 
 def _noise_excludes(scale: float, noise: float) -> bool:
-    """Whether noise (in parts of what is believed of it) cannot be that of another unit."""
+    """Whether noise (relative to the configured one) cannot be that of another unit."""
     return (scale >= 100.0 and noise < 0.1 * scale) or (0.0 < scale <= 0.01 and noise > 0.1)
 
 

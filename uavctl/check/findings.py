@@ -32,7 +32,7 @@ from uavctl.records import LinkStats, PositionSample, Vec3
 
 
 class ItemState(StrEnum):
-    """How it stands with an item."""
+    """Verdict on an item of the check."""
 
     GOOD = "good"
     NOTE = "note"  # flyable, and worth knowing
@@ -43,10 +43,10 @@ class ItemState(StrEnum):
 class Item(msgspec.Struct, frozen=True, kw_only=True):
     """One line of a check."""
 
-    name: str  # what was looked at; `check.accept` takes it
+    name: str  # name of the item, as `check.accept` takes it
     ok: bool  # nothing speaks against flying; false only for a `bad` state
-    value: str  # what was found
-    want: str  # what is wanted
+    value: str  # value that was found
+    want: str  # value that is wanted
     hint: str  # what to do; empty if nothing is to be done
     state: ItemState  # the whole answer: `good`, `note`, `undetermined` or `bad`
 
@@ -73,7 +73,7 @@ def refusals(items: Iterable[Item], config: CheckConfig) -> tuple[Item, ...]:
     return tuple(one for one in items if one.state is ItemState.BAD and one.name not in config.accept)
 
 
-# What was heard of cameras and vehicle while a check listened.
+# Record of what cameras and vehicle said while a check listened.
 
 
 _MOST_PARAMETERS = 1000
@@ -100,7 +100,7 @@ class Sample:
 
 @dataclass
 class Heard:
-    """What was heard."""
+    """Record of all that was heard while the check listened."""
 
     begun_ns: int  # when listening began
     samples: list[Sample] = field(default_factory=list)  # positions of the cameras, as they arrived

@@ -142,7 +142,7 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     value = f"{loss:.0%} of {count} steps"
     if link.model != "bernoulli" or link.probability:
         return item(name, ItemState.NOTE, value, f"as link.model {link.model!r} has it", "compare it with the model's")
-    # Two standard deviations: fewer than one right set-up in forty is told that it loses more than it does.
+    # Two standard deviations: fewer than one right set-up in forty is told of more losses than it has.
     # Losses in bursts vary more than that.
     alone = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
     in_runs = loss_std(np.diff(np.unique(steps)) - 1)

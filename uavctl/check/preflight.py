@@ -57,7 +57,7 @@ class Guide:
 
     @property
     def prompt(self) -> str:
-        """What is asked for now; empty while the body has to rest first, and at the end."""
+        """Prompt for the person now; empty while the body has to rest first, and at the end."""
         return "" if self.over or self._start is None else PROMPTS[self._index][1]
 
     def take(self, at_ns: int, position_m: Vec3, heading_rad: float | None) -> None:
@@ -186,7 +186,7 @@ class Preflight:
         return Received(answers, from_vehicle, from_source)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        """What is to be sent at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
+        """Yield what to send at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
         del tick
         for name, link in self._links.items():
             for data in link.due(at_ns):
@@ -205,7 +205,7 @@ class Preflight:
                 yield Outgoing(link=VEHICLE, data=data)
 
     def _requests(self, vehicle: MavlinkConnection) -> Iterator[bytes]:
-        """What has not been told yet is asked for."""
+        """Yield requests for what the vehicle has not told yet."""
         kind = self._seen.autopilot
         if self._rounds <= 2:  # a lost request is repeated once; a vehicle that ignores it is not pestered
             for message_id, rate_hz in _STREAMS_HZ.get(kind or 0, {}).items():
@@ -215,7 +215,7 @@ class Preflight:
                 yield vehicle.request_parameter(name)
 
     def items(self, at_ns: int) -> tuple[Item, ...]:
-        """What is known by `at_ns`."""
+        """Return the items of the check as known by `at_ns`."""
         seen, config = self._seen, self._config
         seen.stats = {name: link.stats(at_ns) for name, link in self._links.items()}
         vehicle = self._links[VEHICLE].vehicle
@@ -256,12 +256,12 @@ class Preflight:
 
     @property
     def prompt(self) -> str:
-        """What a person is asked to do now; empty for nothing."""
+        """Prompt that tells a person what to do now; empty for nothing."""
         return self.guide.prompt if self.guide is not None and self._is_safe else ""
 
     @property
     def _is_safe(self) -> bool:
-        """Nobody is sent near propellers that turn, or might."""
+        """Whether a person may be sent near the vehicle: not to propellers that turn, or might."""
         return self._seen.heartbeat is not None and not is_armed(self._seen)
 
     def _hear(self, message: Message, at_ns: int) -> None:

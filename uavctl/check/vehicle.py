@@ -40,7 +40,7 @@ def clock_items(seen: Heard, config: Config) -> list[Item]:
 
 
 def _of_vehicle(config: Config) -> tuple[ItemState, str]:
-    """How bad it is that the vehicle does not answer, and what to do."""
+    """Return how bad it is that the vehicle does not answer, and what to do."""
     if config.relay.enabled:
         return (
             ItemState.BAD,
@@ -86,7 +86,7 @@ _ANY = "any value"
 
 
 class ParameterVerdict(NamedTuple):
-    """How a value is, and what is wanted in its place with the other parameters as they are."""
+    """Verdict on a parameter's value, and what is wanted in its place with the other parameters as they are."""
 
     state: ItemState
     want: str
@@ -109,7 +109,7 @@ def _wanted(want: str, *, good: bool, otherwise: ItemState = ItemState.NOTE) -> 
 
 
 def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerdict:
-    """A want that holds under a condition alone; without it any value will do, and that is what is said."""
+    """Judge a want that holds only under a condition; without it any value will do, and the verdict says so."""
     return _wanted(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {unless}")
 
 
@@ -162,7 +162,7 @@ def _copter_threshold(value: float, _get: Get, config: Config) -> ParameterVerdi
 
 
 def _without_positions(config: Config) -> ItemState:
-    """How bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
+    """Return how bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
     return ItemState.BAD if config.relay.enabled else ItemState.NOTE
 
 
@@ -285,7 +285,7 @@ _NAMES = {3: "ArduPilot", 12: "PX4"}
 
 
 def vehicle_items(seen: Heard, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
-    """Items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
+    """Return the items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
     heartbeat = seen.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
     if heartbeat is None:

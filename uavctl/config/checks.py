@@ -141,7 +141,7 @@ def fences(plant: PlantConfig, sets: SetsConfig, given: Sequence[FenceConfig]) -
 
 
 def _tightens(key: str, sets: SetsConfig, fence: FenceConfig, state: int) -> Iterator[ConfigProblem]:
-    """A fence stands inside the constant limits."""
+    """Check that a fence stands inside the constant limits."""
     if not 0 <= state < min(len(sets.state_lower), len(sets.state_upper)):
         count = len(sets.state_lower)
         yield ConfigProblem(f"{key}.state", f"there is no state {state}", f"give 0 to {count - 1}")
@@ -174,13 +174,13 @@ def _increasing(key: str, times_s: Floats) -> Iterator[ConfigProblem]:
 
 
 def solver(given: SolverConfig, told: MissionConfig) -> Iterator[ConfigProblem]:
-    """The printed problem knows no trajectory."""
+    """Check that no trajectory is given to the printed problem, which cannot follow one."""
     if given.method == "printed" and told.trajectory.times_s:
         yield ConfigProblem("solver.method", '"printed" follows no trajectory', 'use "library" or "exact"')
 
 
 def solver_fences(given: SolverConfig, told: Sequence[FenceConfig]) -> Iterator[ConfigProblem]:
-    """Nor does it know moving limits."""
+    """Check that no moving limits are given to the printed problem, which cannot keep them."""
     if given.method == "printed" and told:
         yield ConfigProblem("solver.method", '"printed" knows no limits that move', 'use "library" or "exact"')
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from uavctl.config.document import LONGEST_PATH, LONGEST_URL, ConfigProblem, Position, Section
 
-# How the vehicle is asked for modes, arming and take-off, and how long its answers are waited for.
+# Requests to the vehicle for modes, arming and take-off, and how long to wait for its answers.
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
@@ -64,7 +64,7 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     ] = (47.397742, 8.545594, 488.0)
 
 
-# Whom the control loop talks to: frame and clock of the positions' source, and the connections.
+# Partners of the control loop: frame and clock of the positions' source, and the connections.
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class CameraSystem:
     """A camera system that is listened to without a bridge to MAVLink."""
 
     camera: str  # `module:Class` of its `uavctl.io.camera.Camera`, made with the body's name and the axis that is up
-    package: str  # what that imports beyond ours; empty for nothing
-    extra: str  # of ours, that installs the package
+    package: str  # package that it imports beyond ours; empty for none
+    extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none
-    advice: str  # where no answer comes
+    advice: str  # what to check if no answer comes
 
 
 # By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY. Another one is a line here and its class.
@@ -110,7 +110,7 @@ class FrameConfig(Section, frozen=True, kw_only=True):
 
 
 class SourceConfig(Section, frozen=True, kw_only=True):
-    """Which messages count as external positions."""
+    """Messages that count as external positions."""
 
     messages: Annotated[
         tuple[
@@ -175,7 +175,7 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     )
 
 
-# Who is believed: signing, and the addresses that are listened to.
+# Trust: signing, and the addresses that are listened to.
 
 
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
@@ -257,7 +257,7 @@ def check(security: SecurityConfig) -> Iterator[ConfigProblem]:
 
 
 def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
-    """What is open to strangers in a configuration that is not wrong; for people, before a flight."""
+    """Return warnings of what a valid configuration leaves open to strangers; for people, before a flight."""
     urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
     if daemon.vehicle == daemon.mocap:
         del urls["mocap"]
@@ -277,13 +277,13 @@ def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
 
 
 def roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
-    """A camera system flies nothing."""
+    """Check that a camera system is not given as the vehicle."""
     if daemon.vehicle.startswith(CAMERAS):
         yield ConfigProblem("daemon.vehicle", f'"{daemon.vehicle}" is a camera system', "give it as daemon.mocap")
 
 
 def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
-    """Its positions have to be among those that count."""
+    """Check that a camera system's positions are among those that count."""
     if not daemon.mocap.startswith(CAMERAS):
         return
     if CAMERA_MESSAGE not in source.messages:
@@ -299,7 +299,7 @@ def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem
 
 
 def signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
-    """It cannot sign."""
+    """Check that no signatures are asked of a camera system, which cannot sign."""
     if daemon.mocap.startswith(CAMERAS) and security.key_file and "mocap" in security.require:
         yield ConfigProblem(
             "security.require",

@@ -1,4 +1,4 @@
-"""Where each key of a TOML document stands: key path -> line number.
+"""Line numbers of the keys of a TOML document: key path -> line number.
 
 Parsers give values without places, or places without paths; a message that names the line of a
 wrong key needs both. The document must be valid TOML (the parser has seen it first).
@@ -30,7 +30,7 @@ class ConfigProblem(NamedTuple):
     todo: str
 
 
-# What no TOML document of ours exceeds, whatever its keys: looked at before and right after it is read.
+# Bounds that no TOML document of ours exceeds, whatever its keys: checked before and right after it is read.
 #
 # A document that nests deeper than the parsers' own calls can, or whose numbers and texts no key takes, is refused
 # with the place, before anything is made of it.
@@ -66,7 +66,7 @@ def excess(text: str) -> tuple[int, str] | None:
 
 
 def oversized(table: dict[str, Any]) -> Iterator[ConfigProblem]:
-    """The first things in a document that no key takes: depths, lengths, whole numbers; without calls in calls."""
+    """Yield the first values in a document that no key takes, by depth, length or whole number; without recursion."""
     todo: list[tuple[str, object, int]] = [("", table, 0)]
     found = 0
     while todo and found < _TOLD:
@@ -109,7 +109,7 @@ def _problem(path: str, value: object, depth: int) -> ConfigProblem | None:
 
 
 class DataFileError(Exception):
-    """What is wrong with a file: one reason a line, each with file and line."""
+    """Errors in a file: one reason per line, each with file and line."""
 
     def __init__(self, reasons: tuple[str, ...]) -> None:
         super().__init__("\n".join(reasons))
@@ -117,7 +117,7 @@ class DataFileError(Exception):
 
 
 def read_text(path: Path) -> str:
-    """Its text; a byte order mark is passed over.
+    """Return the text of a file; a byte order mark is passed over.
 
     Raises:
         DataFileError: It cannot be read, is no file (a pipe would be waited for, a device has no end), is too long, or
@@ -145,7 +145,7 @@ def read_text(path: Path) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Its lines.
+    """Return the lines of a file.
 
     Raises:
         DataFileError: As `read_text`.
@@ -279,9 +279,9 @@ class _Scanner:
         self._at += 1
 
 
-# What all sections of the configuration are made of, and how large anything in them may be.
+# Base of all sections of the configuration, and the largest sizes in them.
 #
-# Every number has a range and every list and text a longest length: what is beyond is a slip, and would only come out
+# Every number has a range and every list and text a longest length: anything beyond is a slip, and would only show
 # as an overflow, or as work without end.
 
 
@@ -308,12 +308,12 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all sections."""
 
 
-# Where the keys of a configuration stand, to tell its problems.
+# Places of the keys of a configuration, for its problems.
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a configuration came from: enough to say where each key stands."""
+    """Origin of a configuration: enough to say where each key stands."""
 
     file: str  # the file, as a person finds it
     lines: Mapping[str, int]  # key path -> line in the file
@@ -343,7 +343,7 @@ def _outwards(key: str) -> Iterator[str]:
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
 
 
-# What the types of the keys say in words.
+# Types of the keys in words.
 
 
 _SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
@@ -394,7 +394,7 @@ def description(field: FieldInfo) -> str:
 
 
 def _unit(annotation: Any) -> str:
-    """What a length counts."""
+    """Return the unit that the length of a value counts."""
     return "characters" if annotation is str else "entries"
 
 

@@ -189,7 +189,7 @@ def _delays(path: Path) -> Floats:
 
 
 def _wrong(cells: list[str], column: int, width: int) -> Iterator[str]:
-    """What is wrong with a line, if anything."""
+    """Yield the errors in a line."""
     if len(cells) != width:
         yield f"has {len(cells)} columns; give {'as many as the header' if width > 1 else 'one, or a header'}"
         return

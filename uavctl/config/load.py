@@ -136,7 +136,7 @@ def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> Config:
 
 
 def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """The same from TOML text; `file` is the name that messages show.
+    """Load a configuration from TOML text; `file` is the name that messages show.
 
     Raises:
         ConfigError: With all problems found.
@@ -338,7 +338,7 @@ def _missing(key: str, field: FieldInfo) -> ConfigProblem:
 
 
 def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[ConfigProblem]:
-    """What is wrong with a value by its type, if anything."""
+    """Yield the errors of a value by its type."""
     todo = f"give {type_text(field.type)}: {description(field)}"
     for path, number in _numbers(key, value):
         if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):

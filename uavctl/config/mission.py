@@ -25,7 +25,7 @@ from uavctl.config.document import (
     refuse,
 )
 
-# Where to fly to in the course of a flight: waypoints or a trajectory, and limits that close in.
+# Mission of a flight: waypoints or a trajectory, and limits that close in.
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):
@@ -171,7 +171,7 @@ def _three(values: Floats) -> tuple[float, float, float]:
 
 
 def _wrong(cells: list[str], width: int) -> Iterator[str]:
-    """What is wrong with a row, if anything."""
+    """Yield the errors in a row."""
     if len(cells) not in (_WITHOUT, _WITH):
         yield f"has {len(cells)} columns; {_WANTED}"
     elif len(cells) != width:

@@ -123,7 +123,7 @@ class InertialConfig(Section, frozen=True, kw_only=True):
 
 
 class ChecksConfig(Section, frozen=True, kw_only=True):
-    """What the simulated autopilot doubts of itself though nothing is wrong (docs/autopilots.md)."""
+    """False alarms of the simulated autopilot: checks that fail though nothing is wrong (docs/autopilots.md)."""
 
     flicker_s: Annotated[
         float,
@@ -256,7 +256,7 @@ _OF_KIND = {
 
 
 def spans(key: str, given: Spans) -> Iterator[ConfigProblem]:
-    """Spans of time since the start that are none."""
+    """Yield the spans of time since the start that are not valid: a negative start, or an end that is not after it."""
     for i, (start, end) in enumerate(given):
         if not 0 <= start < end:
             yield ConfigProblem(
@@ -301,7 +301,7 @@ def sim(config: SimConfig) -> Iterator[ConfigProblem]:
 
 
 def ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
-    """Two on one link that cannot be told apart."""
+    """Check that the simulated vehicle and the daemon have different system ids, to be told apart on one link."""
     if sim.system_id == daemon.system_id:
         yield ConfigProblem(
             "sim.system_id", f"{sim.system_id} is that of the daemon too (daemon.system_id)", "give another number"

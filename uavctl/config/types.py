@@ -67,7 +67,7 @@ class LogConfig(Section, frozen=True, kw_only=True):
 
 
 def check(log: LogConfig) -> Iterator[ConfigProblem]:
-    """What does not fit together."""
+    """Yield the keys that do not fit together."""
     if log.stop_bytes > log.low_bytes:
         yield ConfigProblem(
             "log.stop_bytes",
@@ -300,7 +300,7 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
 
 
 class RiskConfig(Section, frozen=True, kw_only=True):
-    """How a likelihood becomes back-offs."""
+    """Rules by which a likelihood becomes back-offs."""
 
     allocation: Annotated[
         Literal["ellipsoid", "halfspace"],
@@ -340,7 +340,7 @@ class SolverConfig(Section, frozen=True, kw_only=True):
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
-    """Where to fly to, unless `[mission]` says otherwise; the design's terminal set is checked there."""
+    """Target to fly to, unless `[mission]` says otherwise; the design's terminal set is checked there."""
 
     position_m: Annotated[
         Position, Meta(description="target position in local NED [m]; axes that the plant has not are ignored")
@@ -439,7 +439,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):
-    """What takes over when the age of information reaches H."""
+    """Fallback that takes over when the age of information reaches H."""
 
     brake_gain_1ps: Annotated[
         float, Meta(ge=1e-6, le=1000, description="deceleration per predicted speed while braking [1/s]")
@@ -487,7 +487,7 @@ Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
-    """What is possible in flight; beyond it the vehicle is let go: level, and its own landing."""
+    """Bounds of what is possible in flight; beyond them the vehicle is let go: level, and its own landing."""
 
     outside_m: Annotated[
         Bound,

@@ -28,9 +28,9 @@ from uavctl.daemon.lock import runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Vec3
 
-# What is said on a daemon's control socket, and where its socket is.
+# Messages on a daemon's control socket, and the path of the socket.
 #
-# One JSON object a line in each direction: a `Request`, then its `Reply`.
+# One JSON object a line in each direction: a `ControlRequest`, then its `Reply`.
 
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
@@ -47,7 +47,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     position_m: Vec3 | None = None  # local NED; with goto only
 
     def problem(self) -> str | None:
-        """What is wrong with it as such; None if nothing is."""
+        """Error in the request by itself; None if there is none."""
         if (self.ask == "goto") != (self.position_m is not None):
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
@@ -56,7 +56,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """What was decided on an order, or the flight as it is."""
+    """Reply to a request: what was decided on an order, or the flight as it is."""
 
     ok: bool
     text: str
@@ -83,7 +83,7 @@ def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ)
 
 
 def socket_path(folder: Path, name: str) -> Path:
-    """Where the daemon of this name listens.
+    """Return the path of the socket on which the daemon of this name listens.
 
     Raises:
         UsageError: the path is too long for a socket.
@@ -103,7 +103,7 @@ _REQUEST = msgspec.json.Decoder(ControlRequest)
 
 
 class Orderly(Protocol):
-    """What takes orders: the control loop."""
+    """Receiver of orders: the control loop."""
 
     answers: tuple[tuple[Command, Event], ...]  # the orders that the last tick took, each with its answer
 
@@ -112,7 +112,7 @@ class Orderly(Protocol):
         ...
 
     def against(self, order: Order) -> str:
-        """Why an order would come to nothing now; empty if it may be given."""
+        """Return why an order would have no effect now; empty if it may be given."""
         ...
 
 
@@ -145,7 +145,7 @@ class ControlServer:
             self._serve(client, due.at_ns)
 
     def close(self) -> None:
-        """End the service; who still waits is told so."""
+        """End the service; clients that still wait are told so."""
         for client, _ in self._waiting:
             self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
         for client in self._clients:
@@ -220,7 +220,7 @@ class ControlServer:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
     def _misplaced(self, request: ControlRequest) -> str | None:
-        """In which coordinates a place is outside the limits; None if it is inside, or there is none."""
+        """Return in which coordinates a place is outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
             return None
         config = self._config

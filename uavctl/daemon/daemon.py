@@ -150,7 +150,7 @@ class _Reader:
             self._connections[answer.link].send(answer.data)
 
     def _look_at_losses(self, stalled: bool) -> None:
-        """Tell what the system dropped while nobody looked. A flood's losses are told by nobody, and change nothing."""
+        """Tell what the system dropped while nobody looked. Losses in a flood are not told, and change nothing."""
         for name, connection in self._connections.items():
             before, lost = self._lost[name], connection.lost()
             self._lost[name] = lost
@@ -167,7 +167,7 @@ class _Refusals:
         self._next_ns = 0
 
     def tell(self, at_ns: int, *, last: bool = False) -> None:
-        """Do so if the time has come, or the last one, and there is something to tell."""
+        """Tell what is new if a second has passed, or this is the last call."""
         if at_ns < self._next_ns and not last:
             return
         self._next_ns = at_ns + SECOND_NS

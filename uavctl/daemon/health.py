@@ -18,7 +18,7 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
 from uavctl.records import ControlMode, Decision, Estimate, LinkEstimate, RelayStats, Vector, VehicleStatus
 
-# How a flight is doing, once a second: for a person, for `uavctl ctl status`, for the service manager.
+# State of a flight, once a second: for a person, for `uavctl ctl status`, for the service manager.
 
 
 PERIOD_NS = 1_000_000_000
@@ -51,13 +51,13 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
 
     sent: int  # since the start
     sent_hz: float  # in the last second
-    kept: dict[str, int]  # that were not passed on, by reason
+    kept: dict[str, int]  # positions not passed on, by reason
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
-    """The flight at one moment; SI units, local NED, axes that the plant has not are left out."""
+    """State of the flight at one moment; SI units, local NED, axes that the plant lacks are left out."""
 
     name: str
     url: str
@@ -76,13 +76,13 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     missed_ticks: int  # since the start
     vehicle: VehicleHealth | None
     recorder: RecorderHealth
-    who_flies: str = ""  # where the hand-over stands
-    ending: str = ""  # how the flight ends or has ended, in the words of its end; empty while nothing ends it
+    who_flies: str = ""  # state of the hand-over
+    ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
     relay: RelayHealth | None = None  # None where no positions are passed on
 
 
 class Flight(Protocol):
-    """What is looked at of a control loop."""
+    """Control loop as far as its health is looked at."""
 
     decision: Decision | None
     estimate: Estimate | None
@@ -93,17 +93,17 @@ class Flight(Protocol):
 
     @property
     def who_flies(self) -> HandoverState:
-        """Where the hand-over stands."""
+        """State of the hand-over."""
         ...
 
     @property
     def relay(self) -> RelayStats | None:
-        """What has become of the positions for the vehicle; None where none are passed on."""
+        """Counts of the positions passed on to the vehicle; None where none are passed on."""
         ...
 
     @property
     def let_go(self) -> str:
-        """What cannot be and made us let the vehicle go; empty as long as nothing did."""
+        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
         ...
 
 
@@ -158,7 +158,7 @@ class HealthWatch:
             self._tell(line(health))
 
     def _alarm(self, recorder: RecorderHealth) -> None:
-        """Say once what has become of the recording, in a line of its own."""
+        """Report each change of the recording's health once, in a line of its own."""
         now = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
         if now == self._recording:
             return
@@ -242,7 +242,7 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-# The service manager's notification socket (sd_notify): ready, alive, what goes on.
+# The service manager's notification socket (sd_notify): ready, alive, status.
 #
 # The sign of life comes from the control loop and from nowhere else: a loop that hangs is a daemon that hangs.
 

@@ -77,7 +77,7 @@ LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a ba
 
 
 def identity(url: str) -> str:
-    """What a connection URL leads to, in one form for all URLs that mean the same.
+    """Return the identity of what a connection URL leads to, in one form for all URLs that mean the same.
 
     Args:
         url: as `uavctl.io.transport.open_connection` takes it.
@@ -127,7 +127,7 @@ class VehicleLock:
 
     @property
     def left_ns(self) -> int | None:
-        """When that flight began, time since the machine's start [ns]; None if no vehicle would be left."""
+        """Start of the flight that would now be left, time since the machine's start [ns]; None if none would."""
         return self._left_ns
 
     @property
@@ -152,7 +152,7 @@ class VehicleLock:
 
 
 def _left_ns(text: bytes, now_ns: int) -> int | None:
-    """When the file's last holder took a vehicle into flight that it then left; None if there is none to find."""
+    """Return when the file's last holder began a flight that it then left [ns]; None if there is none to find."""
     _, _, flown = text.decode(errors="replace").partition(f"\n{_FLOWN} ")
     at_ns = int(flown.strip()) if flown.strip().isdecimal() else None
     # A time to come is one of before the machine's last start.

@@ -1,4 +1,4 @@
-"""What a flight does to the process: garbage is collected between ticks only; with `--realtime` class and memory too.
+"""Settings of the process for a flight: garbage collection between ticks only; with `--realtime` class and memory too.
 
 Each part of `--realtime` that is not permitted is told with what to do, and the flight goes on without it.
 """

@@ -1,4 +1,4 @@
-"""What is constant in a flight, and what one tick leaves to the next."""
+"""Constants of a flight, and the state that one tick leaves to the next."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from uavctl.smpc.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """Everything constant that `step` needs.
+    """Constants of a flight that `step` needs.
 
     Raises:
         ValueError: If the ticks do not divide Δt, or a target has not one entry a state.
@@ -33,21 +33,21 @@ class Controller:
     design_id: str  # goes into every plan
     horizon: int  # H [steps]
     solver: Solver  # answers the decision problem
-    mission: Mission  # where to fly to, and within what limits
-    names: Names  # what the rows and states are called in events
+    mission: Mission  # waypoints or trajectory, and moving limits
+    names: Names  # names of the rows and states in events
     estimator: EstimatorParameters  # parameters of the filter
     fallback: FallbackParameters  # parameters of the fallback
     limits: LimitsParameters  # parameters of the last gate
-    trust: GateParameters  # how far positions are believed
+    trust: GateParameters  # parameters of the gate for positions
     dt_ns: int  # δt [ns]
     tick_ns: int  # time between ticks [ns]; divides Δt
-    link: LinkEstimateParameters  # what the estimate of the link goes by
+    link: LinkEstimateParameters  # parameters of the link estimate
     dead_ns: int = 0  # from sending an input until it begins to act [ns]
     late_steps: int = 0  # age up to which the solver counts what it has not seen since [steps]
-    envelope: EnvelopeParameters | None = None  # what is possible; None: nothing is held against it
+    envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: nothing is checked against them
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
-    reach: Reach = field(init=False, repr=False)  # where the vehicle can be, made from the others
+    reach: Reach = field(init=False, repr=False)  # reachable set of the vehicle, made from the others
 
     def __post_init__(self) -> None:
         if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
@@ -62,27 +62,27 @@ class Controller:
 
 
 class ControlState(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next."""
+    """State of the controller that one tick leaves to the next."""
 
     history: FilterHistory | None = None  # the estimator; None before the first tick
     decided_step: int | None = None  # step of the last boundary that was seen
     plan: Plan | None = None  # the plan that is flown; None if none is
     fallback: Fallback | None = None  # the fallback that flies; None if it does not
-    trust: SourceHealth = msgspec.field(default_factory=SourceHealth)  # what is known of the sources of positions
+    trust: SourceHealth = msgspec.field(default_factory=SourceHealth)  # health of the position sources
     fresh: int = 0  # fresh samples in a row
     accel_mps2: Vec3 = ZERO  # the last setpoint
-    mission: MissionState | None = None  # how far the mission has come; None before the first decision
-    order: Command | None = None  # what the operator ordered of the mission and no decision has taken up yet
-    link: LinkBelief = NOTHING_SEEN  # what the boundaries so far have shown of the link
-    link_alarms: tuple[str, ...] = ()  # what was told of the link and still holds, by event code
-    # How it is with the vehicle's inertial data, by event code; empty where none are used or we do not fly
+    mission: MissionState | None = None  # progress of the mission; None before the first decision
+    order: Command | None = None  # operator's order for the mission that no decision has taken up yet
+    link: LinkBelief = NOTHING_SEEN  # counts of the link at the boundaries so far
+    link_alarms: tuple[str, ...] = ()  # alarms of the link that were told and still hold, by event code
+    # State of the vehicle's inertial data, by event code; empty where none are used or we do not fly
     inertial: str = ""
     at_bounds: tuple[int, ...] = ()  # inputs whose bias was told to be as large as what is flown against it
-    watching: Watching = NOT_WATCHING  # what the envelope knows of this flight
-    breach: Breach | None = None  # what it found that cannot be; None for nothing
+    watching: Watching = NOT_WATCHING  # state of the envelope check in this flight
+    breach: Breach | None = None  # the breach that it found; None for none
     # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since
     recalled: bool = False
     biases: Biases = ()  # estimated biases of late
     taken_back: int | None = None  # the step in which positions were last taken back; None for none
     coming: Coming = ()  # inputs that were sent and do not act yet, oldest first
-    held_m: Vec3 | None = None  # where HOLD began, as it was estimated [m]; None in other modes
+    held_m: Vec3 | None = None  # estimated position at which HOLD began [m]; None in other modes

@@ -1,4 +1,4 @@
-"""Who flies in a tick: operator orders, plan, fallback."""
+"""Decision of a tick on what flies: operator orders, plan, fallback."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from uavctl.records import (
 from uavctl.smpc.answer import Answer, Preview, Solver, all_finite
 from uavctl.smpc.plant import Plant
 
-# What the operator orders in flight: refused with a reason, or taken; a pure part of the tick.
+# Orders of the operator in flight: refused with a reason, or taken; a pure part of the tick.
 #
 # Landing begins in the tick of the order. The others wait for the next decision that makes a plan: they change where
 # the mission flies to. Of several that wait the last one counts.
@@ -48,7 +48,7 @@ _OURS = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
 
 def mode_of(state: ControlState) -> ControlMode:
-    """What flies."""
+    """Return the control mode of a state."""
     if state.fallback is not None:
         return state.fallback.mode
     return ControlMode.WAIT if state.plan is None else ControlMode.TRACK
@@ -77,7 +77,7 @@ def take_orders(state: ControlState, inp: StepInput, controller: Controller) -> 
 
 
 def obey(mission: Mission, state: MissionState, order: Command | None, estimate: Vector, at_ns: int) -> MissionState:
-    """The mission at a boundary (of the estimate (n_x,)) once an order is taken up."""
+    """Return the mission at a boundary, with estimate (n_x,), once an order is taken up."""
     if order is None:
         return state
     if mission.room is None or order.order is Order.RESUME:
@@ -87,14 +87,14 @@ def obey(mission: Mission, state: MissionState, order: Command | None, estimate:
 
 
 def told(command: Command) -> str:
-    """An order in words."""
+    """Return an order in words."""
     if command.position_m is None:
         return command.order.value
     return f"{command.order.value} {_place(command.position_m)}"
 
 
 def unready(vehicle: VehicleStatus | None) -> str:
-    """Why the vehicle does not take setpoints; empty if it does."""
+    """Return why the vehicle does not take setpoints; empty if it does."""
     if vehicle is None:
         return "no vehicle is heard"
     if not vehicle.armed:
@@ -136,12 +136,12 @@ def _place(position_m: Vec3) -> str:
 # One question to the solver, and what may fly of its answer.
 
 
-# What arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
+# Errors that arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
 
 
 class SolveOutcome(msgspec.Struct, frozen=True):
-    """How a solve ended; `plan` is there only if it may fly."""
+    """Outcome of a solve; `plan` is there only if it may fly."""
 
     status: SolveStatus
     plan: Plan | None
@@ -215,7 +215,7 @@ def _rows(values: Array) -> Matrix:
     return tuple(map(tuple, values.tolist()))
 
 
-# Who flies in a tick: nobody yet, a plan (fresh, or played out), or the fallback.
+# Choice of what flies in a tick: nothing yet, a plan (fresh, or played out), or the fallback.
 
 
 class Tick(msgspec.Struct, frozen=True, eq=False):
@@ -231,7 +231,7 @@ class Tick(msgspec.Struct, frozen=True, eq=False):
 
 
 class Choice(msgspec.Struct, frozen=True, eq=False):
-    """What a tick decided."""
+    """Decision of a tick, with the state after it."""
 
     state: ControlState
     reason: str
@@ -253,7 +253,7 @@ _FINAL = {
 
 
 def place(state: ControlState, inp: StepInput, history: FilterHistory, controller: Controller) -> Tick:
-    """The tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt).
+    """Place a tick on the grid, with the estimate and the age of information (Δt boundary - capture, in whole Δt).
 
     The age counts what had been captured by the boundary, also in a tick after it: a boundary that was missed is
     decided as it would have been then.
@@ -274,7 +274,7 @@ def place(state: ControlState, inp: StepInput, history: FilterHistory, controlle
 
 
 def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
-    """Who flies: nobody yet, the plan, or the fallback."""
+    """Decide what flies: nothing yet, the plan, or the fallback."""
     if state.fallback is not None and state.fallback.ended:
         return _fall(state, state.fallback, tick, inp, controller, "handed over")
     why_not = unready(inp.vehicle)
@@ -310,7 +310,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
 
 
 def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
-    """The decision of a Δt boundary, with a vehicle that takes setpoints."""
+    """Decide at a Δt boundary, with a vehicle that takes setpoints."""
     at_ns = inp.at_ns
     if tick.age_steps is None:
         never = tick.estimate is None
@@ -339,7 +339,7 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
 
 
 def _begins(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Belief | None:
-    """What a plan begins with: what is believed of where the first input that is sent now begins to act."""
+    """Return the belief that a plan begins with: for the time at which an input that is sent now begins to act."""
     if inp.at_ns == tick.boundary_ns and not controller.dead_ns:
         return tick.belief
     return belief_ahead(controller.kalman, tick.history, state.coming, tick.boundary_ns, controller.dead_ns)
@@ -443,13 +443,13 @@ def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
 
 
 # Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
-# nothing would tell that they err. Of positions five times a second of which 60 % are lost one in ten is older.
+# nothing would tell that they err. With five positions a second and 60 % of them lost, one in ten is older.
 PLANNED_NS = 1_000_000_000
 RECKONS_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 
 
 def reckons(fallback: Fallback, tick: Tick) -> bool:
-    """Whether the vehicle's own inertial data carry an estimate on that nothing speaks against."""
+    """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
     belief = tick.belief
     if belief is None or belief.felt_ns is None or belief.doubted_ns is not None or fallback.final:
         return False
@@ -457,9 +457,9 @@ def reckons(fallback: Fallback, tick: Tick) -> bool:
 
 
 def held_mps2(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Vec3:
-    """What has to be sent for the vehicle not to accelerate: against the bias, where that is known; else zero."""
+    """Return the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
     bias = fb.learnt(state.biases)
-    # A bias of while no position came may be an error of the inertial data, and would be flown for seconds: it counts
+    # A bias learnt without positions may be an error of the inertial data, and would be flown for seconds: it counts
     # where the vehicle's own velocity would contradict.
     told = envelope.witness(state.watching, inp.motion, inp.at_ns) is not None
     if told and tick.estimate is not None and reckons(fallback, tick):
@@ -485,12 +485,12 @@ def moving_mps(state: ControlState, tick: Tick, inp: StepInput, controller: Cont
 
 
 def _nonsense(state: ControlState) -> bool:
-    """Whether all that has come of late is further out than any position can be."""
+    """Whether all recent positions are further out than any position can be."""
     return state.trust.absurd is not None and state.trust.absurd.likely
 
 
 def _misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
-    """Whether a plan that plays out is made of what was not so."""
+    """Whether a plan that plays out was made from an estimate that proved wrong."""
     if controller.envelope is None or tick.estimate is None or (tick.age_steps or 0) < PLAYED_OUT_STEPS:
         return False
     seen = seen_of(tick, inp, state.accel_mps2, controller.plant)
@@ -506,7 +506,7 @@ def seen_of(
     *,
     braking: bool = False,
 ) -> envelope.Observation:
-    """What the envelope may know of a tick."""
+    """Return the data of a tick that the envelope is checked against."""
     position, speed = None, (math.nan, math.nan, math.nan)
     if tick.estimate is not None:
         mean = tick.estimate.mean
@@ -523,7 +523,7 @@ def seen_of(
 
 
 def back_mps2(state: ControlState, tick: Tick, controller: Controller) -> Vec3:
-    """What brings a vehicle that holds by its inertial data back to where it began to; else zero."""
+    """Return the acceleration [m/s²] that brings a vehicle back to where its hold by inertial data began; else zero."""
     fallback, estimate = state.fallback, tick.estimate
     if fallback is None or fallback.mode is not ControlMode.HOLD or state.held_m is None or estimate is None:
         return ZERO
@@ -535,12 +535,12 @@ def back_mps2(state: ControlState, tick: Tick, controller: Controller) -> Vec3:
 
 
 def position(estimated: Estimate | None, plant: Plant) -> Vec3:
-    """Predicted position, zero in the axes that the plant has not."""
+    """Return the predicted position, zero in the axes that the plant lacks."""
     return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.position_index, 0.0)
 
 
 def velocity(estimated: Estimate | None, plant: Plant) -> Vec3:
-    """Predicted velocity, zero in the axes that the plant has not."""
+    """Return the predicted velocity, zero in the axes that the plant lacks."""
     return ZERO if estimated is None else _vec3(plant, estimated.mean, plant.velocity_index, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The envelope in flight: what is believed is held against what is possible, whoever estimates and whoever plans.
+"""The envelope in flight: checks the estimate against what is physically possible, whoever estimates and whoever plans.
 
 Each tick of a flight, four questions:
 
@@ -76,13 +76,13 @@ _TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 @dataclass(frozen=True)
 class EnvelopeParameters:
-    """What is possible; vectors are north, east, down."""
+    """Bounds of what is physically possible in flight; vectors are north, east, down."""
 
     axes: tuple[bool, ...]  # which axes the plant has; the others are not looked at
     lower_m: Vec3  # position limits; minus infinity where there is none
     upper_m: Vec3  # the same, infinity where there is none
-    outside_m: Vec3  # how far beyond them the vehicle may be
-    brake_mps2: Vec3  # what it can brake with
+    outside_m: Vec3  # distance beyond them that the vehicle may be at
+    brake_mps2: Vec3  # largest deceleration when braking
     lag_s: Vec3  # time constant from setpoint to acceleration
     unexplained_mps2: float  # acceleration that positions may show beside what was sent: wind, and the model's error
     disagreement_mps: float  # difference between the velocity that positions show and the vehicle's own
@@ -91,7 +91,7 @@ class EnvelopeParameters:
 
 
 class Breach(msgspec.Struct, frozen=True):
-    """What cannot be: an event's code, and the cause in words."""
+    """Observation that is physically impossible: an event's code, and the cause in words."""
 
     code: str
     text: str
@@ -101,14 +101,14 @@ ABSURD = Breach(OUTSIDE, "all positions are further out than any can be, as if t
 
 
 class Observation(msgspec.Struct, frozen=True):
-    """What the envelope may know of a tick."""
+    """Data of a tick that the envelope is checked against."""
 
     at_ns: int  # the tick [ns]
     samples: Sequence[PositionSample]  # positions that were believed in this tick
     sent_mps2: Vec3  # setpoint that acts since the tick before
-    position_m: Vec3 | None  # estimated position; NaN in axes that the plant has not
+    position_m: Vec3 | None  # estimated position; NaN in axes that the plant lacks
     velocity_mps: Vec3  # estimated velocity, the same
-    motion: VehicleMotion | None  # what the vehicle itself says
+    motion: VehicleMotion | None  # motion by the vehicle's own estimate
     braking: bool  # whether the fallback brakes
 
 
@@ -118,11 +118,11 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
     at_ns: int  # its capture time [ns]
     mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
     cov: Array  # (3, 3) of one axis; those of all axes are alike
-    accel_mps2: Array  # what the setpoints so far make the vehicle accelerate by, behind its lag (3,)
+    accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
-    """What one tick leaves to the next while we fly."""
+    """State of the envelope check that one tick leaves to the next while we fly."""
 
     observer: Observer | None = None  # None before the first position
     tick_ns: int | None = None  # the last tick
@@ -150,7 +150,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def answered(self) -> bool:
-        """Whether positions have been held against a flight for so long that they are those of this vehicle."""
+        """Whether positions have agreed with the flight for so long that they must be those of this vehicle."""
         began_ns, tick_ns = self.began_ns, self.tick_ns
         return began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS
 
@@ -162,7 +162,7 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
     """Take a tick in which we fly.
 
     Args:
-        watching: What the tick before left; `NOT_WATCHING` where a flight begins.
+        watching: State that the tick before left; `NOT_WATCHING` where a flight begins.
     """
     seen = _shown(seen, parameters)
     watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
@@ -178,7 +178,7 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
 def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
     """The vehicle's own velocity where it may be braked on; None where it does not come, or nothing speaks for it.
 
-    For it speak positions that agreed with it, the velocity that is predicted, and what was sent since a flight began.
+    Evidence for it: positions that agreed with it, the predicted velocity, and what was sent since a flight began.
 
     Args:
         seen: The tick; with the velocity that is predicted.
@@ -216,18 +216,18 @@ def contradicts(watching: Watching, seen: Observation, age_s: float, parameters:
 
 
 def witness(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
-    """The vehicle's own velocity, where positions have agreed with it of late; else None."""
+    """Return the vehicle's own velocity where recent positions agree with it; else None."""
     return None if watching.contradicted or watching.apart_mps is None else own_words(motion, at_ns)
 
 
 def _near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
-    """Whether no axis is further apart, of those that are known."""
+    """Whether no known axis is further apart."""
     pairs = zip(velocity, known, strict=True)
     return all(abs(own - value) <= within_mps for own, value in pairs if not math.isnan(value))
 
 
 def _gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
-    """What gusts can have made of a velocity meanwhile."""
+    """Return how far gusts can have changed a velocity in `for_s` [m/s]."""
     return GUSTS * parameters.unexplained_mps2 * for_s
 
 
@@ -253,7 +253,7 @@ def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
 
 
 def own_words(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
-    """The vehicle's own velocity; None where it is silent, or says what is no number."""
+    """The vehicle's own velocity; None where it is silent or not finite."""
     if motion is None or motion.velocity_mps is None or motion.velocity_ns is None:
         return None
     fresh = at_ns - motion.velocity_ns <= MOTION_NS
@@ -296,7 +296,7 @@ def _flown_on(watching: Watching, tick_ns: int | None, seen: Observation, parame
 def _position(
     watching: Watching, sample: PositionSample, seen: Observation, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
-    """Take one believed position, if it is newer than those before by enough to tell something."""
+    """Take one believed position, if it is enough newer than those before to tell something."""
     at_ns, position = min(sample.captured_ns, sample.received_ns), np.array(sample.position_m)
     before = watching.observer
     if before is None or seen.at_ns - before.at_ns >= TOLD_NS:
@@ -337,7 +337,7 @@ def _position(
 def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: EnvelopeParameters) -> Observer:
     """The observer at a first position: with the velocity that was sent since the flight began.
 
-    After a long silence, of which not all that was sent is remembered, nobody knows what gusts have made of it either.
+    After a silence too long for all setpoints to be remembered, the effect of gusts is not known either.
     """
     mean, accel = np.zeros((3, 3)), np.zeros(3)
     speed_mps = parameters.unexplained_mps2
@@ -368,7 +368,7 @@ def _predicted(
             continue
         s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
         gone = np.exp(-s / lag_s)
-        behind = (accel - u) * lag_s * (1.0 - gone)  # what the lag adds to the velocity
+        behind = (accel - u) * lag_s * (1.0 - gone)  # velocity that the lag adds
         position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lag_s * ((accel - u) * s - behind)
         velocity = velocity + s * (u + unexplained) + behind
         accel = u + (accel - u) * gone
@@ -388,7 +388,7 @@ def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec
 
 
 def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Take a position; an innovation counts up to a bound, and whether it was beyond."""
+    """Take a position, its innovation clipped to a bound; return too whether it was beyond."""
     noise = max(std_m, POSITION_STD_M) ** 2
     variance = float(observer.cov[0, 0]) + noise
     bound = CLIP * math.sqrt(variance)
@@ -403,7 +403,7 @@ def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Obser
 
 
 def _unexplained(observer: Observer) -> Array:
-    """Unexplained acceleration (3,) once as much of it as can be drag is taken away."""
+    """Return the unexplained acceleration (3,) without the part that can be drag."""
     _, velocity, unexplained = observer.mean
     along = float(velocity @ velocity)
     drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
@@ -444,9 +444,9 @@ def lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] | None:
 def _compared(
     watching: Watching, at_ns: int, position: Array, hinted: bool, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
-    """Compare the way that positions have come with the one that the vehicle says it has flown.
+    """Compare the way that positions show with the one that the vehicle says it has flown.
 
-    Where the observer too has a hint of something amiss, that has not to persist.
+    Where the observer too has a hint of something amiss, a difference need not persist.
     """
     flown = _flown(watching.way, at_ns)
     kept = (one for one in watching.offsets if one[0] > at_ns - parameters.window_ns)
@@ -473,7 +473,7 @@ def _compared(
 
 
 def _unresolved(watching: Watching, seen: Observation) -> Breach | None:
-    """What is to be made of velocities that contradicted each other where no position comes that tells any more."""
+    """Return a breach if velocities contradicted each other and no position has come for too long to settle it."""
     if watching.apart_ns is None or seen.at_ns - watching.apart_ns < UNRESOLVED_NS:
         return None
     return Breach(VELOCITY, "positions moved otherwise than the vehicle itself says, and none has come since")
@@ -482,7 +482,7 @@ def _unresolved(watching: Watching, seen: Observation) -> Breach | None:
 def _off(
     places: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameters
 ) -> tuple[tuple[float, Array] | None, tuple[tuple[int, Array], ...]]:
-    """In which time (s) positions have left the vehicle's own way too far, and how far (3,) [m]; and the places."""
+    """Return over which time [s] positions left the vehicle's own way too far, and how far (3,) [m]; and the places."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
     place: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
     places = places[bisect_right(places, at_ns - WAYS_NS, key=_TIME) :]
@@ -506,9 +506,10 @@ def _slope(offsets: tuple[tuple[int, Array], ...], parameters: EnvelopeParameter
 
 
 def _explained(apart: Array, way: tuple[tuple[int, Array], ...], offsets: tuple[tuple[int, Array], ...]) -> Array:
-    """What is left of a difference of velocities (3,) once as much of it as stamps that are late make is taken away.
+    """Return a difference of velocities (3,) without the part that late stamps explain.
 
-    They make the acceleration meanwhile, by the way that the vehicle says it has flown, times how late they are.
+    Late stamps make a difference of the acceleration meanwhile, by the way that the vehicle says it has flown, times
+    how late they are.
     """
     (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
     begin, middle, end = (_flown(way, at_ns) for at_ns in (begin_ns, (begin_ns + end_ns) // 2, end_ns))
@@ -575,7 +576,7 @@ def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
 
 
 def _braking(watching: Watching, seen: Observation) -> tuple[Watching, Breach | None]:
-    """Whether braking brakes, by the vehicle's own velocity."""
+    """Whether braking slows the vehicle down, by its own velocity."""
     velocity = own_words(seen.motion, seen.at_ns)
     if not seen.braking:
         return replace(watching, braking=None), None

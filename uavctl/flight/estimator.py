@@ -26,7 +26,7 @@ TOO_OLD = "sample-too-old"
 # further off says nothing of the capture. A constant, as a tick may be of any length.
 LATEST_STAMP_NS = 20_000_000
 
-# Order of what happens at one instant; a sample sees the input before its change, which is the same state.
+# Order of what happens at one instant; a sample comes before a change of input, which leaves the state the same.
 _SAMPLE, _FELT, _INPUT, _MARK = 0, 1, 2, 3
 
 Coming = tuple[tuple[int, Array | None], ...]  # (when it begins to act [ns], input), oldest first
@@ -35,7 +35,7 @@ _KEY = attrgetter("key")
 
 
 class Node(msgspec.Struct, frozen=True, eq=False):
-    """What is known after an entry: the belief (None before the first sample) and the input that acts.
+    """State of the filter after an entry: the belief (None before the first sample) and the input that acts.
 
     The input is None while others fly the vehicle.
     """
@@ -60,12 +60,12 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 
     origin_ns: int  # A boundary of the Δt grid [ns]
     horizon_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
-    anchor: Node  # what was known at the horizon
-    entries: tuple[FilterEvent, ...] = ()  # what happened since, sorted by key
+    anchor: Node  # state of the filter at the horizon
+    entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
 
     @property
     def newest(self) -> Node:
-        """What is known after everything."""
+        """State of the filter after all entries."""
         return self.entries[-1].after if self.entries else self.anchor
 
     @property
@@ -123,9 +123,9 @@ def absorb(
 
 
 def feel(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
-    """Take the inertial data of a tick as what they are in the mean, at the mean of their times.
+    """Take the mean of a tick's inertial data, at the mean of their times.
 
-    One that is no number, or that says to the last bit what the one before did, says nothing.
+    Data that are not finite, or equal to the last bit to the ones before, are ignored.
     """
     told = [one for one, before in zip(samples, (None, *samples), strict=False) if _says_something(one, before)]
     if not told or not kalman.n_felt:
@@ -238,7 +238,7 @@ def estimate(kalman: Kalman, history: FilterHistory, at_ns: int) -> Estimate | N
 
 
 def estimated(kalman: Kalman, belief: Belief) -> Estimate:
-    """What a belief says to others."""
+    """Return a belief as the estimate that leaves the filter, biases within their bounds."""
     bias, largest = kalman.bias, np.array(kalman.bias_bounds)
     return Estimate(
         at_ns=belief.at_ns,
@@ -280,7 +280,7 @@ def coasted(kalman: Kalman, history: FilterHistory, belief: Belief, at_ns: int) 
 
 
 def _known(history: FilterHistory, at_ns: int) -> Node:
-    """What was known after all that had happened by `at_ns`."""
+    """Return the state of the filter after all that had happened by `at_ns`."""
     for entry in reversed(history.entries):  # one of the newest, as a rule
         if entry.key[0] <= at_ns:
             return entry.after
@@ -317,7 +317,7 @@ def _trimmed(history: FilterHistory, horizon_ns: int) -> FilterHistory:
 
 
 def _after(kalman: Kalman, origin_ns: int, node: Node, entry: FilterEvent, belief: Belief | None = None) -> Node:
-    """What is known after an entry; `belief` is the prediction for it, if that has been asked."""
+    """Return the state of the filter after an entry; `belief` is the prediction for it, if it is there already."""
     if belief is None and node.belief is not None:
         belief = predicted(kalman, origin_ns, node.belief, node.input, entry.key[0])
     if entry.sample is not None:

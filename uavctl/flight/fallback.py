@@ -1,4 +1,4 @@
-"""What flies when no plan may: brake, zero acceleration, the vehicle's own landing.
+"""Fallback that flies when no plan may: brake, zero acceleration, the vehicle's own landing.
 
 A state machine of four modes, each with a time limit:
 
@@ -41,7 +41,7 @@ LATELY_NS = 3_000_000_000  # as far as it has been there for all of this time
 
 @dataclass(frozen=True)
 class FallbackParameters:
-    """How the fallback acts."""
+    """Parameters of the fallback."""
 
     brake_gain_1ps: float  # deceleration per predicted speed [1/s]
     brake_s: float  # longest time of braking [s]
@@ -52,7 +52,7 @@ class FallbackParameters:
 
 
 class FallbackEnd(IntEnum):
-    """What the fallback ends in; a greater one overrides a smaller one, and there is no way back to a smaller one."""
+    """End of the fallback; a greater one overrides a smaller one, and there is no way back to a smaller one."""
 
     RECOVER = auto()  # plans, once positions are back; until then as configured
     BARRED = auto()  # positions are not believed any more: as configured, and plans never again
@@ -67,7 +67,7 @@ class Fallback:
 
     mode: ControlMode  # BRAKE, HOLD, LAND or STOPPED
     since_ns: int  # when this mode was entered [ns]
-    end: FallbackEnd = FallbackEnd.RECOVER  # what it ends in
+    end: FallbackEnd = FallbackEnd.RECOVER  # end of the fallback
     held_ns: int | None = None  # when it first held [ns]; None before
 
     @property
@@ -176,7 +176,7 @@ Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), o
 
 
 def learnt(biases: Biases) -> Vector:
-    """The part of a bias (n_u,) that has been there all the time of late; zero of one that is not known for long.
+    """Return the part of a bias (n_u,) that has lasted through recent time; zero if it has not been known for long.
 
     In the first seconds, and where the vehicle does not answer as the model says, an estimated bias comes and goes with
     what is flown; blind, its acceleration would be flown for seconds.

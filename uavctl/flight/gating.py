@@ -41,12 +41,12 @@ from uavctl.records import PositionSample, StepInput, VehicleStatus
 INVALID = "sample-invalid"
 FUTURE = "sample-future"
 
-# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves it most of them.
+# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves most of them to it.
 _FRESH_PART = 3
 
 
 class SourceHealth(msgspec.Struct, frozen=True, eq=False):
-    """What is known of the sources."""
+    """Health of the position sources: what is known and suspected of them."""
 
     suspect: OutlierTrack | None = None  # samples that the vehicle cannot have come to and that agree; None without any
     absurd: OutlierTrack | None = (
@@ -54,20 +54,20 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     )
     # How wrong the velocity may be, each axis of the plant [m/s]; None before it was held against one
     doubt_mps: Array | None = None
-    watches: Watches = msgspec.field(default_factory=dict)  # what each source has said
+    watches: Watches = msgspec.field(default_factory=dict)  # record of each source
     moved_ns: Moved = (0, 0, 0)  # when the vehicle last moved north, east and down, as far as it says so [ns]
 
 
 class MeasurementUpdate(msgspec.Struct, frozen=True, eq=False):
-    """What came of a tick's samples."""
+    """Result of looking at a tick's samples."""
 
     history: FilterHistory  # the estimator with them
-    trust: SourceHealth  # what is known of the sources
+    trust: SourceHealth  # health of the sources
     moved: bool  # A source has moved: positions are not to be believed any more
     absurd: bool  # it says what cannot be for so long that the same holds, for whoever flies
     accepted: tuple[PositionSample, ...]  # the samples taken
     refused: tuple[tuple[PositionSample, str], ...]  # those that were not, each with the reason (an event's code)
-    clean_ns: int | None  # what was captured after this was believed and has been taken back; None if nothing was [ns]
+    clean_ns: int | None  # samples captured after this have been taken back; None if none were [ns]
     fresh: int  # fresh samples in a row, up to now
 
 
@@ -82,7 +82,7 @@ def take(
     Here this is seen of boundaries between two captures (their ticks may have been missed), in `step` of the last one.
 
     Args:
-        trust: What is known of the sources, before.
+        trust: Health of the sources, before.
         horizon: H, the steps that a plan bridges.
         fresh: Fresh samples in a row, before.
     """
@@ -134,7 +134,7 @@ def _fresh_in_row(
 
 
 class _Believed(msgspec.Struct, frozen=True, eq=False):
-    """What came of samples that were looked at one after another; the fields are those of `MeasurementUpdate`."""
+    """Result of looking at samples one after another; the fields are those of `MeasurementUpdate`."""
 
     history: FilterHistory
     trust: SourceHealth
@@ -179,7 +179,7 @@ def _believe(kalman: Kalman, reach: Reach, history: FilterHistory, trust: Source
 
 
 def _said_since(source: str, first_ns: int) -> Callable[[PositionSample], bool]:
-    """What a source has said since `first_ns`, and then."""
+    """Return a test for samples that `source` captured at `first_ns` or later."""
     return lambda sample: sample.source == source and captured_ns(sample) >= first_ns
 
 
@@ -201,11 +201,11 @@ def _unstuck(
 
 
 class _Distrust(msgspec.Struct, frozen=True, eq=False):
-    """What is known of the sources with one more sample."""
+    """Health of the sources after one more sample, and whether that sample is believed."""
 
-    trust: SourceHealth  # that
+    trust: SourceHealth  # health of the sources
     reason: str | None  # why the sample is not believed; None if it is
-    stuck_ns: int | None = None  # when its source first said what it says, where that is to be taken back [ns]
+    stuck_ns: int | None = None  # time at which its source first gave this value, where that is to be taken back [ns]
 
 
 def _distrust(
@@ -217,7 +217,7 @@ def _distrust(
     sample: PositionSample,
     belief: Belief,
 ) -> _Distrust:
-    """What is known of the sources with one more sample; `belief` is the prediction for its capture time."""
+    """Return the health of the sources after one more sample; `belief` is the prediction for its capture time."""
     at_ns = captured_ns(sample)
     values, variances = shown_by(kalman, sample)
     off = values - belief.mean[kalman.shown[: len(values)]]
@@ -254,7 +254,7 @@ def _flies(vehicle: VehicleStatus | None) -> bool:
 
 
 def _moved_ns(before_ns: Moved, inp: StepInput, at_rest_mps: float) -> Moved:
-    """When it last moved, as far as it says so; a vehicle that says nothing moves."""
+    """Return when the vehicle last moved in each axis, by its own word; one that says nothing counts as moving."""
     velocity = own_words(inp.motion, inp.at_ns) or (math.inf,) * 3
     rows = zip(before_ns, velocity, strict=True)
     north, east, down = (ns if abs(v) < at_rest_mps else inp.at_ns for ns, v in rows)
@@ -262,7 +262,7 @@ def _moved_ns(before_ns: Moved, inp: StepInput, at_rest_mps: float) -> Moved:
 
 
 def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:
-    """Why a sample does not count, as an event's code; None if it does.
+    """Return why a sample does not count, as an event's code; None if it does.
 
     Args:
         sample: The sample, after frame and clock conversion.
@@ -282,7 +282,7 @@ def refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters)
 
 
 def _far_out(sample: PositionSample, kalman: Kalman) -> bool:
-    """Whether a position is a number, and further out than any can be, as in another unit."""
+    """Whether a position is finite, but further out than any can be, as in another unit."""
     return all(map(math.isfinite, sample.position_m)) and not _plausible(
         sample.position_m, kalman.parameters.max_position_m
     )

@@ -106,14 +106,14 @@ AGREES_NS = 1_000_000_000  # after the position before, a position that agrees s
 # model's errors in it: in a silence a vehicle that said nothing itself was flown 6 m out against a wind that was none.
 # So it drifts a tenth as fast while no inertial data are used, and from so long after the newest ones on.
 UNFELT_DRIFT, UNFELT_NS = 0.1, 1_000_000_000
-# The first ones are not refused for a bias that nobody could know: a flight that begins in a wind would doubt them.
+# The first ones are not refused for a bias that nobody can know yet: a flight that begins in wind would doubt them.
 SETTLES_NS = 40_000_000_000  # in which covariances settle
 RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
 
 
 @dataclass(frozen=True)
 class EstimatorParameters:
-    """What the filter believes of its samples."""
+    """Parameters of the estimator: what it assumes of samples, biases and inertial data."""
 
     position_std_m: float  # least standard deviation of a position sample, each axis [m]; a sample may claim more
     velocity_std_mps: float  # standard deviation of a velocity sample, each axis [m/s]
@@ -147,8 +147,8 @@ class Kalman:
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
     shown: NDArray[np.intp]  # state index of each axis' position, then of each axis' velocity
     parameters: EstimatorParameters  # noise and window
-    felt_z: Array  # what inertial data show of z (n_felt, n_x + n_w)
-    felt_u: Array  # what they show of the input (n_felt, n_u)
+    felt_z: Array  # measurement matrix of inertial data for z (n_felt, n_x + n_w)
+    felt_u: Array  # the same for the input (n_felt, n_u)
     felt_noise: Array  # covariance of their noise (n_felt, n_felt)
     pushed: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
     identity: Array  # of the size of z
@@ -160,7 +160,7 @@ class Kalman:
 
     @property
     def bias(self) -> slice:
-        """Where the biases are among the states."""
+        """Slice of the biases among the states."""
         return slice(self.n_x - self.n_felt - self.n_bias, self.n_x - self.n_felt)
 
 
@@ -242,7 +242,7 @@ def settled_cov(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
 
 
 def captured_ns(sample: PositionSample) -> int:
-    """Capture time that is believed: never after the arrival, where a clock offset's error may put the stamp."""
+    """Capture time that counts: never after the arrival, where a clock offset's error may put the stamp."""
     return min(sample.captured_ns, sample.received_ns)
 
 
@@ -364,7 +364,7 @@ def _widen(cov: Array, index: NDArray[np.intp], variance: float) -> None:
 
 
 def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> Belief:
-    """Kalman update with an acceleration (n_felt,) under an input (n_u,); without it where it cannot be so.
+    """Kalman update with an acceleration (n_felt,) under an input (n_u,); left out where it is implausible.
 
     Raises:
         ValueError: The filter uses no inertial data.

@@ -19,7 +19,7 @@ from uavctl.records import LinkEstimate
 
 @dataclass(frozen=True)
 class LinkEstimateParameters:
-    """What the estimate goes by."""
+    """Parameters of the link estimate."""
 
     promised: float  # the least p(k) that the design counts on
     half_life_steps: float = 100.0  # an observation this old counts half [steps]
@@ -33,7 +33,7 @@ class LinkEstimateParameters:
 
 
 class LinkBelief(msgspec.Struct, frozen=True):
-    """What one boundary leaves to the next: forgotten counts."""
+    """Counts that one boundary leaves to the next; old observations are forgotten gradually."""
 
     arrived: float = 0.0  # steps with news
     lost: float = 0.0  # steps without
@@ -68,7 +68,7 @@ def observe(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameter
 
 
 def report(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
-    """What is believed at `at_ns`.
+    """Return the link estimate at `at_ns`.
 
     The mean is that of Jeffreys' prior, Beta(½, ½), and the counts' posterior, whose quantiles hold their level on
     the average only. The bounds add another half step, to the losses for the lower one, to the arrivals for the
@@ -122,13 +122,13 @@ def _correlation(belief: LinkBelief) -> float:
     return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
 
 
-# How well a share of losses is known that come in runs.
+# Precision of a share of losses where they come in runs.
 
 
 def loss_std(missing: NDArray[np.int64]) -> float:
     """Standard error of the share of losses, each run of arrivals with the losses after it counted as one draw.
 
-    Losses in bursts tell less than as many that are each by themselves.
+    Losses in bursts tell less than as many single ones.
 
     Args:
         missing: how many are missing after each one that came.

@@ -1,4 +1,4 @@
-"""Where to fly to, step by step: waypoints, a trajectory, limits that change in time. Pure.
+"""Mission of a flight, step by step: waypoints, a trajectory, limits that change in time. Pure.
 
 Time counts from the first decision with a vehicle that takes setpoints, and runs on from there. That decision is at a
 Δt boundary, and so is every other: a trajectory is met at its own samples only.
@@ -51,7 +51,7 @@ class Fence:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Where the plant may rest, and where it comes to rest."""
+    """Places where the plant may rest, and the place where a state comes to rest."""
 
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
     lower: Array  # least place to rest at of each axis (n_axes,) [m]: the terminal set fits the limits there
@@ -60,7 +60,7 @@ class Room:
     stop: Array  # place (n_axes, n_x) at which a state comes to rest by inputs that brake, as a linear map of it
 
     def refusal(self, position_m: Vec3) -> str:
-        """Why nothing may rest at a place; empty if it may."""
+        """Return why nothing may rest at a place; empty if it may."""
         for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
             if not lower <= position_m[axis] <= upper:
                 return f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
@@ -99,7 +99,7 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """What is asked for in a flight; constant."""
+    """Mission of a flight as configured; constant."""
 
     waypoints: tuple[Waypoint, ...]  # at least one; a trajectory takes their place
     accept_m: float  # A waypoint is reached when the estimate is this near [m]
@@ -107,7 +107,7 @@ class Mission:
     limits: Array  # right sides of the state set's rows (m_x,)
     horizon: int  # H [steps]
     dt_ns: int  # δt [ns]
-    room: Room | None  # where the operator may send the vehicle to; None if the plant cannot rest wherever it is sent
+    room: Room | None  # places that the operator may send the vehicle to; None if the plant cannot rest everywhere
     trajectory: Trajectory | None = None  # the motion to follow; None to fly to the waypoints
     fences: tuple[Fence, ...] = ()  # moving limits
     land: bool = False  # whether to land at the end; else the last place is held
@@ -126,7 +126,7 @@ class Lead:
 
 @dataclass(frozen=True)
 class MissionState:
-    """How far a mission has come."""
+    """Progress of a mission."""
 
     start_ns: int  # its time zero [ns]
     waypoint: int = 0  # number of the waypoint flown to, from 0
@@ -134,7 +134,7 @@ class MissionState:
     stay: Vector | None = None  # equilibrium (n_x,) that the operator ordered instead; None on the mission
     left_ns: int | None = None  # when the mission was left for that [ns]; None on the mission
     paused_ns: int = 0  # time that a trajectory has stood still for orders [ns]; fences move on all the same
-    led: Lead | None = None  # how the first motion began; None before it
+    led: Lead | None = None  # beginning of the first motion; None before it
 
 
 def advance(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:
@@ -268,10 +268,10 @@ def hold(
 # A motion that the plant can make, nearest to positions over time, and plans along it that end at rest.
 
 
-# What a change of input costs beside a miss of the position that it makes within a step. Without it the inputs
+# Cost of a change of input beside a miss of the position that it makes within a step. Without it the inputs
 # would ring: a sampled plant with more than two integrations cannot follow every sample with a steady hand.
 _CALM = 1e-2
-# Keeps the system regular where a state is seen by nothing; moves nothing that is.
+# Keeps the system regular where nothing shows a state; moves nothing that is shown.
 _REGULAR = 1e-12
 _FIRM = 1e3  # metres of a missed position that a unit of a state is worth that a motion begins without
 # A plan along a motion has to end at rest, and is to leave the motion late: what it does in a stage costs this many
@@ -295,7 +295,7 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Pl
 
     Args:
         plant: The plant; its model without disturbances is kept exactly.
-        positions_m: (n, 3), local NED [m]; axes that the plant has not are ignored.
+        positions_m: (n, 3), local NED [m]; axes that the plant lacks are ignored.
         velocities_mps: (n, 3) [m/s], or None.
 
     """
@@ -330,7 +330,7 @@ def follow(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> Pl
 
 
 def _of_loops(plant: Plant) -> NDArray[np.bool_]:
-    """Which states (n_x,) are of the vehicle's own loops.
+    """Return which states (n_x,) belong to the vehicle's own loops.
 
     They end by themselves: a motion cannot choose to begin with them, and inputs that made them zero at a given stage
     would be large.
@@ -362,7 +362,7 @@ def along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower: Arr
     later = _LATER ** min(plant.dt_s / _STEP_S, 1.0)
     cost = np.asarray(np.kron(np.diag(later ** -np.arange(rest, dtype=np.float64)), np.eye(n_u)))
     rest_x, rest_u = _equilibria(plant)
-    # At rest wherever it comes to be: the part of x_N that is no equilibrium is to vanish.
+    # At rest, wherever that is: the part of x_N that is no equilibrium has to vanish.
     moving, seen = _moving(plant, rest_x), ~_of_loops(plant)
     braked = states[:, rest] - states[:, rest] @ (reach[rest] @ _least(cost, moving @ reach[rest]) @ moving).T
     places = np.clip(braked[:, list(plant.position_index)], lower, upper)
@@ -376,7 +376,7 @@ def along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower: Arr
 
 
 def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
-    """Where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
+    """Return where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
 
     Args:
         lower: Least place to rest at of each axis (n_axes,) [m].
@@ -398,7 +398,7 @@ def room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
 
 
 def _reach(plant: Plant, steps: int) -> Array:
-    """What inputs u_0 … u_{steps-1} do to the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
+    """Return how inputs u_0 … u_{steps-1} act on the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
     reach = np.zeros((steps + 1, plant.n_x, steps * plant.n_u))
     for t in range(steps):
         reach[t + 1] = plant.a @ reach[t]

@@ -33,7 +33,7 @@ _HORIZONS = 2  # the vehicle may be anywhere after that many horizons of silence
 
 @dataclass(frozen=True)
 class GateParameters:
-    """How far positions are believed."""
+    """Parameters of the gate for positions."""
 
     sigma: float  # half-width of the set in standard deviations, beside what inputs can do
     margin_m: float  # and beside both, for what no model says [m]
@@ -68,7 +68,7 @@ class OutlierTrack:
         return self.count >= _SUSPECT_SAMPLES and self.last_ns - self.first_ns >= _SUSPECT_NS
 
     def moved(self, parameters: GateParameters) -> bool:
-        """Whether this is no chance any more: the source has moved, or the estimate is lost."""
+        """Whether chance is ruled out: the source has moved, or the estimate is lost."""
         return self.count >= _SAMPLES and self.last_ns - self.first_ns >= parameters.jump_ns
 
 
@@ -102,7 +102,7 @@ def radius(reach: Reach, kalman: Kalman, belief: Belief, variances: Array, doubt
 
 
 def doubt(reach: Reach, belief: Belief, off_m: Array) -> Array:
-    """How wrong the velocity may be (n_axes,) [m/s] once a sample that was `off_m` the prediction has been believed.
+    """Return how wrong the velocity may be (n_axes,) [m/s] after believing a sample `off_m` away from the prediction.
 
     A filter that knows its inputs takes what is off for a velocity that disturbances made; inputs that it does not know
     of may have made the position and none of that velocity, as far as they can.
@@ -115,7 +115,7 @@ def doubt(reach: Reach, belief: Belief, off_m: Array) -> Array:
 
 
 def _far(reach: Reach, belief: Belief) -> Array:
-    """How far inputs can have carried positions, then velocities, since the newest sample of a belief."""
+    """Return how far inputs can have carried positions, then velocities, since the newest sample of a belief."""
     ticks = -(-(belief.at_ns - belief.captured_ns) // reach.tick_ns)
     return reach.far[ticks] if ticks < len(reach.far) else np.full(reach.far.shape[1], np.inf)
 
@@ -123,7 +123,7 @@ def _far(reach: Reach, belief: Belief) -> Array:
 def judge(
     suspect: OutlierTrack | None, at_ns: int, off: Array, width: Array, n_axes: int
 ) -> tuple[bool, OutlierTrack | None]:
-    """Whether a sample may count, and who is suspected after it.
+    """Judge whether a sample may count, and which samples are suspected after it.
 
     Args:
         at_ns: Capture time of the sample [ns].
@@ -157,8 +157,8 @@ def judge(
 #
 # The resolution is the smallest change that the source has shown.
 #
-# Of a vehicle that says itself that it is at rest cameras that round say the same again and again: they are believed,
-# as of one on the ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of what
+# Cameras that round repeat their value while a vehicle is at rest by its own word: they are believed,
+# as with one on the ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of what
 # they say (where we know that, it is not asked at all).
 #
 # Until that is known a value that comes again says nothing new, and is not believed where it would do harm: where the
@@ -192,7 +192,7 @@ Moved = tuple[int, int, int]  # when the vehicle last moved north, east and down
 
 
 class Watch(msgspec.Struct, frozen=True, eq=False):
-    """What a source has said."""
+    """Record of what one source has said."""
 
     at_ns: int  # capture time of its newest sample [ns]
     position_m: Vec3  # what that said
@@ -217,30 +217,30 @@ class Watch(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def as_usual(self) -> bool:
-        """Whether this source says its values so often."""
+        """Whether this source repeats its values that often as a rule."""
         return self.usual >= _USUAL and self.repeats < _REPEATS
 
     @property
     def stale_since_ns(self) -> int:
-        """Capture time from which on it said what was no news [ns].
+        """Capture time from which on its samples were repeats [ns].
 
-        The value that first came may be an older one already, which was lost when it was new; not where no sample was.
+        The value's first sample may itself be a repeat, if one before it was lost; not where no sample was lost.
         """
         known = self.changes + self.repeats > _SPACINGS
         return self.first_ns + (known and self.gap_ns < _GAP * self.spacing_ns)
 
     @property
     def unlike_it(self) -> bool:
-        """Whether the value has come again a few times, and this source does not do so."""
+        """Whether the value has come again a few times, which is unusual for this source."""
         return 0 < self.repeats <= _REPEATS and not self.as_usual
 
     @property
     def grain_m(self) -> float:
-        """The resolution; of a few changes only as far as no motion is taken for it [m]."""
+        """The resolution; after only a few changes it is bounded, so that no motion is taken for it [m]."""
         return self.resolution_m if self.changes >= _ENOUGH else min(self.resolution_m, _GRAIN_M)
 
     def still_since_ns(self, moved_ns: Moved) -> int | None:
-        """Capture time from which an axis has stood still that noise has moved all the time [ns]; None if none has.
+        """Return since which capture time an axis, moved by noise until then, has stood still [ns]; None if none has.
 
         One that has rested since then, by the vehicle's own word, may stand still.
         """
@@ -260,7 +260,7 @@ Watches = Mapping[str, Watch]
 
 
 def observe(watches: Watches, kalman: Kalman, history: FilterHistory, sample: PositionSample, off_m: Array) -> Watches:
-    """What the sources have said, with one more sample; those that come late say nothing.
+    """Return the records of the sources with one more sample; samples that come late change nothing.
 
     Args:
         history: The estimator before the sample.
@@ -338,5 +338,5 @@ def doubtful(watch: Watch, kalman: Kalman, sample: PositionSample, parameters: G
 
 
 def _noisy(watch: Watch, resolutions: float) -> bool:
-    """Whether what the source said was news so far, of so many resolutions at least."""
+    """Whether the source's samples have been news so far, of at least so many resolutions."""
     return bool(watch.resolution_m) and watch.news_m >= max(_LEAST_NEWS_M, resolutions * watch.resolution_m)

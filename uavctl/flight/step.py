@@ -79,11 +79,11 @@ def at_bound(bias: Sequence[float], bounds: Sequence[float], told: Sequence[int]
 
 
 def bias_events(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_ns: int) -> tuple[Event, ...]:
-    """What has become of it: an event if more inputs are at their bounds than before, and one if none is any more.
+    """Return a warning if the bias of a further input is at its bound, and a note once none is any more.
 
     Args:
         push_mps2: the bias as an acceleration, local NED [m/s²].
-        before: inputs of which was told that they are at their bounds.
+        before: inputs that were already told to be at their bounds.
     """
     if set(now) - set(before):
         pushes = ", ".join(f"{value:+.2f}" for value in push_mps2)
@@ -113,16 +113,16 @@ _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
 class StepOutput(msgspec.Struct, frozen=True):
-    """What a tick gives to the outside."""
+    """Output of a tick."""
 
     estimate: Estimate | None  # state estimate at the tick; None before the first sample
     plan: Plan | None  # A new plan, only if this tick made one
     decision: Decision  # everything that the tick knew and chose
     setpoint: Setpoint | None  # what to send; None for nothing
-    events: tuple[Event, ...]  # what is worth telling
+    events: tuple[Event, ...]  # events worth telling
     land: bool  # ask for the vehicle's own landing, once
     refused: tuple[PositionSample, ...] = ()  # samples that were not believed
-    link: LinkEstimate | None = None  # what is believed of the link; at boundaries that were not missed
+    link: LinkEstimate | None = None  # link estimate; at boundaries that were not missed
 
 
 def initial_state() -> ControlState:
@@ -131,7 +131,7 @@ def initial_state() -> ControlState:
 
 
 def disbelieves(state: ControlState) -> bool:
-    """Whether positions are not believed any more, for good: nobody else is to be told of them either."""
+    """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
     jumped = state.fallback is not None and state.fallback.end is FallbackEnd.BARRED
     if jumped or state.breach is None:
         return jumped
@@ -283,7 +283,7 @@ def _lies(state: ControlState, tick: Tick, inp: StepInput, controller: Controlle
         return False
     if belief.doubted_ns is not None or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
         return False
-    # Both of one time: what the vehicle said a quarter of a second ago is no word on how it moves now.
+    # Both of the same time: what the vehicle said a quarter of a second ago does not tell how it moves now.
     then = belief_at(controller.kalman, tick.history, min(motion.velocity_ns, inp.at_ns))
     if then is None:
         return False
@@ -321,7 +321,7 @@ def _cleaned(intake: MeasurementUpdate, clean_ns: int, controller: Controller) -
 
 
 def _outdated(plan: Plan | None, clean_ns: int | None, *, afresh: bool) -> Plan | None:
-    """The plan that is flown; where it was made of what has been taken back, any estimate is news beside it.
+    """Return the plan that is flown; if it was made from samples now taken back, any estimate is news beside it.
 
     So it is for some steps (`afresh`): the setpoint was far from where the new plan begins, and is slew-limited.
     """
@@ -335,7 +335,7 @@ def _outdated(plan: Plan | None, clean_ns: int | None, *, afresh: bool) -> Plan 
 
 
 def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
-    """The biases of late, without those of what has been taken back, and with that of a boundary with news."""
+    """Return the recent biases, without those from samples taken back, and with that of a boundary with news."""
     biases = state.biases
     if clean_ns is not None:
         biases = tuple(one for one in biases if one[0] <= clean_ns)
@@ -347,7 +347,7 @@ def _biases(state: ControlState, tick: Tick, clean_ns: int | None) -> fb.Biases:
 
 
 def remember(biases: fb.Biases, at_ns: int, bias: Vector) -> fb.Biases:
-    """The biases of late, with one more, from an estimate with a fresh position in it."""
+    """Return the recent biases with one more, from an estimate with a fresh position in it."""
     return (*(one for one in biases if at_ns - one[0] <= fb.LATELY_NS), (at_ns, bias))
 
 
@@ -373,7 +373,7 @@ _LINK_TEXTS = {
 def _link(
     state: ControlState, tick: Tick, at_ns: int, controller: Controller
 ) -> tuple[LinkBelief, LinkEstimate | None]:
-    """Whether a position of the step that ends here has arrived, and what that makes one believe of the link."""
+    """Count the step that ends here for the link; return the counts, and the estimate if this is a boundary on time."""
     if not tick.boundary or tick.age_steps is None or at_ns != tick.boundary_ns:
         return state.link, None
     belief = observe(state.link, tick.age_steps == 0, controller.link)
@@ -381,7 +381,7 @@ def _link(
 
 
 def _alarms(link: LinkEstimate, told: tuple[str, ...]) -> tuple[str, ...]:
-    """What holds of the link; what was told holds until the estimate is on the good side, or it would be told often."""
+    """Return the link alarms that hold; one already told holds on until the estimate is on the good side again."""
     holds = {
         "link-bursts": (link.bursts, link.burst_statistic > 0.0),
         "link-below-promise": (link.below_promise, link.arrival_mean < link.promised),
@@ -413,7 +413,7 @@ ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for 
 
 
 def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> str:
-    """How it is with the vehicle's inertial data, as an event's code; empty where that is nothing to us."""
+    """Return the state of the vehicle's inertial data as an event code; empty if none are used or we do not fly."""
     belief, flown = tick.history.newest.belief, mode_of(state) not in _NOT_FLOWN and _is_ours(inp.vehicle)
     if not controller.kalman.n_felt or belief is None or not flown:
         return ""
@@ -424,7 +424,7 @@ def _inertial(state: ControlState, tick: Tick, inp: StepInput, controller: Contr
 
 
 def _inertial_events(before: str, now: str, at_ns: int) -> tuple[Event, ...]:
-    """What has become of the vehicle's inertial data; that they are used is told only where they were not."""
+    """Return the event for a change in the use of inertial data; "used" is told only where they were not before."""
     if now in ("", before) or (now == "inertial-used" and not before):
         return ()
     severity, text = _INERTIAL[now]
@@ -447,7 +447,7 @@ def _setpoint(
         want = (brake[0] + held[0] + back[0], brake[1] + held[1] + back[1], brake[2] + held[2] + back[2])
     elif state.plan is not None:
         want = controller.plant.to_accel(np.array(state.plan.inputs[tick.number - state.plan.seq]))
-    # Level at once where what is seen cannot be: each tick of slewing would be flown on nobody knows what.
+    # Level at once where what is seen cannot be: each tick of slewing would be flown on unknown data.
     before = ZERO if state.fallback is not None and state.fallback.end is fb.FallbackEnd.LET_GO else state.accel_mps2
     accel, limited = gate(want, before, controller.tick_ns * 1e-9, controller.limits)
     setpoint = Setpoint(at_ns=inp.at_ns, accel_mps2=accel, source=source, limited=limited)

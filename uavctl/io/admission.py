@@ -1,4 +1,4 @@
-"""Who may speak to a connection, and how much work each may make: counted before anything looks into a datagram."""
+"""Admission to a connection: who may send, and how much work each may make, before anything looks into a datagram."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TOO_MUCH = "too-much"
 MAX_SENDERS = 64  # strangers with a budget of their own; who is heard longest ago gives its place to another
 MAX_TRUSTED = 16  # senders of what the flight needs, beside the vehicle
 MAX_KNOWN = 1024  # addresses whose verdict is kept
-SILENCE_NS = 5_000_000_000  # who has not been heard for so long gives its place to another
+SILENCE_NS = 5_000_000_000  # a sender that has not been heard for so long makes room for another
 MAGIC = (0xFD, 0xFE)  # the first byte of a frame of MAVLink 2, and 1
 SHORTEST_FRAME, MAX_TRIES = 8, 64  # bytes; tries after which a datagram is given up (`uavctl.mavlink.framing`)
 _HEARTBEAT = re.compile(rb"\xfd.{6}\0\0\0|\xfe.{4}\0", re.DOTALL)
@@ -24,7 +24,7 @@ _HEARTBEATS = 8  # of a backlog of the vehicle's; what looks like one may be non
 
 @dataclass(frozen=True)
 class Rules:
-    """What a UDP connection lets in."""
+    """Rules for what a UDP connection lets in."""
 
     allow: tuple[str, ...] = ()  # addresses and networks; none lets anybody in
     max_per_s: float = 2000.0  # datagrams a second of one sender
@@ -62,23 +62,24 @@ class AllowList:
 
 
 def frames_in(data: bytes) -> int:
-    """How many frames a datagram can make us look at, at most: no checksum and no hash is taken more often.
+    """Return the most frames that a datagram can make us look at: no checksum and no hash is taken more often.
 
-    Each begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given up.
+    Each frame begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given
+    up.
     """
     return max(1, min(data.count(MAGIC[0]) + data.count(MAGIC[1]), len(data) // SHORTEST_FRAME + MAX_TRIES + 1))
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """How much one may send: datagrams, frames and bytes."""
+    """Amount that a sender may send: datagrams, frames and bytes."""
 
     per_s: tuple[float, float, float]  # of each, a second
     burst: tuple[float, float, float]  # of each, at once
 
     @staticmethod
     def of(rules: Rules, times: float, burst: tuple[float, float, float]) -> Allowance:
-        """So many times what the rules give one sender."""
+        """Return `times` times what the rules give one sender."""
         return Allowance(_times(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
 
@@ -99,7 +100,7 @@ def _times(factor: float, those: tuple[float, float, float]) -> tuple[float, flo
 
 
 class _Budget:
-    """What may still be sent now."""
+    """Budget of what a sender may still send now."""
 
     __slots__ = ("_allowance", "_at_ns", "bytes", "datagrams", "frames")
 
@@ -117,12 +118,12 @@ class _Budget:
 
     @property
     def spent(self) -> float:
-        """Share of the burst that is used, of whichever is scarcest: who has sent least lately has least."""
+        """Share of the burst that is used, of whichever is scarcest; the least for whoever has sent least lately."""
         burst = self._allowance.burst
         return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
 
     def refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
-        """Why a datagram does not fit; None if it does.
+        """Return why a datagram does not fit; None if it does.
 
         Args:
             keep: share of the burst that has to be left afterwards.
@@ -194,24 +195,24 @@ class Budgets:
         self._meet_strangers(FIRST_BURST)
 
     def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
-        """Give those who are not known budgets with this burst, and twice that together."""
+        """Give unknown senders budgets with this burst, and twice that together."""
         self._strangers.clear()
         self._stranger = Allowance.of(self._rules, 1.0, burst)
         self._all_strangers = _Budget(Allowance.of(self._rules, 1.0, _times(2.0, burst)), 0)
 
     def _know_somebody(self) -> None:
-        """Take little of strangers from now on."""
+        """Accept little from strangers from now on, if this is the first sender that is known."""
         if self._vehicle is None and not self._known:
             self._meet_strangers(STRANGER_BURST)
 
     def answer(self, sender: Address, now_ns: int) -> None:
-        """Take a sender for the flown vehicle's."""
+        """Note that a sender is the flown vehicle."""
         self._know_somebody()
         if self._vehicle is None or self._vehicle[0] != sender:
             self._vehicle = sender, _Sender(self._of_vehicle, now_ns)
 
     def trust(self, sender: Address, now_ns: int) -> None:
-        """Take a sender for one that the flight needs; who was so longest ago gives its place."""
+        """Note that the flight needs a sender; the one noted longest ago makes room."""
         self._know_somebody()
         known = self._known.pop(sender, None) or _Sender(self._trusted, now_ns)
         if len(self._known) >= MAX_TRUSTED:
@@ -219,7 +220,7 @@ class Budgets:
         self._known[sender] = known
 
     def take(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
-        """Which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
+        """Return which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
 
         Args:
             senders: of the datagrams, in the order in which they came.

@@ -1,4 +1,4 @@
-"""What the daemon needs of a connection, and what all connections share."""
+"""Protocol of a connection as the daemon needs it, and what all connections share."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ BACKLOG_READS = 16_384  # of a call that is to read everything: more than any bu
 
 
 class Connection(Protocol):
-    """What the daemon needs of a connection."""
+    """Connection as the daemon needs it."""
 
     @property
     def url(self) -> str:
-        """Where it goes."""
+        """URL of the connection."""
         ...
 
     @property
@@ -36,7 +36,7 @@ class Connection(Protocol):
 
     @property
     def refused(self) -> Counter[str]:
-        """What came and was not handed on, by reason."""
+        """Counts of what came and was not handed on, by reason."""
         ...
 
     @property
@@ -58,11 +58,11 @@ class Connection(Protocol):
         ...
 
     def lost(self) -> int:
-        """How much the system has dropped of what the vehicle sent, for want of room, before it could be read."""
+        """Return how much of the vehicle's data the system dropped, for want of room, before it could be read."""
         ...
 
     def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
-        """What has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
+        """Return what has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
 
         Args:
             everything: also a long backlog of the vehicle's.

@@ -13,7 +13,7 @@ from uavctl.errors import ConnectionSpecError, UavctlError
 from uavctl.frames import Quaternion, Up
 from uavctl.records import Vec3
 
-# What a camera system has to tell, whatever its protocol: the small interface that each one implements.
+# Interface of a camera system, whatever its protocol.
 
 
 class CameraError(UavctlError):
@@ -47,7 +47,7 @@ class Camera(Protocol):
 
     @property
     def awaits(self) -> str:
-        """What it lacks while it is not ready, for people."""
+        """Text for people on what it lacks while it is not ready."""
         ...
 
     @property
@@ -57,7 +57,7 @@ class Camera(Protocol):
 
     @property
     def dropped(self) -> Counter[str]:
-        """What came and gave no position, by reason."""
+        """Counts of datagrams that gave no position, by reason."""
         ...
 
     def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
@@ -69,7 +69,7 @@ class Camera(Protocol):
         ...
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """What is to be sent to the server now."""
+        """Return the datagrams to send to the server now."""
         ...
 
     def ask_time(self, token: int) -> bytes:
@@ -129,7 +129,7 @@ def _address(url: str, text: str) -> str:
         raise ConnectionSpecError(f"connection {url!r}: interface {error}; give this computer's address") from error
 
 
-# What daemon and camera process tell each other: the first byte of a message that is not MAVLink, and bounds.
+# Messages between daemon and camera process: the first byte of one that is not MAVLink, and bounds.
 
 
 READY, REFUSED, UNREACHABLE, COUNTS = b"R", b"E", b"T", b"C"

@@ -34,7 +34,7 @@ _SERVER = struct.Struct("<256s4B4BQH?4s")
 _ECHO = struct.Struct("<QQ")
 _RETRY_NS = 500_000_000
 _SILENT_NS = _KEEP_NS = 1_000_000_000
-# A server that began anew answers questions of people it never heard of, and streams only to who asked to connect.
+# A restarted server answers questions of clients it does not know, but streams only to those that asked to connect.
 _ALIVE = (SERVER_INFO, FRAME)
 _MAX_EXPOSED_S = 1.0  # from exposure to sending; more is no frame of this version
 _UNREADABLE = (struct.error, ValueError, IndexError, TypeError, AssertionError, MemoryError, natnet.NatNetError)

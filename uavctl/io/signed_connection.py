@@ -29,7 +29,7 @@ from uavctl.io.sources import open_source
 from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
 from uavctl.mavlink.signing import KEY_BYTES, NEWEST_STAMP, Gate, Signing, SigningKey, Stamps, stamp_at
 
-# Files of signing keys: read with care for who else can, and made.
+# Files of signing keys: made, and read with a check of who else can read them.
 #
 # A file holds 32 bytes, or 64 hexadecimal digits, or a line `passphrase: …`, from which the key is derived as
 # MAVProxy, Mission Planner and pymavlink's tools do: SHA-256 of the words.
@@ -116,7 +116,7 @@ LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in m
 
 
 def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where stamps are kept: systemd's state directory, else the user's."""
+    """Return the folder where stamps are kept: systemd's state directory, else the user's."""
     systemd, xdg = environment.get("STATE_DIRECTORY"), environment.get("XDG_STATE_HOME")
     if systemd:
         return Path(systemd.partition(":")[0])
@@ -181,7 +181,7 @@ def _private(path: Path, flags: int) -> TextIO:
 
 
 def _take(lock: int) -> None:
-    """Lock a file; who holds it for long is no daemon that is writing its stamp.
+    """Lock a file; a daemon that writes its stamp holds it only briefly.
 
     Raises:
         BlockingIOError: it is held.
@@ -337,7 +337,7 @@ class Sealed:
 
 
 def rules(security: SecurityConfig) -> Rules:
-    """Whom the UDP connections listen to, and how much."""
+    """Return the rules of the UDP connections: whom they listen to, and how much."""
     return Rules(
         security.allow,
         float(security.max_datagrams_per_s),

@@ -152,7 +152,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
     return piped
 
 
-# Where positions come from: MAVLink as it is, or a camera system whose words are turned into MAVLink at the edge.
+# Sources of positions: MAVLink as it is, or a camera system whose messages are turned into MAVLink at the edge.
 #
 # A source is whatever implements `uavctl.io.transport.Connection` and hands on MAVLink. Camera systems speak protocols
 # of their own, so a process of ours (`uavctl.io.camera_host`) listens to one and gives the daemon ODOMETRY, stamped

@@ -103,7 +103,7 @@ class UdpIn(_Udp):
     """Bound UDP socket. It answers the peer that it was told to, and until then the first one that speaks MAVLink.
 
     What others send is handed on too: cameras and vehicle may share a port. Only a peer that has fallen silent is
-    followed by another one, so that nobody draws the setpoints to himself while it speaks.
+    followed by another one, so that nobody can draw the setpoints to themselves while it speaks.
 
     Vehicle and cameras get sockets of their own once they are known, on the same port and connected to them: the system
     keeps what they send apart from what others do, and a flood fills only the buffer of the others.
@@ -195,7 +195,7 @@ class UdpIn(_Udp):
         self._keep(sender, now_ns)
 
     def _keep(self, sender: Address, now_ns: int) -> None:
-        """Give a sender a socket of its own, if there is room; who has fallen silent makes room."""
+        """Give a sender a socket of its own, if there is room; a sender that has fallen silent makes room."""
         self._trusted_ns[sender] = now_ns
         if sender in self._own:
             return
@@ -303,7 +303,7 @@ CONNECT_TIMEOUT_S = 5.0
 CHUNK_BYTES = 4096
 MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; what waits is read in the next one
 BACKLOG_CHUNKS = 128  # of a call that is to read everything; the other side waits, and loses nothing
-PORT_BYTES = 4095  # that a port of Linux keeps; a serial line waits for nobody
+PORT_BYTES = 4095  # capacity of a Linux port's buffer; a serial line does not wait
 _PENDING_LIMIT = 4096  # bytes that wait for a stream that does not drain
 
 

@@ -27,7 +27,7 @@ REMEMBERED_TRIPS = 60
 
 
 class StampRefusal(StrEnum):
-    """Why a stamp gives no time of capture."""
+    """Reason why a stamp gives no time of capture."""
 
     FUTURE = "future-stamp"
     LEAP = "stamp-leap"
@@ -35,7 +35,7 @@ class StampRefusal(StrEnum):
 
 
 class ClockSource(StrEnum):
-    """Where the offset comes from."""
+    """Source of a clock offset."""
 
     TIMESYNC = "timesync"
     MINIMUM = "minimum"
@@ -93,7 +93,7 @@ class RoundTrips:
 
     @property
     def drift_ppm(self) -> float | None:
-        """What our clock gains on the peer's [millionths]; None before enough answers."""
+        """Gain of our clock on the peer's [millionths]; None before enough answers."""
         return self._slope * 1e6 if self._settled else None
 
     @property

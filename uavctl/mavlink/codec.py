@@ -142,7 +142,7 @@ OWN_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no externa
 
 
 class Decoded(msgspec.Struct, frozen=True):
-    """What some bytes held."""
+    """Result of decoding some bytes."""
 
     messages: tuple[Message, ...]  # those that are understood, in order
     total: int  # number of messages, also of kinds that are passed over

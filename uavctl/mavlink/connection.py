@@ -44,7 +44,7 @@ from uavctl.records import (
     VehicleStatus,
 )
 
-# What a real vehicle has to be asked for, or told, before it can be flown: its streams, and a place on the globe.
+# Requests and messages that a real vehicle needs before it can be flown: its streams, and a place on the globe.
 
 
 SECOND_NS = 1_000_000_000
@@ -95,14 +95,14 @@ class Streams:
                 self._feels = self._felt_tries > 0
 
     def restart(self) -> None:
-        """The vehicle has started anew and may have forgotten them."""
+        """Ask anew: the vehicle has restarted and may have forgotten the requests."""
         self._seen.clear()
         self._feels = False
         self._next_ns, self._tries = None, 0
         self._felt_next_ns, self._felt_tries = 0, 0
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
-        """(message id, rate [1/s]) of what is to be asked for now; to be called once a vehicle is heard."""
+        """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
         wanted: dict[int, float] = {}
         if self._next_ns is None:
             self._next_ns = at_ns + SETTLE_NS
@@ -121,7 +121,7 @@ class Streams:
 
 
 class Globe:
-    """When to tell an ArduPilot that flies by external positions a place on the globe: without one it does not arm.
+    """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
 
     Its source of positions is read first: with GPS a place of ours would be wrong.
     """
@@ -143,7 +143,7 @@ class Globe:
     def due(self, at_ns: int) -> tuple[bool, bool]:
         """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
 
-        It is told from the second time on: by then an origin that is there has been answered with.
+        The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
         """
         if self._known or at_ns < self._next_ns or self._tries >= ORIGIN_TRIES:
             return False, False
@@ -162,8 +162,8 @@ TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
 FIRST_REQUESTS = 10  # sent faster, until the first answer
 OPEN_REQUESTS = 8  # requests whose answers are still taken
-# Requests that are answered within a time, of the vehicle's and of others' each: a flood of them makes none of answers,
-# and takes no tick its time.
+# Requests that are answered within a time, for the vehicle and for others each: a flood of them neither makes a flood
+# of answers nor costs a tick its time.
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
@@ -183,7 +183,7 @@ class MavlinkConnection:
         daemon: our ids; the connection's URL tells a byte stream from datagrams.
         source: which messages and which system count as positions.
         estimator: standard deviation of a position, and what is absurd.
-        listen: hears every message of others that is understood, with its time of arrival; for who wants to know more
+        listen: hears every message of others that is understood, with its time of arrival; for callers that want more
             than the items tell.
     """
 
@@ -233,12 +233,12 @@ class MavlinkConnection:
 
     @property
     def attitude(self) -> Quaternion | None:
-        """How the body of the newest sample was turned: body axes forward, right, down to NED (w, x, y, z)."""
+        """Attitude of the body in the newest sample: body axes forward, right, down to NED (w, x, y, z)."""
         return self._intake.attitude
 
     @property
     def clock_source(self) -> ClockSource:
-        """Where the time of the newest sample's capture comes from."""
+        """Source of the newest sample's capture time."""
         return self._intake.clock_source
 
     @property
@@ -264,7 +264,7 @@ class MavlinkConnection:
         return self.vehicle is not None and self.vehicle[0] in self._askers
 
     def vehicle_up_s(self, at_ns: int) -> float | None:
-        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         return self._vehicle.up_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> tuple[Item, ...]:
@@ -280,7 +280,7 @@ class MavlinkConnection:
         return (*items, *self._tell(at_ns))
 
     def answers(self) -> tuple[bytes, ...]:
-        """What the last datagram has to be answered with, at once: a TIMESYNC that waits measures the wait."""
+        """Answers to the last datagram, to be sent at once: a TIMESYNC that waits measures the wait."""
         return tuple(self._answers)
 
     def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
@@ -290,7 +290,7 @@ class MavlinkConnection:
         return self._tell(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """What is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
+        """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
         out = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
@@ -343,7 +343,7 @@ class MavlinkConnection:
         return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.modes[name]))
 
     def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
-        """What an ArduPilot without GPS has to be told before it arms; to be called while it is to be armed.
+        """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
 
         Args:
             place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
@@ -434,7 +434,7 @@ class MavlinkConnection:
         return items
 
     def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        """What the vehicle tells of itself."""
+        """Take a message of the vehicle and return what it tells of itself."""
         if isinstance(message, Text):
             whole = self._texts.take(message, at_ns)
             return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
@@ -476,7 +476,7 @@ class MavlinkConnection:
             self._untold[reason] += count
 
     def _tell(self, at_ns: int) -> tuple[Event, ...]:
-        """What was dropped, as one event a second, and new clocks as they are found."""
+        """Return events: what was dropped, one a second, and new clocks as they are found."""
         events = []
         if self._intake.resyncs > self._resyncs_told:
             self._resyncs_told = self._intake.resyncs

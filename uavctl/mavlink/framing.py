@@ -25,7 +25,7 @@ _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
 class BadBytes(StrEnum):
-    """Why bytes were skipped."""
+    """Reason why bytes were skipped."""
 
     CRC = "crc"  # a frame with a wrong checksum
     TRUNCATED = "truncated"  # a frame that the data ends in
@@ -47,7 +47,7 @@ class RawFrame(msgspec.Struct, frozen=True):
 
 
 class Scan(msgspec.Struct):
-    """What a scan found."""
+    """Result of a scan."""
 
     frames: list[RawFrame] = []  # whole frames in order
     bad: dict[str, int] = {}  # skips by reason
@@ -60,7 +60,7 @@ class Scan(msgspec.Struct):
 
 
 class _Shape(msgspec.Struct, frozen=True):
-    """What the first bytes of a frame promise."""
+    """Length and kind of a frame, as its first bytes announce them."""
 
     length: int
     message_id: int
@@ -113,7 +113,7 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
         data: a datagram, or what has come of a stream.
         final: whether the data ends here. If not, a frame that it ends in is left for later.
         in_step: whether the first byte should begin a frame (see `Scan`).
-        verify: takes only frames whose signature it likes, in place of the checksum; frames of ids that the dialect
+        verify: takes only frames whose signature it accepts, in place of the checksum; frames of ids that the dialect
             has not are verified too, and then counted and dropped.
 
     Returns:
@@ -164,7 +164,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
 
 
 def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tuple[int | None, str]:
-    """The same where signatures are asked for: no frame without one is believed in anything but its length."""
+    """Try for a frame where signatures are required: of a frame without one only the length is believed."""
     at = result.consumed
     end = at + shape.length
     frame = data[at:end]
@@ -181,7 +181,7 @@ def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tup
 
 
 def _between_frames(data: bytes, result: Scan, end: int) -> bool:
-    """Whether an unchecked length can be believed: what is before it was a frame, and another seems to follow."""
+    """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
     return result.in_step and (end >= len(data) or data[end] in _MAGIC)
 
 
@@ -201,7 +201,7 @@ _SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
 
 
 class Fields(Protocol):
-    """What a frame says: the fields of its message by their names, an array as a tuple, a text as its bytes."""
+    """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
 
     msgname: str
     src_system: int
@@ -211,7 +211,7 @@ class Fields(Protocol):
 
 
 class MessageLayout:
-    """How one kind of message lies in a frame."""
+    """Layout of one kind of message in a frame."""
 
     def __init__(self, kind: Any) -> None:
         self._name, self._id = kind.msgname, kind.id.to_bytes(3, "little")

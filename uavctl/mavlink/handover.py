@@ -41,27 +41,27 @@ HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
 
 
 class Passage(msgspec.Struct, frozen=True):
-    """A way in the table that was gone."""
+    """Transition of the table that was made."""
 
     before: HandoverState  # the state that was left
     seen: HandoverEvent  # why
     after: HandoverState  # the state that was entered
     why: str = ""  # more about it, where something failed
-    ask: RequestKind | None = None  # what the vehicle had been asked for
+    ask: RequestKind | None = None  # request to the vehicle at that time
     granted: bool = False  # it had said yes to that
 
 
 class HandoverStep(msgspec.Struct, frozen=True):
-    """What a tick makes of it."""
+    """Result of a tick of the hand-over."""
 
-    sending: Sending  # what may be streamed
-    ask: RequestKind | None = None  # what to ask the vehicle for now, if anything
-    events: tuple[Event, ...] = ()  # what there is to tell
-    passage: Passage | None = None  # the way in the table that was gone, if one was
+    sending: Sending  # setpoints that may be streamed
+    ask: RequestKind | None = None  # request to make now, if any
+    events: tuple[Event, ...] = ()  # events to tell
+    passage: Passage | None = None  # transition that was made, if one was
 
 
 class HandOver:
-    """Who flies one vehicle.
+    """State machine that decides who flies one vehicle.
 
     Args:
         sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle
@@ -105,7 +105,7 @@ class HandOver:
     def carries(self) -> bool:
         """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
 
-        One that is not heard any more gets them for the time of a landing.
+        A vehicle that is not heard any more gets them for the time of a landing.
         """
         return self._sees_it_down and self._aloft_ns is not None
 
@@ -182,7 +182,7 @@ class HandOver:
         return events
 
     def _against(self, command: Command, view: HandoverView) -> str:
-        """Why an order is refused; empty if it is taken."""
+        """Return why an order is refused; empty if it is taken."""
         if command.order is Order.ENGAGE:
             return against_engaging(self.state, view)
         if command.order is Order.STAND_BY:
@@ -267,7 +267,7 @@ class HandOver:
         return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
 
     def _see_to_disarming(self, view: HandoverView) -> None:
-        """A vehicle that stands on the ground after a flight of ours and stays armed is asked to disarm."""
+        """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
         vehicle = view.vehicle
         if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
             self._landed_ns = None

@@ -1,4 +1,4 @@
-"""What a tick of the hand-over sees of the vehicle, in the words of the table of `handover_states.py`.
+"""Guards of the hand-over: the event that a tick sees, in the words of the table of `handover_states.py`.
 
 Pure: all that it goes by is an argument.
 """
@@ -43,40 +43,40 @@ _LEFT = "a daemon before this one has left the vehicle in flight: nothing is sen
 
 
 class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
-    """What the hand-over knows in a tick."""
+    """Inputs of the hand-over in a tick."""
 
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
     ready: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
-    up_s: float | None = None  # how long ago it started [s]; None if it does not tell
+    up_s: float | None = None  # time since it started [s]; None if it does not tell
     land: bool = False  # the controller asks for landing
     stop: bool = False  # the operator asks for the end
     unfit: str = ""  # why nothing may be armed now; empty if it may
     up_m: float | None = None  # height of the estimate in local NED [m]; None without one
-    up_mps: float = 0.0  # how fast it climbs [m/s]
+    up_mps: float = 0.0  # its rate of climb [m/s]
     heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
 
 @dataclass(kw_only=True)
 class Progress:
-    """How far the hand-over has come."""
+    """Progress of the hand-over."""
 
     config: HandOverConfig  # times and bounds
-    request: PendingRequest  # what is asked for, or waited for
+    request: PendingRequest  # request that is made, or waited for
     state: HandoverState = HandoverState.WAITING  # place in the table
     since_ns: int = 0  # when it was entered [ns]
     ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
     height_m: float = 0.0  # height of the climb that was ordered [m]
     ground_up_m: float | None = None  # height of the estimate before it was armed [m]
     left_mode: str = ""  # the mode that is to be left for the external one, after a release; or that a failsafe chose
-    climb_ns: int | None = None  # when the climb began first [ns]; None before
+    climb_ns: int | None = None  # time at which the climb first began [ns]; None before
     resumes: bool = False  # the failsafe that acts ended the climb, not the flight
-    words: str = ""  # what the vehicle said before its failsafe acted
+    words: str = ""  # texts of the vehicle from before its failsafe acted
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # times that the vehicle had started anew by the last tick
     stands_by: bool = False  # A vehicle that is found armed is left alone
-    flown_ns: int | None = None  # when the flight that it is left from began [ns]; None if that is not known
+    flown_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
     heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
 
     def shows_the_past(self, vehicle: VehicleStatus) -> bool:
@@ -85,7 +85,7 @@ class Progress:
 
 
 class GuardResult(msgspec.Struct, frozen=True):
-    """What is seen, and why, where that has to be told."""
+    """Event that is seen, with the reason where that has to be told."""
 
     seen: HandoverEvent  # in the words of the table
     why: str = ""  # why something failed
@@ -113,7 +113,7 @@ def fails(vehicle: VehicleStatus) -> bool:
 
 
 def against_engaging(state: HandoverState, view: HandoverView) -> str:
-    """Why the external mode must not be asked for again; empty if it may."""
+    """Return why the external mode must not be asked for again; empty if it may."""
     vehicle = view.vehicle
     if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
@@ -125,7 +125,7 @@ def against_engaging(state: HandoverState, view: HandoverView) -> str:
 
 
 def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
-    """Why an order of where to fly would come to nothing; empty if it is we who fly."""
+    """Return why an order of where to fly would have no effect; empty if it is we who fly."""
     if state is HandoverState.ENGAGED:
         return ""
     if state is HandoverState.WAITING or vehicle is None:
@@ -142,7 +142,7 @@ def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
 
 
 def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
-    """What a tick sees; of several things the first in the order of `Seen`."""
+    """Return the event that a tick sees; of several the first in the order of `HandoverEvent`."""
     vehicle, state = view.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
         return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
@@ -177,7 +177,7 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
 
 
 def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
-    """Why the vehicle's failsafe is not waited for any longer; empty while it is."""
+    """Return why the vehicle's failsafe is not waited for any longer; empty while it is."""
     vehicle, config = view.vehicle, progress.config
     lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
     begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
@@ -191,7 +191,7 @@ def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
 
 
 def _never_ready(progress: Progress, view: HandoverView) -> str:
-    """Why an ordered take-off will not begin; empty if it may, or none was ordered."""
+    """Return why an ordered take-off will not begin; empty if it may, or none was ordered."""
     vehicle, limit_s = view.vehicle, progress.config.ground_s
     if progress.ordered_ns is None:
         return ""
@@ -208,7 +208,7 @@ def _never_ready(progress: Progress, view: HandoverView) -> str:
 
 
 def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    """Before, between and after flights."""
+    """Return the event seen before, between and after flights."""
     ready = progress.state is HandoverState.READY and not (view.unfit or view.stop)
     if ready and progress.ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
@@ -233,7 +233,7 @@ def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> G
 
 
 def _has_started_since(progress: Progress, view: HandoverView) -> bool:
-    """Whether the vehicle has started after the flight that a daemon before left: it is on another one."""
+    """Whether the vehicle has started after the flight that an earlier daemon left: it is on another one."""
     if progress.flown_ns is None or view.up_s is None:
         return False
     return view.up_s / SLOWEST + LATEST_S < (view.at_ns - progress.flown_ns) / 1e9
@@ -269,7 +269,7 @@ def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) ->
 
 
 def _climbed(progress: Progress, view: HandoverView, ahead_s: float) -> float:
-    """Share of the height that will have been reached in a moment, by fresh positions."""
+    """Return the share of the height that will be reached `ahead_s` from now, by fresh positions."""
     if view.up_m is None or progress.ground_up_m is None or view.unfit:
         return 0.0
     return (view.up_m + ahead_s * view.up_mps - progress.ground_up_m) / progress.height_m
@@ -288,7 +288,7 @@ def _for_external(progress: Progress, _view: HandoverView, vehicle: VehicleStatu
 
 
 def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    """On a flight that we began; that the pilot may take over is no different from any other time."""
+    """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
     if not vehicle.armed:
         return GuardResult(
             HandoverEvent.DISARMED, f"the vehicle's own failsafe ({progress.left_mode}) has landed it{progress.words}"

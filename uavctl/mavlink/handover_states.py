@@ -12,7 +12,7 @@ from enum import Enum, StrEnum
 
 
 class HandoverState(StrEnum):
-    """Who flies, or what is under way."""
+    """State of the hand-over: who flies, or what is under way."""
 
     WAITING = "waiting"  # no vehicle is heard
     READY = "ready"  # heard; neutral setpoints warm the stream up
@@ -31,7 +31,7 @@ class HandoverState(StrEnum):
 
 
 class HandoverEvent(StrEnum):
-    """What a tick sees; of several things the first in this order."""
+    """Event that a tick of the hand-over sees; of several the first in this order."""
 
     REBOOT = "reboot"  # the vehicle has started anew
     LAND = "land"  # the controller, or the operator, asks for landing
@@ -49,7 +49,7 @@ class HandoverEvent(StrEnum):
 
 
 class Sending(Enum):
-    """What a tick may stream to the vehicle."""
+    """Setpoints that a tick may stream to the vehicle."""
 
     NOTHING = "nothing"
     NEUTRAL = "neutral"

@@ -25,7 +25,7 @@ class Position(Message, frozen=True, kw_only=True):
     velocity_mps: Vec3 | None = None  # velocity in the same axes [m/s], or None
     convention: Convention | None = None  # axes that the message declares; None if it leaves them to the configuration
     local_ned: bool = False  # the message is in the vehicle's local NED already
-    # how the body is turned (w, x, y, z), body axes to those of the position; None if not given, or no rotation
+    # attitude of the body (w, x, y, z), body axes to those of the position; None if not given, or no rotation
     attitude: Quaternion | None = None
     # the attitude came as Euler angles: its body axes are forward, right, down in a frame that points down and forward,
     # left, up in one that points up. Otherwise they are forward, right, down.

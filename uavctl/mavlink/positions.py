@@ -38,12 +38,12 @@ Kept = TypeVar("Kept")
 
 
 class SourceTable(Generic[Key, Kept]):
-    """What is kept of each source. There is always room for another one: who has said least gives its place.
+    """Table of what is kept of each source. A new one always finds room: the one that has said least gives way.
 
-    So nobody is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
+    So no source is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
 
     Args:
-        bad: told when a source loses its place that is not silent.
+        bad: called when a source that is not silent loses its place.
     """
 
     def __init__(self, most: int, bad: Callable[[], None]) -> None:
@@ -54,21 +54,21 @@ class SourceTable(Generic[Key, Kept]):
         return len(self._entries)
 
     def get(self, key: Key) -> Kept | None:
-        """What is kept of a source; None of one that is not there."""
+        """Return what is kept of a source; None if it is not there."""
         found = self._entries.get(key)
         return None if found is None else found[0]
 
     def times(self, key: Key) -> int:
-        """How often a source has spoken; 0 of one that is not there."""
+        """Return how often a source has spoken; 0 if it is not there."""
         found = self._entries.get(key)
         return 0 if found is None else found[1]
 
     def values(self) -> Iterator[Kept]:
-        """What is kept of all of them."""
+        """Iterate over what is kept of all sources."""
         return (kept for kept, _, _ in self._entries.values())
 
     def hear(self, key: Key, at_ns: int, make: Callable[[], Kept]) -> Kept:
-        """What is kept of a source that speaks now; of a new one it is made."""
+        """Note that a source speaks now, and return what is kept of it; for a new one, `make` makes it."""
         found = self._entries.get(key)
         if found is None and len(self._entries) >= self._most:
             self._make_room(at_ns)
@@ -129,7 +129,7 @@ class PositionDecoder:
 
     @property
     def clock_source(self) -> ClockSource:
-        """Where that offset comes from."""
+        """Source of that offset."""
         return ClockSource.NONE if self._latest is None else self._latest.source
 
     def trips(self, address: Address | None = None) -> RoundTrips | None:
@@ -185,7 +185,7 @@ class PositionDecoder:
         return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
     def _has_room(self, message: Position, received_ns: int) -> bool:
-        """Whether one more sample is looked at; of sources that are settled each is."""
+        """Whether one more sample is looked at; each sample of a settled source is."""
         self.settled = self._clocks.times(_key(message)) >= SETTLED
         if self.settled:
             self._settled_ns = received_ns
@@ -224,7 +224,7 @@ class PositionDecoder:
 
 
 def _key(message: Position) -> tuple[Address, bool]:
-    """Whose clock stamps it, and which of its clocks."""
+    """Return whose clock stamps a message, and which of its clocks."""
     return (message.system, message.component), message.boot_ms
 
 

@@ -67,7 +67,7 @@ def _copter_mode(vehicle_type: int, custom_mode: int) -> str:
 
 @dataclass(frozen=True)
 class AutopilotProfile:
-    """How one autopilot gets into the air and out of it, by its own names of modes."""
+    """Profile of one autopilot: its modes for take-off, flight and landing, by its own names, and its habits."""
 
     external: str  # the mode that takes our setpoints
     take_off: str  # the mode that take-off begins in, asked for on the ground

@@ -23,7 +23,7 @@ _WAITING = 64  # poses of one tick
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A body as an estimator is told of it."""
+    """Pose of a body as sent to the vehicle's estimator."""
 
     message: str  # as which message
     usec: int  # time of capture, in the clock that the vehicle expects [us]
@@ -58,7 +58,7 @@ class Relay:
         return self._config.enabled
 
     def take(self, sample: PositionSample, attitude: Quaternion | None) -> None:
-        """Take a sample as it arrives, with the body's attitude in NED; an estimator of yaw cannot do without."""
+        """Take a sample as it arrives, with the body's attitude in NED, which an estimator of yaw cannot do without."""
         if not self.enabled:
             return
         if attitude is None:
@@ -70,7 +70,7 @@ class Relay:
     def due(
         self, at_ns: int, *, offset_ns: int | None, asks: bool, refused: Sequence[PositionSample]
     ) -> tuple[Pose, ...]:
-        """What goes to the vehicle in this tick, in order of capture.
+        """Return the positions that go to the vehicle in this tick, in order of capture.
 
         Args:
             offset_ns: (our time - the vehicle's) from round trips; None if it does not answer.
@@ -99,7 +99,7 @@ class Relay:
         return tuple(out)
 
     def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
-        """Why a pose is kept; None if it goes."""
+        """Return why a pose is kept back; None if it goes."""
         same = self._last == (sample.position_m, attitude)
         self._last, self._same = (sample.position_m, attitude), self._same + 1 if same else 0
         newest_ns = self._newest_ns

@@ -16,7 +16,7 @@ _MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal
 
 
 class RequestKind(StrEnum):
-    """What the vehicle is asked for; the value is how a person would say it."""
+    """Request to the vehicle; the value is how a person would say it."""
 
     TAKE_OFF_MODE = "the mode to take off in"
     ARM = "arming"
@@ -54,7 +54,7 @@ class PendingRequest:
     """
 
     def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
-        self.ask = ask  # what is asked for; None for a wait in which nothing is said
+        self.ask = ask  # the request; None for a wait in which nothing is sent
         self._patience = patience
         self._begun_ns = at_ns
         self._next_ns = at_ns
@@ -83,9 +83,9 @@ class PendingRequest:
                 self._next_ns = at_ns + self._patience.retry_ns
 
     def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
-        """What to send now, if anything; `held` says why it must not be sent yet.
+        """Return the request to send now, if any; `held` says why it must not be sent yet.
 
-        `blind`: nothing is made again now, as it is not known what the vehicle does meanwhile.
+        `blind`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
         """
         self._held = held
         if blind and self._tries:
@@ -100,7 +100,7 @@ class PendingRequest:
         return self.ask
 
     def given_up(self, at_ns: int) -> str:
-        """Why nothing more is to be expected; empty while there is hope."""
+        """Return why the request is given up; empty while it may still succeed."""
         over = at_ns - self._begun_ns >= self._patience.limit_ns
         out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
@@ -125,7 +125,7 @@ class PendingRequest:
 
     @property
     def words(self) -> str:
-        """What the vehicle has said meanwhile, to be added to a reason."""
+        """The vehicle's texts since the request, quoted, to be added to a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
     def _effort(self, at_ns: int) -> str:

@@ -1,7 +1,7 @@
 """MAVLink 2 signing, sans IO: who holds the key, and whether a frame is newer than the last one.
 
 Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked at,
-so that who has not the key changes nothing here: with the other order one forged frame with a stamp from the future
+so that nobody without the key changes anything here: in the other order one forged frame with a stamp from the future
 locks the true peer out.
 """
 
@@ -35,7 +35,7 @@ Stream = tuple[int, int, int]
 
 
 class SignatureRefusal(StrEnum):
-    """Why a frame is not taken."""
+    """Reason why a frame is not taken."""
 
     FORGED = "forged"  # made without the key, or damaged
     REPLAYED = "replayed"  # not newer than the newest of its stream, or than all before the start
@@ -142,7 +142,7 @@ class Signing:
         return refusal
 
     def _keep(self, stream: Stream, stamp: int) -> None:
-        """Keep a stream's stamp. The oldest one gives its place, and nothing that is older is taken for new again."""
+        """Keep a stream's stamp. The oldest one makes room, and nothing that is older is taken for new again."""
         if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
             oldest = min(self._newest, key=lambda one: self._newest[one])
             self._floor = max(self._floor, self._newest.pop(oldest))

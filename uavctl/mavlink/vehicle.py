@@ -44,7 +44,7 @@ class BootClock:
         self._newest: _Reading | None = None
 
     def up_s(self, at_ns: int) -> float | None:
-        """How long ago the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         newest = self._newest
         return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
 
@@ -62,7 +62,7 @@ class BootClock:
         elif doubted is not None and at_ns - doubted.at_ns <= AGREE_NS and _goes_on(doubted, reading):
             del self._doubted[kind]
             anew = known.confirmed and (_advance_ms(known, reading) < 0 or _is_young(known, reading))
-            if anew:  # what the others have told is of the time before
+            if anew:  # the others' readings are from before the restart
                 self._known.clear()
                 self._doubted.clear()
             self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=True))
@@ -82,7 +82,7 @@ class BootClock:
 
 
 def _advance_ms(before: _Reading, after: _Reading) -> int:
-    """By how much a clock went on, the shorter way around its wrap [ms]."""
+    """Return by how much a clock went on, the shorter way around its wrap [ms]."""
     return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
 
 
@@ -100,7 +100,7 @@ def _is_young(before: _Reading, after: _Reading) -> bool:
     return after.boot_ms <= _passed_ms(before, after) + AHEAD_MS
 
 
-# STATUSTEXT in one piece again: a vehicle says what is longer than 50 characters in several.
+# STATUSTEXT joined again: a vehicle sends what is longer than 50 characters in several pieces.
 
 
 WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
@@ -109,7 +109,7 @@ LOST = "…"  # stands for a piece that did not come
 
 
 class _Begun(msgspec.Struct):
-    """A text of which more is to come."""
+    """Text of which more pieces are to come."""
 
     first: Text
     said: str
@@ -117,7 +117,7 @@ class _Begun(msgspec.Struct):
     at_ns: int
 
     def so_far(self) -> Text:
-        """What has come of it."""
+        """Return the text as far as it has come, with a mark for the part that is missing."""
         return _plain(self.first, self.said + LOST)
 
 
@@ -197,7 +197,7 @@ class Punctual:
         self._values: Vec3 | None = None
 
     def takes(self, stamp_us: int, values: Vec3, at_ns: int) -> bool:
-        """Whether a message is of now.
+        """Whether a message is current.
 
         Args:
             stamp_us: when it was measured, by the sender's clock.
@@ -219,7 +219,7 @@ class Punctual:
 class VehicleWatch:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
-    One that has fallen silent on the ground, disarmed, gives its place to another.
+    A vehicle that has fallen silent on the ground, disarmed, gives way to another.
 
     Args:
         bad: counter that heartbeats of other vehicles are added to.
@@ -252,7 +252,7 @@ class VehicleWatch:
 
     @property
     def autopilot(self) -> str:
-        """Which autopilot it is; empty before its first heartbeat."""
+        """Name of its autopilot; empty before its first heartbeat."""
         return "" if self._status is None else self._status.autopilot
 
     def take(
@@ -296,11 +296,11 @@ class VehicleWatch:
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
     def up_s(self, at_ns: int) -> float | None:
-        """How long ago it started, by its own clock [s]; None if it does not tell."""
+        """Return the time since it started, by its own clock [s]; None if it does not tell."""
         return self._clock.up_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
-        """What turns a specific force of that time into local NED (w, x, y, z); None where it is old or unknown."""
+        """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
         if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
             return None
         return from_euler(self._turned[0])
@@ -321,7 +321,7 @@ class VehicleWatch:
     def _moves(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
     ) -> tuple[VehicleMotion, ...]:
-        """How it moves, with what it just said of that."""
+        """Return the vehicle's motion, updated with what it has just said of it."""
         if velocity is not None:
             self._motion = msgspec.structs.replace(self._motion, velocity_mps=velocity, velocity_ns=at_ns)
         if attitude is not None:
@@ -371,7 +371,7 @@ class VehicleWatch:
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
     def _begin(self, address: tuple[int, int], at_ns: int) -> None:
-        """Follow a vehicle; of another than before nothing is known, and nothing is armed yet."""
+        """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
         if self.address is not None:
             self._reboot()
             self._battery_v = None

@@ -1,4 +1,4 @@
-"""What a solver of the decision problem answers, and the protocol that solvers share."""
+"""Answer of a solver of the decision problem, and the protocol that solvers share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 # A mean input may pass a hard limit by this much before it is cut back [input units]; more is not an optimum.
 INPUT_TOLERANCE = 1e-6
 
-# What still counts as a constraint kept (each in its own unit, or summed over a plan).
+# Tolerance up to which a constraint counts as kept (each in its own unit, or summed over a plan).
 KEPT = 1e-6
 
 
@@ -31,7 +31,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What is known ahead about the steps of one plan."""
+    """Knowledge of the steps of one plan ahead: limits, path, age of the position, covariance."""
 
     # Right sides of the state rows in each stage (H+1, m_x); None: those of the design. What holds in the last τ + 1
     # stages holds for the reference.

@@ -25,7 +25,7 @@ Counts = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class News:
-    """What is known at the beginning of step k, for N runs."""
+    """Information at the beginning of step k, for N runs."""
 
     step: int  # k
     newest: Counts  # step (N,) in which the newest position known was captured; 0 at first: x(0) is always known
@@ -132,7 +132,7 @@ def gathered(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
 
 @dataclass(eq=False)
 class Tally:
-    """What the controller met, by run (N,)."""
+    """Counts of plans and fallbacks, by run (N,)."""
 
     decisions: NDArray[np.intp]  # plans asked for
     infeasible: NDArray[np.intp]  # those that were not found
@@ -142,7 +142,7 @@ class Tally:
 
     @classmethod
     def zero(cls, runs: int) -> Self:
-        """Nothing met yet."""
+        """Return counts of zero."""
         decisions, infeasible, slack_used, fallbacks = np.zeros((4, runs), dtype=np.intp)
         return cls(decisions, infeasible, slack_used, fallbacks, np.zeros(runs))
 

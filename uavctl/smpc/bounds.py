@@ -1,4 +1,4 @@
-"""What no controller can beat: the expected quadratic cost when positions are lost or late, and nothing is limited.
+"""Cost that no controller can beat: the expected quadratic cost with lost or late positions, and nothing limited.
 
 The state is known exactly at its capture, and neither losses nor delays depend on the inputs: certainty equivalence
 holds (Schenato et al. 2007, Foundations of control and estimation over lossy networks, TCP-like case). The best input

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 
-# A plant with an unknown acceleration that stays: wind, drag that nobody compensates, an error of the hover thrust.
+# A plant with an unknown lasting acceleration: wind, uncompensated drag, an error of the hover thrust.
 #
 # The bias d acts where the input does and is a random walk; it becomes a state of a larger plant, which a filter of
 # the usual kind then estimates:
@@ -29,7 +29,7 @@ from uavctl.smpc.plant import Plant
 #
 # Between two boundaries d moves on a line, so B_d is the mean of B(t) over the step.
 #
-# A force acts at once, not through the lag of what steers: where accelerations are measured, that has to be told
+# A force acts at once, not through the lag of the inputs: where accelerations are measured, that has to be told
 # apart. With the acceleration of a lagging axis meaning all of it, the force's too, a change of d shows in it as it
 # happens, while its motion from then on is that of A, B as before; B_d has the mean of A(t) J beside it, with J the
 # steady acceleration of a unit of input.
@@ -192,7 +192,7 @@ class _Sight:
         )
 
     def after(self, p: Array, *, seen: bool) -> Array:
-        """P at the end of a step (n_x, n_x), from that at its begin."""
+        """P at the end of a step (n_x, n_x), from that at its beginning."""
         z = self._at_sample(p)
         if seen:
             gain = self._gain(z)
@@ -203,7 +203,7 @@ class _Sight:
         return np.asarray((z + z.T)[:n_x, :n_x] / 2.0)
 
     def effect(self, p: Array) -> Array:
-        """E (n_x, n_y) of ν = E ω, ω ~ N(0, I), from the covariance at the step's begin: L S^½ carried to its end."""
+        """E (n_x, n_y) of ν = E ω, ω ~ N(0, I), from the covariance at the step's start: L S^½ carried to its end."""
         z = self._at_sample(p)
         root = np.linalg.cholesky(self._innovation(z))
         return np.asarray((self.to_end @ self._gain(z) @ root)[: len(p)])

@@ -37,7 +37,7 @@ _ROUNDING = 1e-9
 
 
 class AgeModel(Protocol):
-    """What risk conditioned on the age asks of a link."""
+    """Link model as risk conditioned on the age needs it."""
 
     def outage(self, steps: int) -> float:
         """P(a(k) >= `steps`) in the long run."""
@@ -45,7 +45,7 @@ class AgeModel(Protocol):
 
 
 class LinkModel(AgeModel, Protocol):
-    """What a design of scheme `hahn-stursberg` asks of a link."""
+    """Link model as a design of scheme `hahn-stursberg` needs it."""
 
     def age(self, steps: int) -> Array:
         """Distribution of the age over the steps to come, from an age of 0: (4), (5).

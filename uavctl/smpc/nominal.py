@@ -18,7 +18,7 @@ from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 from uavctl.smpc.sets import Polytope
 
-# What every baseline is given: the same plant, limits and weights as the SMPC.
+# Problem that every baseline is given: the same plant, limits and weights as the SMPC.
 
 
 Array = NDArray[np.float64]

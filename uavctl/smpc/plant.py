@@ -197,7 +197,7 @@ class Plant:
         return self._accel_map
 
     def to_accel(self, u: Array) -> Vec3:
-        """Acceleration setpoint [m/s²] of an input (n_u,); 0 in the axes that the plant has not."""
+        """Acceleration setpoint [m/s²] of an input (n_u,); 0 in the axes that the plant lacks."""
         accel = [0.0, 0.0, 0.0]
         for column, value in zip(self._columns, (self._accel_map @ u).tolist(), strict=True):
             accel[column] = value

@@ -1,4 +1,4 @@
-"""Which rows a program begins with: a guess at those that bind, by where the fastest inputs lead.
+"""Rows that a program begins with: a guess at those that bind, by where the fastest inputs lead.
 
 An active-set method ends at the same optimum from any rows, and takes fewer iterations the nearer they are to those
 that bind there. Plans in transit are alike: as fast as the slew rows let it to where a state row still can be kept,
@@ -234,7 +234,7 @@ def _last(flags: Flags) -> int:
     return int(flags.size - 1 - flags[::-1].argmax())
 
 
-# Where each kind of variable of a component's program sits, and which rows share one.
+# Places of each kind of variable in a component's program, and the rows that share one.
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def pairs_of(c: Array) -> tuple[Pair, ...]:
 
 @dataclass(frozen=True)
 class VariableLayout:
-    """Where each kind of variable sits."""
+    """Places of each kind of variable in the vector of all variables."""
 
     v: slice
     theta: slice

@@ -91,7 +91,7 @@ class Scale:
     cost: float
 
     def beyond_usual(self, point: Array) -> Array:
-        """What of a point (n,) is too large for the solver to find as well by itself, in natural sizes."""
+        """Return the part of a point (n,) too large for the solver to be as accurate by itself, in natural sizes."""
         point = point / self.variables
         return point - np.clip(point, -_USUAL, _USUAL)
 

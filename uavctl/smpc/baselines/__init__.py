@@ -1,4 +1,4 @@
-"""What others would fly: every one a real controller on the same plant, weights, limits, noise and losses."""
+"""Controllers to compare with, every one a real controller on the same plant, weights, limits, noise and losses."""
 
 from uavctl.smpc.baselines.feedback import CascadedPid, Governor, Lqg, PidGains, tune
 from uavctl.smpc.baselines.mpc import HoldLast, MeanQp, PacketisedPredictive, WorstCaseDelay, ZeroOnLoss

@@ -41,7 +41,7 @@ class _OnReceipt(ABC):
         self.begin(0)
 
     def _planner(self, margin: float) -> BatchMpc:
-        """Who plans."""
+        """Make the planner, its limits tightened by `margin` standard deviations."""
         plant = self._problem.plant
         step = plant.e @ plant.w @ plant.e.T
         return BatchMpc(self._problem, margin * deviations(self._problem.state_set, step))
@@ -170,7 +170,7 @@ class WorstCaseDelay:
 
 
 def _backoffs(problem: ControlProblem, delay: int, kappa_x: float, kappa_u: float) -> tuple[Array, Array]:
-    """What is taken off the rows: states (H+1, m_x), inputs (H, m_u)."""
+    """Return the back-offs of the rows: states (H+1, m_x), inputs (H, m_u)."""
     plant = problem.plant
     step = plant.e @ plant.w @ plant.e.T
     error = np.zeros_like(step)

@@ -29,7 +29,7 @@ SELDOM = 0.05  # of the allowed risk: what the oldest ages may use up that keep 
 
 @dataclass(frozen=True, eq=False)
 class AgeRisk:
-    """How the risk of a time is spread over the ages of the information that its plan may be based on."""
+    """Spread of a time's risk over the ages of the information that its plan may be based on."""
 
     weights: Array  # π_t (H,), of information t = 1 … H steps old
     beyond: float  # probability that it is older than H: no plan is left then, and all of it counts as outside
@@ -38,7 +38,7 @@ class AgeRisk:
 
     @property
     def shares(self) -> Array:
-        """What plans spread over their rows (H,): no bound where ε̄_t is 1, as nothing is more often than always."""
+        """Risk that plans spread over their rows (H,); infinite where ε̄_t is 1, for then nothing is asked."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
@@ -112,7 +112,7 @@ def _ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, flo
     return weights, beyond, left
 
 
-# How a plan spreads the risk of an age over its rows: iterative risk allocation.
+# Spread of the risk of an age over the rows of a plan: iterative risk allocation.
 
 
 Flags = NDArray[np.bool_]
@@ -137,7 +137,7 @@ def spent(room: Array, sigma: Array) -> Array:
 
 
 def binding(backoff: Array, room: Array, sigma: Array) -> Flags:
-    """Which rows are at their back-offs, or beyond."""
+    """Return which rows are at their back-offs, or beyond."""
     return np.asarray(room <= backoff + _BINDS * sigma)
 
 
@@ -171,7 +171,7 @@ def shifted(
     return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0, kept, backoff)
 
 
-# What plans with risk conditioned on the age keep from a limit that they rest at.
+# Distances that plans with risk conditioned on the age keep from a limit that they rest at.
 #
 # A plan keeps its back-offs wherever its reference is: they are rows of the program. The reference decides how often
 # a new position leaves a plan that cannot keep them. So it keeps the larger of two distances from a limit. At the
@@ -274,7 +274,7 @@ def rest_backoffs(
     most: int,
     seen: Plant | None = None,
 ) -> Array:
-    """What plans that rest keep from the rows `c` (m, n_x), where 1 … `most` of them share the risk (most, m).
+    """Return the distances (most, m) that plans at rest keep from rows `c` (m, n_x), where 1 … `most` share the risk.
 
     Args:
         risk: How the risk is spread over the ages.
@@ -294,9 +294,9 @@ def rest_backoffs(
 
 @dataclass(frozen=True, eq=False)
 class _RestingRows:
-    """What is known of the rows, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
+    """Data of the rows for plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
 
-    risk: AgeRisk  # how the risk is spread over the ages
+    risk: AgeRisk  # spread of the risk over the ages
     late: int  # age of most positions when they come [steps]
     gaps: Array  # q_t (L,)
     sigma: Array  # deviations of the rows (H, m) in the stages of a plan
@@ -304,7 +304,7 @@ class _RestingRows:
     news: Array  # deviations of the rows (L, H, m) in the stages of a new plan that news make, before its inputs
 
     def distance(self, row: int, share: int, allowed: float) -> float:
-        """What a row is kept that shares the risk with `share` - 1 others."""
+        """Return the distance to keep from a row that shares the risk with `share` - 1 others."""
         weights, sigma = self.risk.weights[self.late :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.late + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
         backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
@@ -335,7 +335,7 @@ def _asked(
     plant, steps = problem.plant, problem.horizon
     late = int(risk.weights.argmax())
     spread = unseen(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
-    # How long plans are flown, by how old what they are made from becomes in the share of time π.
+    # Share of plans that are still flown at each age of their information, from the shares of time π.
     flown = np.minimum.accumulate(risk.weights[late:] / risk.weights[late])
     gaps = flown - np.append(flown[1:], 0.0)
     news = spread[1 : gaps.size + 1] - spread[0]
@@ -356,7 +356,7 @@ def _powers(matrix: Array, most: int) -> Array:
 
 
 def _reach(problem: ControlProblem, slew: SlewRows, seen: Array) -> Array:
-    """How far inputs bring the rows away from their limits in 1 … H steps (H, m), from an input of zero.
+    """Return how far inputs bring the rows away from their limits in 1 … H steps (H, m), from an input of zero.
 
     Args:
         slew: How far setpoints may go in a step.

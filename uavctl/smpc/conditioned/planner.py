@@ -70,7 +70,7 @@ _OPEN = np.array([OPEN])
 
 @dataclass(frozen=True, eq=False)
 class _Margins:
-    """What a covariance and an age ask of the rows, in each stage."""
+    """Margins that a covariance and an age ask of the rows, in each stage."""
 
     sigma: Array  # standard deviations (H, m)
     budgets: Array  # ε̄ of the stages (H,), infinite where nothing is asked
@@ -80,13 +80,13 @@ class _Margins:
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """How the risk is spread over the ages, and what follows from it, by how late [steps] a position was."""
+    """Spread of the risk over the ages, and what follows from it, by how late [steps] a position was."""
 
     risk: AgeRisk  # the spread
     budgets: Array  # ε̄ of the stages (H, H)
     shared: Array  # quantiles of rows that share them equally (H, H, 1)
     distant: Array  # quantiles of rows at first which the regulator's plan is not near (H, H, 1)
-    rest: Array  # what a plan that rests keeps from each row (n, m), by how many rows are in the way of a target
+    rest: Array  # distance of a plan at rest from each row (n, m), by how many rows are in the way of a target
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ class ConditionedSolver:
 
         self._near = spread(age_risk(link, self._pacing(), allowed, price, many))
         self._transit = spread(equal_risk(link, steps, allowed, many))
-        # Who rests there is seldom outside even at the oldest age that keeps something back, so limits matter on the
+        # A plan at rest there is seldom outside even at the oldest age with a back-off, so limits matter on the
         # way alone.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.of(None)[max(0, counts - 1)]
@@ -273,7 +273,7 @@ class ConditionedSolver:
         return self._transit if (self._placed.dot(target[self._rests.held]) <= kept).all() else self._near
 
     def _margins(self, spread: _Spread, outlook: Preview) -> _Margins:
-        """Those of an outlook; the last ones are kept, by the very bits that they are made of."""
+        """Return the margins of an outlook; the last ones are cached, by the exact bits that they are made of."""
         key = spread is self._transit, outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
         if self._last is None or self._last[0] != key:
             sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
@@ -360,7 +360,7 @@ class ConditionedSolver:
         """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
         problem = self.problem
         if outlook.path is None:
-            # The regulator's own cost, and the square of what leaves it.
+            # The regulator's own cost, and the square of the deviation from it.
             cost = dx[0] @ self._tail @ dx[0] + sum(np.vdot(z, z) for _, z in found.left)
         else:
             last, dx, du = dx[-1], dx[:-1] - outlook.path.states, du - outlook.path.inputs
@@ -418,7 +418,7 @@ class ConditionedDecider:
         return gathered(answers, (problem.horizon, problem.plant.n_u))
 
 
-# What flights with risk conditioned on the age are planned with: the counterpart of a design, made at once.
+# Design for flights with risk conditioned on the age: the counterpart of a design, made at once.
 
 
 _SETTLED = 2.0 / 3.0  # of the horizon: a plan along a motion rests from there on, whatever that asks of the inputs
@@ -465,7 +465,7 @@ class ConditionedDesign:
         return max(1, round(_SETTLED * self.horizon))
 
 
-AnyDesign: TypeAlias = "Design | ConditionedDesign"  # what a flight is planned with, of either scheme
+AnyDesign: TypeAlias = "Design | ConditionedDesign"  # design of either scheme
 
 
 def conditioned_id(

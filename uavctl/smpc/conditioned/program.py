@@ -57,7 +57,7 @@ class SlewRows:
             self._nearest = QuadraticProgram(np.eye(n), input_set.c.copy(), hard, np.zeros(m), np.zeros(m))
 
     def own(self, inputs: Index) -> Index:
-        """Which rows have to do with some inputs."""
+        """Return which rows involve some inputs."""
         return np.flatnonzero(np.any(self.d[:, inputs] != 0.0, axis=1))
 
     def first(self, sent: Array) -> tuple[Array, Array]:
@@ -136,7 +136,7 @@ class PartProgram:
         rows = np.vstack([rows_x, rows_u])
 
         def places(of_states: Index, of_hard: Index) -> Index:
-            """Where the rooms (rows,) of one side stand."""
+            """Return the indices of the rooms (rows,) of one side."""
             at_x = columns.start + width * np.arange(steps)[:, None] + of_states
             at_u = width * steps + hard.start + of_u.shape[1] * np.arange(steps)[:, None] + of_hard
             return np.append(np.where(of_states >= 0, at_x, end).ravel(), np.where(of_hard >= 0, at_u, end).ravel())
@@ -290,7 +290,7 @@ class RestPlaces:
 
 
 class RegulatedRows:
-    """What follows from a deviation dx (n_x,) of the state from its reference, under the regulator."""
+    """Effect of a deviation dx (n_x,) of the state from its reference on plan and rows, under the regulator."""
 
     def __init__(self, problem: ControlProblem, law: Lqr, parts: Sequence[Part], slew: SlewRows) -> None:
         plant, steps, n_x = problem.plant, problem.horizon, problem.plant.n_x

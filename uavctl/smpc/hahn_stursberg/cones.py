@@ -20,7 +20,7 @@ from scipy import sparse
 
 from uavctl.smpc.sets import Scale
 
-# How Clarabel is asked, by whoever asks it directly.
+# Settings of Clarabel for direct calls.
 
 
 # The optimum is to be right to 1e-7. With a smaller gap the linear algebra may run out of digits before the end.
@@ -206,7 +206,7 @@ BREAKDOWN = "Breakdown"  # the numbers overflow, or the solver panics
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the solver gave back."""
+    """Result of the solver."""
 
     status: str  # name of Clarabel's status, or BREAKDOWN
     variables: Array  # (n,), not necessarily finite
@@ -216,7 +216,7 @@ class Solution:
 
 
 def unless_panic(call: Callable[[], Result]) -> Result | None:
-    """What `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
+    """Return what `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
     try:
         return call()
     except BaseException as error:

@@ -55,7 +55,7 @@ MOST_CANDIDATES = 500
 
 @dataclass(frozen=True, eq=False)
 class DesignSpec:
-    """What a design is asked for; the fields are those of the configuration of the same name."""
+    """Specification of a design; the fields are those of the configuration of the same name."""
 
     plant: Plant
     state_set: Polytope
@@ -98,7 +98,7 @@ class Design:
     target: Array  # equilibrium that the design was checked at (n_x,)
     horizon: int  # H
     schedule: Schedule  # delays and likelihoods
-    terminal: Terminal  # what follows after the horizon
+    terminal: Terminal  # terminal feedback after the horizon
     kappa_x: Array  # κ_t of the state rows (H+1,); entry 0 is not used
     kappa_u: Array  # κ_t of the input rows (H,)
     kappa_x_terminal: float  # the larger of δ_x's and the last stage's

@@ -375,7 +375,7 @@ def optimal_cost(design: Design, x: Array) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class LateDemand(ScheduleDemand):
-    """What a schedule has to meet that is based on a position `late` steps old; stages count from now."""
+    """Requirements on a schedule that is based on a position `late` steps old; stages count from now."""
 
     late: int = 0
 
@@ -385,7 +385,7 @@ class LateDemand(ScheduleDemand):
         return 1.0 if newest < 0 else self.link.available(t + self.late, newest, self.late)
 
     def usable(self, delays: Sequence[int]) -> Array:
-        """See `Demand`."""
+        """See `ScheduleDemand`."""
         if self.joint:
             sunk = range(1, self.late + 1)  # longer than the time since the base: no feedback
             return self.link.jointly((*sunk, *(delays)), self.late)[self.late :]

@@ -26,7 +26,7 @@ from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
 # limits. Rows whose room it takes whole are pinned to the middle. If the pinned mean QP is feasible, the multipliers
 # of the pinned rows stay within those of the policy, and no other row that depends on the gains has one, the KKT
 # conditions of the joint problem hold (theory notes, D). All components are prepared and judged in common, since
-# Python's time goes by calls.
+# Python's time grows with the number of calls.
 
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Numbers(msgspec.Struct, frozen=True, eq=False):
 
 
 class FrozenAnswer(msgspec.Struct, frozen=True, eq=False):
-    """What the frozen policies say, before it is certified."""
+    """Answer of the frozen policies, before it is certified."""
 
     q: Array  # means (Σ n_q,)
     multipliers: Array  # of the rows (Σ m,), positive at an upper side
@@ -333,7 +333,7 @@ class PlanMap:
         return np.hstack([np.vstack([inputs, self._of_u @ inputs, reference, *offsets]), of_x])
 
     def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Where the components' tables, one after another, have each back-off: (H+1, m_x) and (H, m_u)."""
+        """Return the index of each back-off in the components' tables, one after another: (H+1, m_x) and (H, m_u)."""
         design, steps = self._design, self._shape_u[0]
         of_x = np.zeros((steps + 1, design.state_set.b.size), dtype=np.intp)
         of_u = np.zeros((steps, design.input_set.b.size), dtype=np.intp)

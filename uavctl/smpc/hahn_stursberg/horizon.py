@@ -201,7 +201,7 @@ class Horizon:
         fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # nothing to feed back otherwise
         # Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank
         self.drive = _felt(component.b)
-        # Stages whose input limits are not implied by the terminal condition: N, but H where B has not full column
+        # Stages whose input limits are not implied by the terminal condition: N, but H where B lacks full column
         # rank, because (19c) then says nothing about what the state does not feel
         self.input_stages = self.free if len(self.drive) == n_u else steps
         # (t, r, input, row of `feedback`) of each entry of θ

@@ -35,7 +35,7 @@ from uavctl.smpc.hahn_stursberg.policies import Covariance, Policy, PolicyProgra
 from uavctl.smpc.qp import OPEN
 from uavctl.smpc.sets import Polytope
 
-# What a policy library is made for: states, targets, and what may be known ahead.
+# Region that a policy library is made for: states, targets, and what may be known ahead.
 
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ class Region:
         return target + _SPREAD * rng.random() * self._root @ rng.standard_normal(target.size), target
 
     def ahead(self, rng: np.random.Generator) -> Preview:
-        """What the whole plant knows ahead, as far as this component goes: mostly nothing."""
+        """Draw what is known ahead of the whole plant, as far as this component goes: mostly nothing."""
         kind, design, part = rng.random(), self._design, self._part
         if kind < _FOLLOWS:  # a free motion, which the plant can follow
             state = _SPREAD * self._root @ rng.standard_normal(part.a.shape[0])
@@ -284,7 +284,7 @@ class LibrarySolver:
 
 
 def _sane(outlook: Preview) -> bool:
-    """Whether all that is known ahead are numbers to calculate with."""
+    """Whether all numbers that are known ahead are finite, and not absurdly large."""
     given = [] if outlook.limits is None else [outlook.limits]
     if outlook.path is not None:
         given += [outlook.path.states, outlook.path.inputs]

@@ -28,7 +28,7 @@ _RANK = 1e-9
 
 
 class RowKind(IntEnum):
-    """What a row limits."""
+    """Quantity that a row limits."""
 
     INPUT = 0
     STATE = 1
@@ -41,7 +41,7 @@ class RowKind(IntEnum):
 class Row:
     """One direction c of a limit in one stage, both sides."""
 
-    kind: RowKind  # what it limits
+    kind: RowKind  # quantity that it limits
     t: int  # stage; of a reference row, N
     c: Array  # direction: of the state, the input, or y
     upper: int  # row of the set that limits +c, -1 for none
@@ -153,7 +153,7 @@ class MeanProblem:
         return self.question_of(self.parameters(x, target), outlook)
 
     def question_of(self, p: Array, outlook: Preview) -> Question:
-        """The same for parameters p (n_p,)."""
+        """Return a question in numbers for parameters p (n_p,)."""
         f, constant = self.cost(p, outlook)
         upper, lower = self.sides(outlook)
         return Question(f, constant, self.r @ p, np.minimum(upper, OPEN), np.maximum(lower, -OPEN), p)

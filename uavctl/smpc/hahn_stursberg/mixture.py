@@ -71,7 +71,7 @@ class RowOrder:
 
 @dataclass(frozen=True, eq=False)
 class Below:
-    """What the cuts say of a question."""
+    """Lower bound of the optimum that the cuts give for a question."""
 
     bound: float  # lower bound of the optimum
     weights: Array  # weights of the cuts (K,), of sum 1
@@ -163,7 +163,7 @@ class Cuts:
         return Below(bound, weights, room, sides)
 
     def height(self, below: Below) -> Array:
-        """How far the bound's φ is above each cut (K,)."""
+        """Return how far the bound's φ is above each cut (K,)."""
         height: Array = self._slope @ below.room - self._level
         return height
 

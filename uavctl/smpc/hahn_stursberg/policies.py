@@ -28,10 +28,10 @@ _NOTHING = 1e-7
 # Where a row has one side only, the cheapest policy's back-off there is bounded by this many usual ones.
 _FAR = 1e3
 
-# What a policy may miss the terminal condition by, scaled to unit variances.
+# Amount by which a policy may miss the terminal condition, scaled to unit variances.
 _KEPT = 1e-6
 
-# How far a question is on the infeasible side of another's proof, relative to that one, to share its fate.
+# Distance of a question on the infeasible side of another's proof, relative to that one, to count as infeasible too.
 _BEYOND = 1e-3
 
 _ENDED_WELL = ("Solved", "AlmostSolved", "InsufficientProgress")

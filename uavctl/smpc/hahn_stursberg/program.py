@@ -108,8 +108,8 @@ class Program:
         soft_terminal: Allow x̄_N to miss x_s, and x_s to be outside its limits, at `terminal_weight`.
 
     In the hard form the rows of stages t >= N are not written out: their means are x_s and u_s, and Cov(x_t) <= Σ_x,
-    Cov(u_t) <= K Σ_x Kᵀ by the terminal condition, so the terminal rows with the largest κ imply them. Where B has not
-    full column rank the latter is not so, and the input rows of these stages are written out.
+    Cov(u_t) <= K Σ_x Kᵀ by the terminal condition, so the terminal rows with the largest κ imply them. Where B lacks
+    full column rank the latter does not hold, and the input rows of these stages are written out.
     """
 
     def __init__(self, design: Design, horizon: Horizon, *, soft_terminal: bool) -> None:

@@ -36,7 +36,7 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class ScheduleDemand:
-    """What a schedule has to meet."""
+    """Requirements on a schedule."""
 
     link: LinkModel  # model of the link
     horizon: int  # H

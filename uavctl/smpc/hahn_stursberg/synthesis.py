@@ -41,7 +41,7 @@ LARGEST_RADIUS = 1.0 - 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Weight:
-    """What is weighed: Q_x (n_x, n_x) and Q_u (n_u, n_u)."""
+    """Weights of the cost: Q_x (n_x, n_x) and Q_u (n_u, n_u)."""
 
     x: Array
     u: Array
@@ -135,7 +135,7 @@ class DelayedLoop:
 
 # Share of the room that a terminal ellipsoid may fill: a design needs an interior around its target.
 MOST_FILLED = 0.99
-# What the optimiser is shown where there is no stationary cost (relative to the start's).
+# Cost shown to the optimiser where there is no stationary cost (relative to the start's).
 _WALL = 1e6
 _INPUT_WEIGHTS = tuple(10.0**power for power in range(9))
 _ROUNDING = 1e-8
@@ -145,7 +145,7 @@ _LARGEST_DISCOUNT, _LEAST_DISCOUNT = 0.05, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class GainTask:
-    """What is minimised for one independent part of the plant, and within what."""
+    """Cost and limits that a gain is sought for, of one independent part of the plant."""
 
     loop: DelayedLoop  # the delayed loop
     weight: Weight  # Q_x, Q_u

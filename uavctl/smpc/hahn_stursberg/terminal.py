@@ -20,7 +20,7 @@ _DOUBLINGS = 40  # 2^40 steps: enough for the largest radius that is taken
 
 @dataclass(frozen=True, eq=False)
 class Terminal:
-    """What follows after the horizon: u(k+t) = K_τ x(k+t-τ)."""
+    """Terminal feedback after the horizon, u(k+t) = K_τ x(k+t-τ), with its covariances and weights."""
 
     tau: int  # τ [steps]
     k: Array  # K_τ (n_u, n_x)
