@@ -21,12 +21,21 @@ CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
 # Most of a run's time. They begin, so that no worker is left alone with one of them in the end.
 LONGEST = (
-    "test_closed_loop", "test_operation", "test_campaign_cmd", "test_properties", "test_soak", "test_general_plants",
-    "test_report", "test_sim_quadrotor_peers", "test_identify", "test_whatif", "test_late", "test_conic",
-    "test_library_solver", "test_fly", "test_check_cmd", "test_sources", "test_policies", "test_paper_cmd",
-    "test_scaling", "test_bench", "test_whatif_cmd", "test_faults_storage", "test_hand_over_restart",
-    "test_foreign_stream", "test_bench_loop", "test_natnet_flight", "test_engagement", "test_outlook", "test_viewers",
-    "test_loopback", "test_relay", "test_take_off", "test_linear_world_flight", "test_check_axes", "test_synthesis",
+    "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
+    "test_tune_real", "test_closed_loop", "test_soak", "test_properties", "test_whatif_inertial", "test_conditioned",
+    "test_recorded_flights", "test_extending", "test_relay_outlives", "test_tune", "test_inertial_lies",
+    "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias",
+    "test_inertial_errors", "test_late", "test_whatif", "test_fly", "test_report", "test_loopback", "test_cuts",
+    "test_foreign_stream", "test_engagement", "test_check_cmd", "test_conic", "test_campaign_docs",
+    "test_sim_quadrotor_peers", "test_library_solver", "test_policies", "test_hand_over_restart", "test_whatif_cmd",
+    "test_campaign_trials", "test_identify_jerk", "test_daemon", "test_sources", "test_scaling", "test_trial_fly",
+    "test_report_words", "test_live", "test_build_link", "test_bench_loop", "test_campaign_positions",
+    "test_report_figures", "test_flight_mission", "test_trial_own_loop", "test_natnet_flight", "test_config_bounds",
+    "test_bench", "test_paper_cmd", "test_rest_backoffs", "test_outlook", "test_relay", "test_conditioned_flight",
+    "test_replay", "test_difference", "test_conditioned_design", "test_foreign", "test_flat",
+    "test_sim_autopilot_bytes", "test_sim_fuzz", "test_library", "test_synthesis", "test_campaign_world", "test_loop",
+    "test_check_axes", "test_frozen", "test_take_off", "test_replay_soak", "test_foreign_ros", "test_paper_depth",
+    "test_viewers", "test_sealed", "test_sim_observed",
 )  # fmt: skip
 
 

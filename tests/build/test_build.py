@@ -91,6 +91,7 @@ def test_a_controller_holds_the_configuration_s_numbers() -> None:
     assert controller.estimator.window_s == config.estimator.window_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "asked"),
     [([], True), (["relay.enabled=true"], False), (['source.messages=["LOCAL_POSITION_NED"]'], False)],
@@ -100,6 +101,7 @@ def test_a_velocity_that_is_made_of_our_positions_is_no_witness(overrides: list[
     assert (build_controller(config, build_design(load_config("room-hahn-stursberg"))).trust.at_rest_mps > 0.0) == asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", presets())
 def test_every_preset_can_be_flown(preset: str) -> None:
     config = load_config(preset)

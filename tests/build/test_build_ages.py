@@ -46,6 +46,7 @@ def chances() -> Array:
     return draw(17, 0, RUNS, STEPS, 1).link
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LINKS)
 def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
     given = config(*LINKS[name])

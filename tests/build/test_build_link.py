@@ -125,6 +125,7 @@ def arrivals(config: Config, packets: int, seed: int) -> NDArray[np.bool_]:
     return through
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     [

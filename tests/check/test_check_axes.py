@@ -98,6 +98,7 @@ def test_a_frame_that_is_turned_a_little_is_measured_when_it_moves(autopilot: st
     assert told is not None and abs(int(told[1]) - angle_deg) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15)
 @BOTH
 @pytest.mark.parametrize(
@@ -146,6 +147,7 @@ def test_at_rest_on_the_origin_the_noise_tells_the_unit(autopilot: str) -> None:
     assert found["position noise"].state is ItemState.BAD and "millimetres" in found["position noise"].hint
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15)
 @BOTH
 @pytest.mark.parametrize(

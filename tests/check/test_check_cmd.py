@@ -68,6 +68,7 @@ def checked(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, d
     return code, document
 
 
+@pytest.mark.slow
 def test_a_right_set_up_is_ready(capsys: pytest.CaptureFixture[str], urls: list[str]) -> None:
     code, document = checked(capsys, *urls, *accept())
     assert (code, document["ok"]) == (0, True), [one for one in document["items"] if not one["ok"]]
@@ -77,6 +78,7 @@ def test_a_right_set_up_is_ready(capsys: pytest.CaptureFixture[str], urls: list[
     assert wanted <= names
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15)
 def test_a_wrong_frame_is_not(capsys: pytest.CaptureFixture[str], urls: list[str]) -> None:
     code, document = checked(capsys, *urls, "--set", "frame.convention=enu")
@@ -86,12 +88,14 @@ def test_a_wrong_frame_is_not(capsys: pytest.CaptureFixture[str], urls: list[str
     assert (code, document["ok"]) == (0, True)
 
 
+@pytest.mark.slow
 def test_people_get_a_table(capsys: pytest.CaptureFixture[str], urls: list[str]) -> None:
     assert run(["check", "--seconds", "4", *urls, "--set", "frame.yaw_deg=90"]) == 1
     out = capsys.readouterr().out
     assert "not ready" in out and "what to do" in out and "axes" in out
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15)
 def test_fly_does_not_arm_with_a_wrong_frame(urls: list[str], tmp_path: Path) -> None:
     out = tmp_path / "flight"

@@ -366,6 +366,7 @@ def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) ->
     assert hand.done().items
 
 
+@pytest.mark.slow
 @given(st.lists(st.binary(max_size=64), max_size=30))
 def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
     flight = Preflight(load_config("room-hahn-stursberg"), make_links, 0)

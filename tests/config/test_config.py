@@ -57,6 +57,7 @@ def test_dumped_text_gives_an_equal_configuration(preset: str) -> None:
     assert parse(dump_config(config), "dump").config == config
 
 
+@pytest.mark.slow
 @given(name=st.text(max_size=100), numbers=st.lists(st.floats(min_value=0.0) | st.just(math.inf), min_size=1))
 @settings(max_examples=200)
 def test_any_text_and_any_number_is_dumped_as_it_is(name: str, numbers: list[float]) -> None:

@@ -279,6 +279,7 @@ def quick(words: list[str]) -> list[str]:
     return [*words, "--set", "solver.method=exact"]
 
 
+@pytest.mark.slow
 def test_a_slice_of_spoilt_configurations_ends_in_an_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

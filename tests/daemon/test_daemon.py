@@ -170,6 +170,7 @@ class Stalled(Bench):
         return [name for name, waiting in self.arrived.items() if waiting]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_step", [False, True])
 @pytest.mark.parametrize("stall_ticks", [6, 20, 50])
 @pytest.mark.fault(49)

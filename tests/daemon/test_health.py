@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+import pytest
 from loopback_rig import Memory, make_loop
 
 from sim.simulation import Peers
@@ -52,6 +53,7 @@ def test_before_the_first_tick_nothing_is_known_and_nothing_fails() -> None:
     assert line(health).startswith("-  age - s  loss - %")
 
 
+@pytest.mark.slow
 def test_a_flight_in_figures() -> None:
     flight = Flight("room-hahn-stursberg", "link.loss=0.0")
     health = flight.run(200, lateness_ns=700_000)

@@ -16,6 +16,7 @@ def _library() -> None:
     library_for(build_design(load_config("room-hahn-stursberg")))
 
 
+@pytest.mark.slow
 @pytest.mark.fault(49)
 def test_a_daemon_that_was_stopped_sends_nothing_to_a_vehicle_that_the_pilot_has() -> None:
     assert [row["setpoints"] for row in stalls(1, 3, 600.0, signed=True)] == [0]

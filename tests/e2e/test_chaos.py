@@ -27,6 +27,7 @@ def test_every_setpoint_is_finite_bounded_and_slew_limited_with_faults_of_all_ki
     assert count.flights > 5
 
 
+@pytest.mark.slow
 def test_the_random_flights_see_every_mode_refusal_and_answer() -> None:
     modes, codes = set(), set()
     for _, output, _ in runs(np.random.default_rng(1), 10_000, orders=True):

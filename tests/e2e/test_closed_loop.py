@@ -26,6 +26,7 @@ def paper_flight(seed: int) -> tuple[FlightSummary, FlightSummary]:
     return summarise(flight(memory), wall_s=1.0), summarise(first, wall_s=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 20, 4))
 def test_paper_flies_200_steps_without_slack(first: int) -> None:
     outside = 0
@@ -40,6 +41,7 @@ def test_paper_flies_200_steps_without_slack(first: int) -> None:
     assert outside < 0.01 * 4 * 200
 
 
+@pytest.mark.slow
 def test_a_flight_of_200_steps_replays_identically() -> None:
     memory = lockstep("paper", 200.0, "sim.seed=3")
     result = replay(memory.entries, partial(make_loop, load_config("paper", ["sim.seed=3"])))
@@ -95,6 +97,7 @@ def test_playout_flies_the_old_plan_s_next_input_in_every_step_of_silence() -> N
     assert silent > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "near_m"), [("room-hahn-stursberg", 0.25), ("room", 0.05)])
 def test_a_room_s_flight_settles_at_the_target_from_the_far_corner(preset: str, near_m: float) -> None:
     for seed in range(3):
@@ -116,6 +119,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
     assert sent(5) != sent(6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "largest_gap"), [("library", 1e-3), ("exact", 1e-6)])
 def test_plans_are_optimal_and_certified(method: str, largest_gap: float) -> None:
     plans = lockstep("room-hahn-stursberg", 10.0, f"solver.method={method}").of(Plan)
@@ -127,6 +131,7 @@ def test_plans_are_optimal_and_certified(method: str, largest_gap: float) -> Non
     assert {plan.method for plan in plans} <= ({"frozen", "mixture", "exact"} if method == "library" else {"exact"})
 
 
+@pytest.mark.slow
 def test_the_library_decides_as_the_exact_program_does() -> None:
     """To the same question as far apart as its certificate lets it be, and in flight as far as that can carry."""
     direct = ("sim.seed=2", "envelope.lead_s=0")  # all plans go to the same target

@@ -29,6 +29,7 @@ def flight() -> Memory:
     return lockstep("room", 30.0, "sim.seed=4")
 
 
+@pytest.mark.slow
 def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
     plans = flight.of(Plan)
     assert {plan.method for plan in plans} == {METHOD}
@@ -72,6 +73,7 @@ def test_a_flight_replays_bit_for_bit(flight: Memory) -> None:
     assert replay(flight.entries, lambda sink: make_loop(config, sink)).identical
 
 
+@pytest.mark.slow
 def test_a_fence_that_closes_in_is_kept() -> None:
     found = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
     assert max(truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 14e9) < 1.2
@@ -80,6 +82,7 @@ def test_a_fence_that_closes_in_is_kept() -> None:
     assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
 
 
+@pytest.mark.slow
 def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
     found = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
     rests = resting(build_conditioned(load_config("room")))[0]

@@ -76,33 +76,39 @@ def deafen(kind: str) -> Callable[[Endings], None]:
 # As ordered
 
 
+@pytest.mark.slow
 def test_the_mission_is_over(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "mission.waypoints=[[0.3,0.0,-1.2]]", "mission.hold_s=0.5", "mission.then='land'")
     told = typed(rig, Cause.MISSION, *TAKE_OFF, good=True)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_operator_orders_the_landing(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, order(Order.LAND), after_s=2.0)
     typed(rig, Cause.ORDERED, *TAKE_OFF, good=True)
 
 
+@pytest.mark.slow
 def test_the_operator_ends_it(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=2.0)
     told = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_operator_hands_over_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(HandoverState.ENGAGED, interrupt, after_s=3.0)
     told = typed(rig, Cause.OPERATOR, good=True)
     assert "in the air, in mode OFFBOARD" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path), Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode: str) -> None:
     rig = Endings(tmp_path, f"sim.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
@@ -111,12 +117,14 @@ def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode:
     assert f"in the air, in mode {mode}" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0)
     rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=1.0)
     typed(rig, Cause.PILOT_LANDED, good=True)
 
 
+@pytest.mark.slow
 def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
     rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
@@ -127,6 +135,7 @@ def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_pat
 # The take-off
 
 
+@pytest.mark.slow
 def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.CLIMBING, stick("POSCTL"), after_s=0.6)
     rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
@@ -134,20 +143,24 @@ def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, typed: Type) -> None:
     assert "before the controller was in charge" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_operator_ends_it_in_the_climb(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).at(HandoverState.CLIMBING, interrupt, after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).at(HandoverState.CLIMBING, order(Order.LAND), after_s=0.5), Cause.NOT_ENGAGED, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
     poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
     told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
     assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.ground_s=4.0")
     rig.hears = lambda data: not NO_COMMANDS(data)
@@ -155,6 +168,7 @@ def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None
     assert "did not answer" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
     monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
@@ -162,11 +176,13 @@ def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytes
     assert "FAILED" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
     told = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.NO_CLIMB, *TAKE_OFF)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.engage_s=3.0")
     rig.at(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
@@ -179,6 +195,7 @@ def test_no_positions_come(tmp_path: Path, typed: Type) -> None:
     typed(rig, Cause.NO_POSITIONS, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_no_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.ground_s=4.0")
     rig.told = lambda data: False
@@ -201,10 +218,12 @@ def test_the_vehicle_is_in_the_air_already(tmp_path: Path, typed: Type) -> None:
     assert "armed already" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_pilot_never_switches(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).after(4.0, interrupt), Cause.NOT_FLOWN)
 
 
+@pytest.mark.slow
 def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Endings(tmp_path, airborne=True)
     begin = rig.fly
@@ -222,17 +241,20 @@ def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monk
 # In flight
 
 
+@pytest.mark.slow
 def test_the_place_is_not_reached(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path)
     told = typed(rig, Cause.NOT_REACHED, *TAKE_OFF, "--goto", "2.2,1.2,-1.2", "--duration", "4")
     assert "2.2,1.2,-1.2" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_fallback_lands_it(tmp_path: Path, typed: Type) -> None:
     told = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK, *TAKE_OFF)
     assert "age of information" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [TAKE_OFF, ()])
 def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
     # The cameras take another body for ours: its positions are not believed, and ours do not come back.
@@ -242,28 +264,33 @@ def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, 
     assert "jumped" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_landing_fails(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=6.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
     assert "in the air" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._disarm(), after_s=2.0)
     typed(rig, Cause.DISARMED, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_the_envelope_lets_it_go(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "target.position_m=[2.0,1.0,-1.2]", peers=("frame.yaw_deg=90.0",))
     told = typed(rig, Cause.LET_GO, *TAKE_OFF)
     assert told.summary["let_go"] and told.summary["let_go"] in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, fail(Role.LAND), after_s=2.0)
     typed(rig, Cause.FAILSAFE_LANDED, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.climb_s=8.0")
     rig.at(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
@@ -271,6 +298,7 @@ def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path,
     assert "has not ended in 8 s" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
     rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
@@ -278,6 +306,7 @@ def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Ty
     assert "in the air" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
     def young(rig: Endings) -> None:
         mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -293,6 +322,7 @@ def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
     typed(rig, Cause.RESTARTED, *TAKE_OFF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [TAKE_OFF, ()])
 def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
     def silence(rig: Endings) -> None:
@@ -304,6 +334,7 @@ def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str,
     assert "not heard for" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_the_connection_is_closed(tmp_path: Path, typed: Type) -> None:
     def close(rig: Endings) -> None:
         rig.lines["vehicle"].closed = True
@@ -328,6 +359,7 @@ def test_the_controller_fails_and_the_relay_goes_on(
     assert told.relay is not None and told.relay.alone
 
 
+@pytest.mark.slow
 def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
     rig.at(HandoverState.ENGAGED, Endings.ask_status, after_s=1.0).at(
@@ -348,6 +380,7 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     assert told.relay is not None and told.relay.alone
 
 
+@pytest.mark.slow
 def test_the_operator_is_answered_with_the_end_that_is_under_way(tmp_path: Path, typed: Type) -> None:
     rig = (
         Endings(tmp_path)
@@ -380,6 +413,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
     assert code == 0 and words_of(page).count(recorded.sentence) == 2
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -398,6 +432,7 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
 # What the daemon has no part in
 
 
+@pytest.mark.slow
 def test_an_end_that_is_cut_off_is_told_everywhere(
     tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -423,6 +458,7 @@ def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
     assert summarise(flight, wall_s=None).ending.sentence == ending["sentence"]
 
 
+@pytest.mark.slow
 def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -452,6 +488,7 @@ def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> 
         assert code == str(make_ending(cause, "").exit_code), cause
 
 
+@pytest.mark.slow
 def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
     with sole_daemon("udpin://127.0.0.1:1") as tenure:

@@ -53,6 +53,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
     assert not list(tmp_path.rglob("*.mcap"))
 
 
+@pytest.mark.slow
 def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["--arm", "--takeoff", "1.2", "--goto", "1.5,1,-1.2", "--duration", "12", "--json", "--out", str(tmp_path)]
     code, out, err = typed(capsys, "loopback", *words, *FLOOR)
@@ -81,6 +82,7 @@ def test_a_refused_take_off_is_told_with_the_vehicle_s_reason(
     assert code == 1 and "low battery" in err and "TEMPORARILY_REJECTED" in err
 
 
+@pytest.mark.slow
 def test_the_same_way_over_real_sockets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
     code, _, err = typed(capsys, "loopback", *words, *FLOOR)

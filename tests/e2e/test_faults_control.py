@@ -71,6 +71,7 @@ def test_row_3_fallback_in_the_very_tick_in_which_the_age_reaches_the_horizon() 
     assert outputs[entered].decision.reason == "age of information 4 has reached H = 4"
 
 
+@pytest.mark.slow
 @pytest.mark.fault(3)
 def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
     rng = np.random.default_rng(30)

@@ -386,6 +386,7 @@ def check(item: Item) -> None:
         assert item.captured_ns <= item.received_ns
 
 
+@pytest.mark.slow
 def test_mutated_messages_raise_nothing() -> None:
     link = make_link(
         source=SourceConfig(

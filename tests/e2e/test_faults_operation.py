@@ -75,6 +75,7 @@ def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
     assert flight.speed_mps < 0.2 and flight.truths[-1].mode == "GUIDED"
 
 
+@pytest.mark.slow
 @pytest.mark.fault(27)
 def test_a_vehicle_that_falls_silent_is_braked_then_held_then_left_to_its_own_failsafe() -> None:
     flight = Flight()
@@ -88,6 +89,7 @@ def test_a_vehicle_that_falls_silent_is_braked_then_held_then_left_to_its_own_fa
     assert SETPOINT not in flight.run(5.0)  # heard again, but no longer ours
 
 
+@pytest.mark.slow
 @pytest.mark.fault(27)
 def test_setpoints_die_with_the_control_loop() -> None:
     flight = Flight()

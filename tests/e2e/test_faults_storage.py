@@ -186,6 +186,7 @@ def test_30_slow_disk_never_holds_up_the_caller(tmp_path: Path) -> None:
     assert info(path).dropped == 300
 
 
+@pytest.mark.slow
 @pytest.mark.fault(31)
 def test_31_killed_processes_lose_the_open_chunk_at_most() -> None:
     done = subprocess.run(
@@ -203,6 +204,7 @@ def test_31_killed_processes_lose_the_open_chunk_at_most() -> None:
         assert figures["records_put"] >= figures["records_kept"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "runs"), [("cuts", 4), ("killed-flight", 2)])
 @pytest.mark.fault(52)
 def test_what_is_left_of_a_flight_replays_alike(scenario: str, runs: int) -> None:
@@ -255,6 +257,7 @@ def readable(path: Path) -> tuple[list[Item], bool]:
     return own(got), False
 
 
+@pytest.mark.slow
 @pytest.mark.fault(32)
 @pytest.mark.parametrize("finished", [True, False])
 def test_32_a_flipped_byte_anywhere_is_never_a_wrong_value(tmp_path: Path, finished: bool) -> None:

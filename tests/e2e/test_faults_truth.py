@@ -54,6 +54,7 @@ def bounded(flight: TrueFlight) -> TrueFlight:
     return flight
 
 
+@pytest.mark.slow
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("at_s", [0.3, 2.0])
 def test_cameras_that_freeze_in_motion_are_no_worse_than_a_blackout(
@@ -67,6 +68,7 @@ def test_cameras_that_freeze_in_motion_are_no_worse_than_a_blackout(
     assert frozen.ended in ("AUTO.LAND", "LAND", "AUTO.LOITER", "GUIDED")
 
 
+@pytest.mark.slow
 @pytest.mark.fault(14)
 def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: Prepared, world: Config) -> None:
     # Two seconds have not passed, so no bias is known.
@@ -74,6 +76,7 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
     assert 0.0 <= bounded(flight).hold_mps2 <= 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("seed", [0, 2, 22, 32])
 def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_nothing_itself(
@@ -89,6 +92,7 @@ def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_noth
     assert bounded(fly_true(prepared, blackout, flight_s=14.0, own_motion=False)).outside_m <= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.fault(14, 15)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize(
@@ -113,6 +117,7 @@ def test_as_delivered_the_preset_stays_near_the_room_too(
     assert flight.alarms and "LAND" in flight.ended
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15, 45)
 @pytest.mark.parametrize("axes", IN_THE_AIR)
 def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
@@ -123,6 +128,7 @@ def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", AT_ONCE)
 def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
@@ -134,6 +140,7 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
+@pytest.mark.slow
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
 def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
@@ -148,6 +155,7 @@ def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_en
     assert any("envelope-response" in alarm for alarm in flight.alarms)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(42)
 @pytest.mark.parametrize("speed_mps", [0.1, 0.3])
 @pytest.mark.parametrize("axis", [0, 2])
@@ -170,6 +178,7 @@ def test_positions_that_cannot_be_from_the_start_let_it_land(prepared: Prepared,
     assert "LAND" in flight.ended
 
 
+@pytest.mark.slow
 @pytest.mark.fault(13)
 def test_another_body_in_motion(prepared: Prepared, world: Config) -> None:
     swapped = FaultConfig(at_s=2.0, kind="swapped", for_s=20.0)
@@ -177,12 +186,14 @@ def test_another_body_in_motion(prepared: Prepared, world: Config) -> None:
     assert flight.moved_m < MOVED_M
 
 
+@pytest.mark.slow
 @pytest.mark.fault(3)
 @pytest.mark.parametrize("at_s", [0.5, 2.5])
 def test_a_blackout_in_motion(prepared: Prepared, world: Config, at_s: float) -> None:
     bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=at_s, kind="blackout", for_s=30.0))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.2, 0.7])
 @pytest.mark.fault(42)
 def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: float) -> None:

@@ -96,6 +96,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "overrides"), CASES)
 def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: tuple[str, ...]) -> None:
     memory = flown(seconds, *overrides)
@@ -124,6 +125,7 @@ def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
     assert np.mean([distance_m(d, t) for d, t in told[-10:]]) < 0.2
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> None:
     """Both after 5 s, in which the vehicle comes from the corner."""
     circling, chasing = flown(22.0, *as_trajectory(20.0)), flown(22.0, *as_waypoints(20.0))
@@ -172,6 +174,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
     assert "the upper limit of north position gave way by " in sentence
 
 
+@pytest.mark.slow
 @unwritten()
 def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
     data = flight(flown(22.0, *WAYPOINTS))

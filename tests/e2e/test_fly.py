@@ -92,6 +92,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dic
 Flown = tuple[dict[str, Any], dict[str, Any], int, Path]
 
 
+@pytest.mark.slow
 def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target(flown: Flown) -> None:
     seen, summary, code, _ = flown
     assert (code, summary["ended"]) == (1, "landing has failed")  # the source knows no landing
@@ -156,6 +157,7 @@ def test_the_recording_replays_identically(flown: Flown) -> None:
     assert result.decisions > 200
 
 
+@pytest.mark.slow
 def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
     with daemon(free_port(), tmp_path) as process:
         process.send_signal(signal.SIGTERM)

@@ -100,6 +100,7 @@ def furthest_m(
     return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(told.codes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize("lie", ["frozen", "step", "small", "ramp"])
 @pytest.mark.fault(58)
@@ -112,6 +113,7 @@ def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(a
         assert told & {"inertial-doubted", "inertial-silent"}
 
 
+@pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -> None:
@@ -121,6 +123,7 @@ def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -
         assert lied_m < 0.1 and "inertial-doubted" in told
 
 
+@pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str) -> None:
@@ -129,6 +132,7 @@ def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str)
         assert healthy_m < -0.4 and "inertial-doubted" not in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_what_does_not_lie_is_not_doubted_and_keeps_further_from_walls(autopilot: str) -> None:
     for seed in (3, 11):

@@ -92,6 +92,7 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
     assert any("released" in event.text for event in rig.memory.of(Event))
 
 
+@pytest.mark.slow
 @pytest.mark.fault(50)
 def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again() -> None:
     rig = Rig('solver.method="exact"')

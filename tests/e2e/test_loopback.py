@@ -44,6 +44,7 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0)
     return found
 
 
+@pytest.mark.slow
 def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
     assert found.keys() >= KEYS
@@ -52,6 +53,7 @@ def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.
     assert Path(found["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.slow
 def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     library_for(build_design(load_config("room-hahn-stursberg")))
     found = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room-hahn-stursberg")
@@ -139,6 +141,7 @@ def test_records_of_a_flight_have_the_types_of_their_topics(flown: Path) -> None
         assert isinstance(record, msgspec.Struct) and topic.startswith("/") and at_ns >= 0
 
 
+@pytest.mark.slow
 def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path: Path) -> None:
     """Page and process that draws it, without the fixture that keeps it from being drawn."""
     with pytest.MonkeyPatch.context() as patch:

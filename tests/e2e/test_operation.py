@@ -47,6 +47,7 @@ def decisions(air: Scene, out: str = "f") -> list[Decision]:
     return list(records(air.folder / out / "flight.mcap", Decision))
 
 
+@pytest.mark.slow
 @pytest.mark.fault(35)
 def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(air: Scene) -> None:
     assert air.ctl("status")[0] == 1 and "start one with `uavctl fly`" in air.ctl("status")[2]
@@ -78,6 +79,7 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
     assert not list(air.control.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.fault(31)
 def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
     with ended(air.fly("f")) as process:
@@ -119,6 +121,7 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
     assert sent.index("COMMAND_LONG") == 1  # the mode is asked for with the first setpoint, and no setpoint is before
 
 
+@pytest.mark.slow
 @pytest.mark.fault(34)
 def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     with ended(air.fly("f")) as process:
@@ -139,6 +142,7 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     assert air.tap.spoken_by_now() == spoken
 
 
+@pytest.mark.slow
 def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
@@ -174,6 +178,7 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
     assert lines[0] in told  # the health line of a daemon without a terminal
 
 
+@pytest.mark.slow
 @pytest.mark.fault(55)
 def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -208,6 +213,7 @@ os.{call} = hanging
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", ["write", "fsync"])
 @pytest.mark.fault(54)
 def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
@@ -232,6 +238,7 @@ def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scen
     assert "records (the recording was last written " in told
 
 
+@pytest.mark.slow
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
     with scene("sim.seed=3") as other:
         other.control = air.control

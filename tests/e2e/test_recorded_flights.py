@@ -59,6 +59,7 @@ def words(name: str) -> list[str]:
 # --- the vehicle's own words -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -> None:
     assert len(packets(name)) > 1000
@@ -191,6 +192,7 @@ def frames(name: str) -> Frames:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "lost"), [(WIND, 0.292), (PILOT, 0.273), (BLOWN, 0.229), (RELEASED, 0.248), (WAYPOINTS, 0.222)]
 )
@@ -204,6 +206,7 @@ def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: 
     assert found.bursts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
     found, true = link(name), frames(name)
@@ -215,6 +218,7 @@ def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
     assert found.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(name: str) -> None:
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
@@ -237,6 +241,7 @@ def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> 
     assert link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
     """The truth is 0.1 s apart, the cameras' noise 2 mm."""
@@ -261,6 +266,7 @@ def _first_capture_s(name: str) -> float:
     return (min(stamps) - packets(name)[0].at_ns) * 1e-9
 
 
+@pytest.mark.slow
 def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> None:
     """By its log: dead time and lag together 0.24 and 0.32 s, drag 0.97 and 1.08 1/s, gain 0.98 and 1.10."""
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
@@ -275,6 +281,7 @@ STEP_RAMP_S = 1.0 / 5.0  # which ArduPilot makes of a step of 1 m/s² at PSC_JER
 GRID_S = 0.02  # of the dead times, and of the lags, of the fit to the simulator's log
 
 
+@pytest.mark.slow
 def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
     """By its log, per step as sent: dead time and lag 0.18 s, gain 1.027 and 1.026, drag 0.009 and 0.011 1/s.
 
@@ -462,6 +469,7 @@ def _landed(memory: Memory) -> None:
     assert "Disarming motors" in texts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "since_s", "seconds", "matters", "on_the_page"),
     [
@@ -524,6 +532,7 @@ def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
         assert not [code for code in codes(heard.memory) if code.startswith(("envelope", "fallback"))]
 
 
+@pytest.mark.slow
 def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_time() -> None:
     """Its client had let go for good in the climb, so OFFBOARD is waited for until the operator's order."""
     patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")

@@ -20,6 +20,7 @@ def test_every_recording_is_replayed() -> None:
     assert {path.name.removesuffix(".mcap.xz") for path in FOLDER.iterdir()} == set(RECORDINGS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_recording_of_before_replays_identically(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

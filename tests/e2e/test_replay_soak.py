@@ -14,6 +14,7 @@ from logs.recording.reader import segment_files
 SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for below
 
 
+@pytest.mark.slow
 def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
     found = [replayed(seed, tmp_path) for seed in SEEDS]
     assert {one.seed: one.result.first_difference for one in found if not one.good} == {}

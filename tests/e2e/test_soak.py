@@ -31,6 +31,7 @@ def faulty() -> Prepared:
     return prepared_for()
 
 
+@pytest.mark.slow
 def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> None:
     prepared = prepared_for(*MISSION)
     flights = [fly_mission(prepared, autopilot, 1) for autopilot in AUTOPILOTS]
@@ -43,6 +44,7 @@ def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> 
     assert (found["touched"], found["landed"], found["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
 
 
+@pytest.mark.slow
 def test_a_take_off_of_each_autopilot_and_a_judge_that_finds_what_hovers() -> None:
     flights = [fly_take_off(autopilot, 1) for autopilot in AUTOPILOTS]
     assert all(flight.reached and not flight.wrong for flight in flights), flights
@@ -56,6 +58,7 @@ def is_setpoint(data: bytes) -> bool:
     return any(message.get_type() == "SET_POSITION_TARGET_LOCAL_NED" for message in decode(data))
 
 
+@pytest.mark.slow
 def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its positions, and holds its height in AUTO.TAKEOFF."""
     flights: list[Flight] = []
@@ -82,6 +85,7 @@ def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch:
     assert tally_take_offs([found])["hovers"] == 1
 
 
+@pytest.mark.slow
 def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes_it_for() -> None:
     flight = Flight("ardupilot", *RELAYED).relayed().take_off()
     flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
@@ -92,6 +96,7 @@ def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes
     assert outcome(flight) == "hovers"
 
 
+@pytest.mark.slow
 def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:
     batch = fly_faults(faulty, 0, 0.03, warm_up=1, flight_s=60.0)
     assert not batch.wrong
@@ -109,6 +114,7 @@ def test_the_faults_of_many_seeds_are_of_every_kind_and_the_same_each_time() -> 
     assert drawn(7) == configs[7]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("planted", "text"), [((2.1, 0.0, 0.0), "beyond"), ((math.nan, 0.0, 0.0), "not finite"), ((1.9, 0.0, 0.0), "leaps")]
 )

@@ -26,6 +26,7 @@ def heartbeat(system: int) -> bytes:
     return bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(mav))
 
 
+@pytest.mark.slow
 @BOTH
 @CRAFT
 def test_the_whole_way(autopilot: str, plant: str) -> None:

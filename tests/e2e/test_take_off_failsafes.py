@@ -20,6 +20,7 @@ BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SEEDS = 10
 
 
+@pytest.mark.slow
 @pytest.mark.fault(60, 61)
 @BOTH
 @pytest.mark.parametrize("seed", range(SEEDS))
@@ -32,6 +33,7 @@ def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilo
     assert "released" not in flight.states  # there is no pilot
 
 
+@pytest.mark.slow
 @pytest.mark.fault(61)
 def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
     more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
@@ -63,6 +65,7 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
     assert not flight.loop.notices
 
 
+@pytest.mark.slow
 @pytest.mark.fault(63)
 @BOTH
 @pytest.mark.parametrize("after_s", [0.6, 1.6, 3.0, 12.0])
@@ -82,6 +85,7 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
     assert flight.now_ns - last_ns < 2_000_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.fault(25, 63)
 def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
     flight = Flight("px4", *RELAYED).relayed().take_off()
@@ -141,6 +145,7 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
     assert flight.peers.autopilot.mode_name == "POSCTL"
 
 
+@pytest.mark.slow
 @pytest.mark.fault(61)
 @pytest.mark.parametrize(("deaf_s", "lands"), [(8.8, False), (1000.0, True)])
 def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(deaf_s: float, lands: bool) -> None:

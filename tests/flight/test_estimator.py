@@ -82,6 +82,7 @@ def test_propagation_is_the_matrix_exponential_over_any_part_of_a_step() -> None
         np.testing.assert_allclose(g, want[:4, 4:], rtol=0, atol=2e-12)
 
 
+@pytest.mark.slow
 def test_a_span_asked_for_again_gives_the_same_bits_and_cannot_be_written_to() -> None:
     plant, rng = small_plant(), np.random.default_rng(3)
     propagation = make_propagation(plant, DT_NS)
@@ -446,6 +447,7 @@ def told(history: FilterHistory) -> list[str]:
     return [repr((history.origin_ns, history.horizon_ns, history.anchor))] + [repr(one) for one in history.entries]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("bias_drift", [0.0, 0.03])
 def test_what_is_taken_back_is_as_if_it_had_never_come(seed: int, bias_drift: float) -> None:

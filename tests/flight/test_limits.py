@@ -77,6 +77,7 @@ def test_nobody_changes_the_limits_in_flight() -> None:
         replace(LIMITS).slew_mps3 = 99.0  # type: ignore[misc]
 
 
+@pytest.mark.slow
 def test_every_setpoint_of_100000_random_steps_with_faults_is_finite_bounded_and_slew_limited() -> None:
     rng = np.random.default_rng(24)
     steps = 100_000

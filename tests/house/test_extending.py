@@ -89,6 +89,7 @@ def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
     return recipe, commands, touched
 
 
+@pytest.mark.slow
 def test_a_controller_flies_in_a_campaign_and_a_what_if_without_an_edit(tmp_path: Path) -> None:
     recipe, commands, touched = walk("A controller", tmp_path)
     campaign, flight, again = commands
@@ -102,6 +103,7 @@ def test_a_controller_flies_in_a_campaign_and_a_what_if_without_an_edit(tmp_path
     assert json.loads(recipe.run(f"{again} --json"))["controller"] == "mine:Careful"
 
 
+@pytest.mark.slow
 def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
     recipe, (script, info), touched = walk("A topic", tmp_path)
     assert touched == 2
@@ -109,6 +111,7 @@ def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
     assert "/uavctl/distance" in recipe.run(info)
 
 
+@pytest.mark.slow
 def test_a_fault_happens(tmp_path: Path) -> None:
     recipe, (flight,), touched = walk("A fault", tmp_path)
     assert touched == 2

@@ -59,6 +59,7 @@ def test_the_page_has_every_row_in_order_and_complete() -> None:
     assert all(len(cells) == 3 and all(cells) for cells in rows.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", NUMBERS)
 def test_a_row_is_shown_where_the_page_says(row: int) -> None:
     shown_by = all_marked()[row]

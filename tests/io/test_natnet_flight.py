@@ -62,6 +62,7 @@ def seen_by_motive(air: Scene) -> Iterator[Server]:
             watching.join()
 
 
+@pytest.mark.slow
 def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
     with scene("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0") as air:
         recording = air.folder / "f" / "flight.mcap"

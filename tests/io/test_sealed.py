@@ -135,6 +135,7 @@ _PEER = Peer()
 _FORGER = SignedPeer(OTHER_KEY, NEWEST_STAMP - 10**6)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(36, 37, 38, 39)
 @pytest.mark.parametrize(
     ("words", "reason"),

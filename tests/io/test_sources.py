@@ -139,6 +139,7 @@ def test_a_lost_body_gives_nothing_and_is_counted_until_it_is_back() -> None:
         desk.until(lambda: len(desk.samples) > lost)
 
 
+@pytest.mark.slow
 def test_a_server_that_went_is_asked_until_it_is_back() -> None:
     with Server([DRONE]) as server, closing(open_source(url(server))) as connection:
         desk = Desk(connection, load_config("room-hahn-stursberg"))
@@ -219,6 +220,7 @@ def test_cameras_that_cannot_be_used(server: Server, rest: str, words: str) -> N
     assert not isinstance(caught.value.__cause__, OSError)
 
 
+@pytest.mark.slow
 def test_a_server_that_does_not_answer_is_a_matter_of_the_network() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))

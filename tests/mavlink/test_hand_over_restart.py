@@ -123,6 +123,7 @@ def test_its_clock_is_waited_for_with_nothing_sent() -> None:
     assert rig.is_in(HandoverState.ENGAGED)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(31)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_the_next_vehicle_on_the_connection_of_a_killed_flight_is_flown(autopilot: str) -> None:
@@ -166,6 +167,7 @@ class Air:
             self._tick += 1
 
 
+@pytest.mark.slow
 @pytest.mark.fault(31)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize("dead_s", [0.3, 4.0], ids=["before its failsafe", "after"])
@@ -187,6 +189,7 @@ def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(auto
     assert result.identical, result.first_difference
 
 
+@pytest.mark.slow
 @pytest.mark.fault(31)
 def test_without_standing_by_px4_would_be_back_in_offboard_at_once() -> None:
     air = Air("px4")

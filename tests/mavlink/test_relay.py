@@ -249,6 +249,7 @@ def test_the_stamp_is_the_time_of_capture_in_the_vehicle_s_clock(name: str) -> N
     assert min(ages_ms) >= 28 and max(ages_ms) <= 30 + 40 + 50 + 2  # delay, jitter, and the wait for the tick
 
 
+@pytest.mark.slow
 def test_px4_moves_stamps_once_its_timesync_has_converged_and_moved_here_too_they_cost_it_its_position(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -273,6 +274,7 @@ def test_px4_moves_stamps_once_its_timesync_has_converged_and_moved_here_too_the
     assert not estimator.position_ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "external"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
 def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(name: str, external: str) -> None:
     rig = Indoors(name, "sim.start_position_m=[0.0, 0.0, -0.1]")

@@ -48,6 +48,7 @@ def is_down(flight: Flight) -> bool:
     return flight.peers.autopilot.craft.landed and not flight.peers.autopilot.pilot.armed
 
 
+@pytest.mark.slow
 @pytest.mark.fault(64)
 @pytest.mark.usefixtures("control_may_fail")
 @BOTH
@@ -77,6 +78,7 @@ def test_a_core_that_fails_lands_the_vehicle_and_leaves_it_its_positions_until_t
     assert stats.alone and stats.sent > 50
 
 
+@pytest.mark.slow
 @pytest.mark.fault(64)
 @pytest.mark.usefixtures("control_may_fail")
 def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,6 +96,7 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
     assert flight.loop.finished and flight.commands() == before
 
 
+@pytest.mark.slow
 @pytest.mark.fault(64)
 @pytest.mark.usefixtures("control_may_fail")
 def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,6 +119,7 @@ def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(m
     assert [event.code for event in flight.memory.of(Event)].count("control") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.fault(63)
 @BOTH
 def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopilot: str) -> None:
@@ -127,6 +131,7 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
     assert poses_after(flight, flight.now_ns - SECOND)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(63)
 def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
@@ -137,6 +142,7 @@ def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     assert flight.loop.ending.cause == Cause.LANDING_FAILED
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_is_not_heard_any_more_gets_them_for_the_time_of_a_landing() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.told = lambda data: False

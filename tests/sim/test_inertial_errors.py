@@ -150,6 +150,7 @@ def ardupilot() -> list[InertialRecord]:
     return flights("ardupilot", 24)
 
 
+@pytest.mark.slow
 def test_px4_dead_reckons_as_recorded(px4: list[InertialRecord]) -> None:
     """Three recorded flights: 2 s 0.05 to 0.07 m (90 %: 0.10 to 0.16), 4 s 0.11 to 0.17 m (0.23 to 0.39).
 
@@ -161,6 +162,7 @@ def test_px4_dead_reckons_as_recorded(px4: list[InertialRecord]) -> None:
     assert 0.11 < median < 0.17 and 0.23 < most < 0.39
 
 
+@pytest.mark.slow
 def test_ardupilot_dead_reckons_worse_by_what_its_message_keeps(
     px4: list[InertialRecord], ardupilot: list[InertialRecord]
 ) -> None:
@@ -243,6 +245,7 @@ def drifted(name: str, seed: int, *more: str) -> float:
     return math.hypot(*one.peers.vehicle.position_m[:2])
 
 
+@pytest.mark.slow
 def test_flying_by_it_px4_drifts_open_loop_and_ardupilot_holds() -> None:
     for seed in range(3):
         assert drifted("px4", seed, FLOWN) > 0.2 > 0.001 > drifted("px4", seed)

@@ -45,6 +45,7 @@ def shots(one: Cameras, count: int) -> dict[int, tuple[int, Any]]:
     return seen
 
 
+@pytest.mark.slow
 def test_samples_are_processed_in_a_time_even_over_its_range_which_the_stamp_does_not_show() -> None:
     # As the recorded simulator's cameras: 25 to 124 ms.
     seen = shots(cameras(replace(PLAIN, latency_s=0.025, jitter_s=0.099)), 20_000)
@@ -98,6 +99,7 @@ def test_a_stream_that_begins_frozen_repeats_its_first_sample() -> None:
     assert [msg.x for _, msg in seen.values()] == [0.0, 0.0, 0.0, 3.0, 4.0]
 
 
+@pytest.mark.slow
 def test_random_occlusions_have_the_rate_and_the_length_asked_for() -> None:
     n, rate_hz = 40_000, 10.0
     seen = shots(cameras(replace(PLAIN, occlusions_per_s=0.5, occlusion_s=0.4)), n)

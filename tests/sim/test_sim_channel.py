@@ -50,6 +50,7 @@ def test_bernoulli_loses_the_share_asked_for_independently() -> None:
     assert abs(float(np.mean(lost[1:] & lost[:-1])) - 0.09) < 4 * math.sqrt(2 * 0.09 * 0.91 / N)
 
 
+@pytest.mark.slow
 def test_gilbert_elliott_loss_rate_and_burst_length() -> None:
     enter, leave, in_good, in_bad = 0.05, 0.25, 0.02, 1.0
     ch = channel(model="gilbert-elliott", loss=in_good, burst_enter=enter, burst_leave=leave, burst_loss=in_bad)

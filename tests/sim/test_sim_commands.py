@@ -236,6 +236,7 @@ def test_an_empty_battery_does_not_arm(name: Name, checked: str, asked: str) -> 
     assert one.texts[0].startswith(checked) and one.texts[1].startswith(asked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parameter", "action", "wait_s", "mode"),
     [

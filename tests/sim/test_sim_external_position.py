@@ -31,6 +31,7 @@ def indoors(name: Name, kind: str | None, *, origin: bool = True) -> Flight:
     return one
 
 
+@pytest.mark.slow
 @EACH
 def test_it_flies_on_every_kind_that_the_autopilot_takes(name: Name, kind: str) -> None:
     one = indoors(name, kind)

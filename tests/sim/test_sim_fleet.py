@@ -104,6 +104,7 @@ class Station:
         self._socket.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_only_it(autopilot: str) -> None:
     told: tuple[list[Truth], list[Truth]] = ([], [])

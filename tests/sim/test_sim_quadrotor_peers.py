@@ -36,6 +36,7 @@ def rough(autopilot: str, seconds: float, *more: str) -> Memory:
     return lockstep("room-hahn-stursberg", seconds, QUADROTOR, *GUSTS, *LINK, f"sim.autopilot={autopilot}", *more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_preset_room_flies_it_with_gusts_bursts_and_delay_bit_for_bit(autopilot: str) -> None:
     memory = rough(autopilot, 30.0)
@@ -52,6 +53,7 @@ def test_preset_room_flies_it_with_gusts_bursts_and_delay_bit_for_bit(autopilot:
     assert summarise(flight(memory), wall_s=1.0).input_violations == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
 def test_over_udp_preset_room_flies_it_in_real_time(autopilot: str, mode: str, tmp_path: Path) -> None:
     settings = [QUADROTOR, *GUSTS, *LINK, *HIGH, f"sim.autopilot={autopilot}"]

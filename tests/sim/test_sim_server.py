@@ -164,6 +164,7 @@ def test_udpin_answers_whoever_speaks() -> None:
         assert listen(sock, is_a("HEARTBEAT"))[-1].get_srcSystem() == 1
 
 
+@pytest.mark.slow
 def test_tcp_takes_a_client_a_stream_in_pieces_and_the_next_client() -> None:
     mocap, mocap_url = udp()
     ardupilot = config("sim.autopilot=ardupilot")

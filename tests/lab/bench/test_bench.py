@@ -72,6 +72,7 @@ def result(design: Design, library: Library, told: list[tuple[str, int, int | No
         return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL, conditioned)
 
 
+@pytest.mark.slow
 def test_one_run_has_all_figures(result: BenchResult) -> None:
     found = msgspec.to_builtins(result)
     assert found.keys() >= WANTED
@@ -161,6 +162,7 @@ def test_a_flight_that_asks_nothing_has_no_decisions() -> None:
     assert time_flight(load_config("room", ["smpc.scheme=age-conditioned", "duration_s=0.1"])) is None
 
 
+@pytest.mark.slow
 def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--set", "smpc.scheme=age-conditioned", "--set", "duration_s=4", "--states", "5"]
     assert command(["bench", *options, "--json"]) == 0

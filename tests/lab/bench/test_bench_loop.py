@@ -38,6 +38,7 @@ def test_the_middle_of_runs_is_the_median_of_each_figure() -> None:
     assert middle.missed_ticks == 0.0 and middle.memory_growth_kib == 2.0
 
 
+@pytest.mark.slow
 def test_a_short_bench_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "--loop", "--seconds", "2", "--runs", "1", "--json", *NO_LIBRARY]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)

@@ -96,6 +96,7 @@ def started(spec: Path, folder: Path, workers: int) -> subprocess.Popen[str]:
     return process
 
 
+@pytest.mark.slow
 def test_one_worker_gives_every_run_in_order(flown: Path) -> None:
     assert contents(flown)
     found = pq.read_table(flown / "runs.parquet")
@@ -105,6 +106,7 @@ def test_one_worker_gives_every_run_in_order(flown: Path) -> None:
     assert set(found["error"].to_pylist()) == {""}
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same(spec: Path, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["campaign", str(spec), "--workers", "2", "--out", str(tmp_path / "two"), "--json"]) == 0
     out = capsys.readouterr().out
@@ -121,11 +123,13 @@ def test_two_workers_give_the_same(spec: Path, flown: Path, tmp_path: Path, caps
     assert smpc["violation_rate"] <= lqg["violation_rate"] and lqg["violation_ci"][0] <= lqg["violation_rate"]
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same(spec: Path, flown: Path, tmp_path: Path, scheduler: str) -> None:
     assert run(["campaign", str(spec), "--dask", scheduler, "--out", str(tmp_path / "dask")]) == 0
     assert contents(tmp_path / "dask") == contents(flown)
 
 
+@pytest.mark.slow
 def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     process = started(spec, folder, workers=1)
@@ -140,6 +144,7 @@ def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, 
     assert contents(folder) == contents(flown)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> None:
     folder = tmp_path / "stopped"
     process = started(spec, folder, workers=2)
@@ -161,6 +166,7 @@ def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
     assert "interrupted before the first run" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_another_campaign_does_not_go_on(spec: Path, flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["campaign", str(spec), "--runs", "4", "--out", str(flown), "--resume"]) == 2
     assert f"runs is {RUNS} there and 4 here" in capsys.readouterr().err

@@ -50,6 +50,7 @@ def test_the_flights_of_the_quadrotor_can_be_read_and_are_as_many_as_the_file_sa
     assert spec.name == file.stem and f"{spec.runs} flights of each of {cells} cells" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
     campaign, _ = read_campaign(file)

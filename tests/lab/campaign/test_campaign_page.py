@@ -174,6 +174,7 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_page_is_complete_in_itself(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"https?://|<script|<link|url\((?!#)", html)

@@ -172,6 +172,7 @@ def rows(made: Cell) -> Columns:
     return fly_task(task)
 
 
+@pytest.mark.slow
 def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covariance(tmp_path: Path) -> None:
     """The worst step's interval begins below the 5 % that are allowed, and without P in the margins it does not."""
     found = rows(cell(tmp_path, 'measured = "position"\n'))

@@ -102,6 +102,7 @@ def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path)
     assert (own.usable_room, own.design_id) == (None, None)
 
 
+@pytest.mark.slow
 def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
     assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
@@ -114,6 +115,7 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
         assert row[name] == getattr(alone, name) or np.isnan(row[name]), name
 
 
+@pytest.mark.slow
 def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
     path = flown.parent / "small.toml"
     spec, text = read_trial(path)

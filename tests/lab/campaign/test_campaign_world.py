@@ -35,6 +35,7 @@ def config(*overrides: str) -> Config:
     return load_config("paper", overrides)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "base"),
     [("independent", 0), ("late", 0), ("shorter than a step", 0), ("bursts", 30), ("runs as measured", 30)],
@@ -53,6 +54,7 @@ def test_the_age_is_distributed_as_the_theory_says(name: str, base: int) -> None
         assert np.abs(measured - wanted[t]).max() < 5.0 * 0.5 / np.sqrt(len(age)), t
 
 
+@pytest.mark.slow
 def test_probabilities_of_each_step_lose_that_share() -> None:
     given = config(*LINKS["p(k)"])
     found = newest(given.link, 1.0, draw(3, 0, RUNS, STEPS, 1).link)

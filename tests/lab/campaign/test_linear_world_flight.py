@@ -161,6 +161,7 @@ def largest_difference(run: Run, truths: list[Truth], steps: int = STEPS) -> flo
 SAME = 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", [LOSSES, LATE], ids=["lost", "late"])
 def test_a_flight_is_the_run_to_what_float32_leaves(link: LinkConfig) -> None:
     run = in_the_linear_world(link, 3)

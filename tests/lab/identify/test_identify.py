@@ -94,6 +94,7 @@ def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> N
     assert np.std(misses) == pytest.approx(1.0, abs=0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_the_likeliest_dead_time_is_the_one_that_made_the_data(seed: int) -> None:
     flown = (fly(0.1, 0.1, 1.0, seed=seed, dead_ticks=3),)
@@ -133,6 +134,7 @@ def missed(flown: Stretch, fit: AxisFit) -> NDArray[np.float64]:
     return np.array([np.sqrt(np.mean(one.errors_m**2)) for one in predict_ahead((flown,), 0, fit)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_plant_with_a_reference_is_found_and_predicts_another_flight(seed: int) -> None:
     flown, other = (flown_by_reference(seed),), flown_by_reference(20 + seed)
@@ -368,6 +370,7 @@ def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     waypoints = "[[1.5,1.0,-1.2],[-1.5,-1.0,-1.0],[1.5,-1.0,-1.6],[1.5,1.0,-1.2]]"

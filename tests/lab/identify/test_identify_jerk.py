@@ -44,6 +44,7 @@ def at(ramps: Stretch, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
     return held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slew_mps3", [3.5, 5.0, 40.0])
 def test_ramps_are_those_of_a_limited_jerk(slew_mps3: float) -> None:
     setpoints = steps(1, 4.0, slew_mps3)
@@ -89,6 +90,7 @@ def flown(setpoints: NDArray[np.float64], seed: int) -> PositionHistory:
     return PositionHistory(times_s, np.full(len(times_s), 0.03), np.array(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slew_mps3", [3.5, 5.0])
 def test_the_simulated_ardupilot_is_found_whether_its_jerk_limit_is_exceeded_or_not(slew_mps3: float) -> None:
     """Its velocity under the same setpoints, without noise, is fitted best by lag 0.13 s and drag 0.24 1/s."""
@@ -105,6 +107,7 @@ def test_the_simulated_ardupilot_is_found_whether_its_jerk_limit_is_exceeded_or_
         assert wrong.value("lag_s") > right.value("lag_s") + (0.04 if slew_mps3 > 3.5 else 0.01)
 
 
+@pytest.mark.slow
 def test_half_of_a_setpoints_ramp_is_in_the_configured_dead_time() -> None:
     setpoints = steps(3, 40.0, 3.5)
     seen = flown(setpoints, 1)

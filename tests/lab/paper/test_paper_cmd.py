@@ -54,6 +54,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return told
 
 
+@pytest.mark.slow
 def test_the_document_has_every_figure_and_both_designs(found: dict[str, Any]) -> None:
     assert found.keys() >= WANTED
     assert [variant["tau"] for variant in found["variants"]] == [4, 3]

@@ -46,6 +46,7 @@ def test_without_limits_the_least_cost_is_the_lqg_bound(axis: Design) -> None:
     assert found == pytest.approx(stationary_bound(axis.plant, axis.q_x, axis.q_u, link), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> None:
     least = least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
     assert least == pytest.approx(11.95, abs=0.05)
@@ -73,6 +74,7 @@ def test_a_plant_of_several_axes_has_to_be_taken_apart(axis: Design) -> None:
         least_settled_cost(design.plant, design.input_set, design.q_x, design.q_u, 0.3, COARSE)
 
 
+@pytest.mark.slow
 def test_designs_that_were_tried_are_told_with_the_reason(depth: Depth) -> None:
     tried = {one.schedule: one for one in depth.designs if one.tau == 3}
     assert "0.9370" in tried["d_t = 4"].refused and tried["d_t = 4"].delays is None

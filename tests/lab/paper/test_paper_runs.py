@@ -95,6 +95,7 @@ def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch:
     assert again.cost_stderr == pytest.approx(result.cost_stderr, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "HERE_UP_TO", 0)
     monkeypatch.setattr(run, "CHUNK", 8)

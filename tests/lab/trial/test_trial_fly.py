@@ -116,6 +116,7 @@ def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:
     assert moments.min() >= 1.0 and moments.max() <= 6.0 and np.unique(moments).size > 190
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [OURS, OWN])
 def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
     found = fly(cell, 2, seconds=14.0, from_s=10.0)
@@ -128,6 +129,7 @@ def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
     assert fly(cell, 2, seconds=14.0, from_s=10.0) == found or cell is OWN  # NaN is not itself
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> None:
     """The recorded ArduCopter held 3 to 5 mm; the simulated one swung by 50 to 180 mm after the same way."""
@@ -147,6 +149,7 @@ def test_an_eight_is_tracked_along_its_own_time() -> None:
     assert length_s("eight", 1.0) > eight().times_s[-1]
 
 
+@pytest.mark.slow
 def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--pilots own own-tuned --autopilots px4 --seeds 2 --rates 10 --losses 0.3 --seconds 6 --from 4 --json"
     assert trials.main(arguments.split()) == 0

@@ -86,6 +86,7 @@ def arrivals(samples: Iterable[PositionSample]) -> list[tuple[int, int]]:
     return sorted((one.captured_ns, one.received_ns) for one in samples)
 
 
+@pytest.mark.slow
 @BOTH
 def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: AutopilotName) -> None:
     overheard, _, _ = flight_of_own(autopilot, AS_DELIVERED)
@@ -98,6 +99,7 @@ def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: Aut
     assert 0.3 < len(own) / (20.0 * SECONDS) < 0.5
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("tuning", [AS_DELIVERED, TUNED])
 def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
@@ -129,6 +131,7 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
     assert peers.autopilot.mode_name in ("OFFBOARD", "GUIDED")
 
 
+@pytest.mark.slow
 @BOTH
 def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) -> None:
     one = TrialCell(TrialPilot("own", own=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm")
@@ -136,6 +139,7 @@ def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) ->
     assert found.hold_rms_m < 0.03 and found.nearer_s < 12.0 and found.beyond_m < 0.0
 
 
+@pytest.mark.slow
 @BOTH
 def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: AutopilotName) -> None:
     one = TrialCell(

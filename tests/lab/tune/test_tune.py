@@ -131,6 +131,7 @@ def rows(told: TunedResult, key: str) -> list[Change]:
     return [one for one in told.changes if one.key == key]
 
 
+@pytest.mark.slow
 def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     made = tuned(config, found)
@@ -148,6 +149,7 @@ def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config
     )
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
     flight: tuple[Config, FlightData, Identification],
 ) -> None:
@@ -162,6 +164,7 @@ def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
         assert rows(made.result, key)[1].reason != row.reason
 
 
+@pytest.mark.slow
 def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MOST_DEAD_RANGE_S))
@@ -171,6 +174,7 @@ def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, 
     assert made.config.plant.drag_1ps != config.plant.drag_1ps
 
 
+@pytest.mark.slow
 def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     replace = msgspec.structs.replace
@@ -187,6 +191,7 @@ def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, Fligh
     assert made.link.jitter_s == pytest.approx(0.04, abs=0.005)
 
 
+@pytest.mark.slow
 def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     stalled = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=3.0))
@@ -196,6 +201,7 @@ def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData
     assert tuned(config, late).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
 
 
+@pytest.mark.slow
 def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     fitted = msgspec.structs.replace(config, plant=found.config.plant)

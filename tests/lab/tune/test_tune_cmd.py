@@ -45,6 +45,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
     for name in (TUNED, PAGE, FIT_PAGE, STATE):
         assert (done / name).is_file()
@@ -91,6 +92,7 @@ def test_a_run_that_is_done_flies_no_more(done: Path, capsys: pytest.CaptureFixt
     assert not (done / f"{BEFORE}-2").exists() and not (done / f"{AFTER}-2").exists()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_after_the_last_step_that_is_done(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +120,7 @@ def test_another_configuration_is_refused_by_its_key(done: Path, capsys: pytest.
     assert "log.segment_bytes" in err
 
 
+@pytest.mark.slow
 def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,6 +136,7 @@ def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
     assert not (folder / TUNED).exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_flight_and_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +155,7 @@ def test_ctrl_c_ends_the_flight_and_the_run(
     assert (folder / BEFORE / "flight.mcap").exists()
 
 
+@pytest.mark.slow
 def test_a_recording_takes_the_place_of_the_first_flight(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +232,7 @@ def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, s
         return typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000", "--json"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
 def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_them(
     copy: Callable[..., Path], done: Path, capsys: pytest.CaptureFixture[str]
@@ -240,6 +246,7 @@ def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_the
     assert document["comparison"]["new_errors"] == there["comparison"]["new_errors"]
 
 
+@pytest.mark.slow
 def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(done: Path, tmp_path: Path) -> None:
     config = parse(header(done / BEFORE / "flight.mcap").config_toml, "before").config
     assert left_whole(config, done / BEFORE) == done / BEFORE / "flight.mcap"
@@ -261,6 +268,7 @@ def test_a_tuned_configuration_that_was_cut_is_not_flown(
     assert (folder / TUNED).read_text() == cut and (folder / AFTER / "flight.mcap").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
 def test_ctrl_c_beside_a_flight_keeps_what_is_done(
     copy: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -336,6 +344,7 @@ def test_corners_in_any_order_are_one_box() -> None:
     assert boxes[0].lower == (-1.0, -2.0, -3.0) and boxes[0].upper == (1.0, 2.0, -0.4)
 
 
+@pytest.mark.slow
 def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     with short_flights(steps=1, hold_s=7.5):

@@ -72,6 +72,7 @@ def recorded(folder: Path, noted: str) -> str:
     return header(folder / noted / "flight.mcap").config_toml
 
 
+@pytest.mark.slow
 def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_climb
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
@@ -80,6 +81,7 @@ def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, 
     assert (folder / BEFORE / "flight.mcap").exists()
 
 
+@pytest.mark.slow
 def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = under_way
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
@@ -89,6 +91,7 @@ def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tu
     assert not result.rig.peers.autopilot.pilot.armed
 
 
+@pytest.mark.slow
 def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder: Path) -> None:
     assert not_agreed.code == not_agreed.document["exit_code"] == tune_cmd.INTERRUPTED
     assert not_agreed.document["before"] == f"{BEFORE}-3/flight.mcap" and not_agreed.document["after"] == ""
@@ -106,6 +109,7 @@ def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
     assert not again.rig.sent and (folder / STATE).read_bytes() == stamp
 
 
+@pytest.mark.slow
 def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_second
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
@@ -114,6 +118,7 @@ def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[
     assert (folder / AFTER / "flight.mcap").exists() and (folder / TUNED).exists()
 
 
+@pytest.mark.slow
 def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
     assert (done.code, done.document["stopped"]) == (0, "")
     assert done.document["after"] == f"{AFTER}-2/flight.mcap" and (folder / PAGE).exists()

@@ -17,6 +17,7 @@ from uavctl.lab.whatif.flight import Departure, Entry, Relinked, Response, captu
 from uavctl.records import Datagram, Decision, Plan, PositionSample, Record, Setpoint, StepInput, Truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [PAPER, ROOM, QUADROTOR], ids=["paper", "room", "quadrotor"])
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     memory, course = again(case)
@@ -29,6 +30,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     assert found.identical and found.largest_state == found.largest_input == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "changes", "least"),
     [
@@ -62,6 +64,7 @@ def test_another_link_loses_what_it_would_have_lost() -> None:
     assert far(memory, real) < WIRE  # the cameras of `paper` see at the boundaries, where the truth is recorded
 
 
+@pytest.mark.slow
 def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_millimetre() -> None:
     quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
@@ -92,6 +95,7 @@ def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
     assert memory.of(Truth)[-1].lost > 0
 
 
+@pytest.mark.slow
 def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
     change = "target.position_m=[0.5, 0.5, -1.0]"
     memory, _ = again(QUADROTOR, change)
@@ -208,6 +212,7 @@ def test_captures_know_the_simulated_cameras_clock() -> None:
     assert all(abs(one.at_ns % 200_000_000 - 100_000_000) <= 1000 for one in found)
 
 
+@pytest.mark.slow
 def test_without_the_truth_estimates_and_a_spline_take_its_place() -> None:
     config = config_of(ROOM)
     blind = history_of(stripped(ROOM, Truth), config, "x")

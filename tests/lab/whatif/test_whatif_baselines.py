@@ -17,6 +17,7 @@ from uavctl.records import Plan, Truth
 from uavctl.smpc.batch import News
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
 def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
     config = config_of(PAPER)

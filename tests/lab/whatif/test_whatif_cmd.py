@@ -47,6 +47,7 @@ def document(capsys: pytest.CaptureFixture[str], flown: Path, out: Path, *more: 
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_figures")
 def test_nothing_changed_reproduces_the_flight(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, flown, tmp_path)
@@ -57,6 +58,7 @@ def test_nothing_changed_reproduces_the_flight(flown: Path, tmp_path: Path, caps
     assert found["model"]["moves"] == 19 and 0.9 < found["model"]["r2"] < 1.0
 
 
+@pytest.mark.slow
 def test_another_cost_is_recorded_reported_and_replays(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,6 +88,7 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
     assert "lqg" in text and "Decision time" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_figures")
 def test_the_design_may_believe_in_another_link_than_the_one_flown(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -101,6 +104,7 @@ def test_the_design_may_believe_in_another_link_than_the_one_flown(
     assert found["what_if"]["lost"] > 10 and found["what_if"]["max_age"] > found["recorded"]["max_age"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_figures")
 def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = load_config("paper", ["plant.b=[[0.25, 0.0], [0.45, 0.0], [0.0, 0.25], [0.0, 0.45]]"])

@@ -158,6 +158,7 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
     assert frames.heard(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.left_out) == (1, 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     memory, course = again(case)
@@ -169,6 +170,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     assert course.departure.begun_ns is None and course.inertial_moved == course.inertial_left_out == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
 @pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
 def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Case, change: str) -> None:
@@ -186,6 +188,7 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     assert largest_m(memory, real) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [(PX4, 0.04), (ARDUPILOT, 0.04)], ids=["px4", "ardupilot"])
 @pytest.mark.parametrize(
     ("change", "target"),

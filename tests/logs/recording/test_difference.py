@@ -36,6 +36,7 @@ def replayed(flown: Memory, *overrides: str) -> ReplayResult:
     return replay(flown.entries, partial(make_loop, config), ignored=MAKERS)
 
 
+@pytest.mark.slow
 def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = 0
 
@@ -70,6 +71,7 @@ def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: Memory, monkeyp
     assert next(iter(course)) == ("/uavctl/decision", "input")
 
 
+@pytest.mark.slow
 def test_a_changed_back_off_is_found_in_the_first_plan_that_differs() -> None:
     result = replayed(lockstep("paper", 12.0, EXACT), EXACT, "smpc.delta_x=0.949")
     first, decision = result.first_difference, result.first_decision
@@ -81,6 +83,7 @@ def test_a_changed_back_off_is_found_in_the_first_plan_that_differs() -> None:
     assert not {"design_id", "method"} & {one.field for one in result.course}
 
 
+@pytest.mark.slow
 def test_of_another_solver_what_it_decides_is_compared_and_not_its_name(flown: Memory) -> None:
     config = load_config("paper", ["solver.method=exact"])
     named = replay(flown.entries, partial(make_loop, config)).first_difference
@@ -167,6 +170,7 @@ def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_flight_in_several_files_is_replayed_from_the_first(
     rotated: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

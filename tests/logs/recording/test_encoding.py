@@ -27,6 +27,7 @@ from uavctl.records import (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
     @given(values(topic.record))

@@ -62,6 +62,7 @@ def expect(row: dict[str, Cell], record: msgspec.Struct) -> None:
     assert found == {name: repr(getattr(value, "value", value)) for name, value in wanted.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_every_value_of_every_record_is_in_its_column(topic: Topic) -> None:
     @given(st.lists(values(topic.record), min_size=1, max_size=3))

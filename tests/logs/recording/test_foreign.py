@@ -50,6 +50,7 @@ def test_every_layout_of_the_file(tmp_path: Path, compression: CompressionType, 
     assert read_mcap(path).packets == read_tlog(DATA / TLOGS[0]).packets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TLOGS[:2])
 def test_the_same_bytes_in_a_tlog_and_in_an_mcap_fly_the_same(tmp_path: Path, name: str) -> None:
     assert flown(read_mcap(write(tmp_path / "a.mcap", rows_of(name))).packets) == by_tlog(name)
@@ -177,6 +178,7 @@ def test_frame_length_needs_a_head() -> None:
     assert frame_length(b"\xfe\x09\x00", 0) == 17 and frame_length(b"abc", 0) == 0
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "a.mcap", rows_of(TLOGS[0]))
     arguments = [

@@ -109,6 +109,7 @@ def test_each_frame_is_unwrapped_byte_by_byte(tmp_path: Path, name: str, encodin
     assert (found.topics, found.torn, found.notes) == ((topic,), False, ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", WRITERS)
 def test_it_flies_as_the_tlog_does(tmp_path: Path, encoding: str) -> None:
     path = WRITERS[encoding][0](tmp_path / "a.mcap", list(read_tlog(DATA / TLOGS[0]).packets))

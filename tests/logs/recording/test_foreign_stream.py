@@ -40,6 +40,7 @@ def pieces_of(name: str, sizes: tuple[int, int], seed: int) -> tuple[list[tuple[
     return pieces, whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sizes", [(1, 1), (1, 40), (7, 7), (100, 900), (4096, 4096)])
 @pytest.mark.parametrize("name", TLOGS)
 def test_reads_of_any_size_hold_the_same_frames(tmp_path: Path, name: str, sizes: tuple[int, int]) -> None:
@@ -49,6 +50,7 @@ def test_reads_of_any_size_hold_the_same_frames(tmp_path: Path, name: str, sizes
     assert not any("left out" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_serial_line_flies_as_the_tlog_does(tmp_path: Path) -> None:
     pieces, _ = pieces_of(TLOGS[0], (1, 60), seed=3)
     by_pieces = flown(read_mcap(write(tmp_path / "a.mcap", [("/serial", "", at, data) for at, data in pieces])).packets)
@@ -135,6 +137,7 @@ def test_an_empty_channel(tmp_path: Path) -> None:
         read_mcap(tmp_path / "a.mcap", ["/empty"])
 
 
+@pytest.mark.slow
 def test_two_vehicles_on_one_channel(tmp_path: Path) -> None:
     rows = rows_of(TLOGS[0])
     other = mavlink.MAVLink(None, 42, 1)
@@ -158,6 +161,7 @@ def test_log_times_that_go_back_a_little_are_put_in_order(tmp_path: Path) -> Non
     assert len(found.notes) == 1 and "time stamps not in order; put in order" in found.notes[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leap_s", [-60, -86_400, 86_400, 40 * 365 * 86_400])
 def test_a_leap_of_the_clock_is_told_and_time_goes_on(tmp_path: Path, leap_s: int) -> None:
     rows = rows_of(TLOGS[0])

@@ -228,6 +228,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: str, capsys: pytest.Capt
     assert capsys.readouterr().err.startswith(f"error: --tolerance {tolerance}: ")
 
 
+@pytest.mark.slow
 def test_the_page_of_a_torn_recording_that_lost_records_comes_with_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

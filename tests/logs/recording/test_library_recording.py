@@ -129,6 +129,7 @@ def test_a_library_recorded_in_the_place_of_the_one_flown_with_is_found(
     assert found["first_difference"]["topic"] == "/uavctl/plan"
 
 
+@pytest.mark.slow
 def test_a_replay_that_differs_says_which_versions_it_was_recorded_with(
     flown: Path, stored: StoredLibrary, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

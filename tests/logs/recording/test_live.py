@@ -60,6 +60,7 @@ def tell(watch: Watcher, at_ns: int, data: bytes = b"{}") -> None:
     watch(definition(EVENT), at_ns, data)
 
 
+@pytest.mark.slow
 def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
     ports: list[int] = []
     told = {topic for topic, _, _ in flown().entries if not topic.startswith("/raw/")} | {view.name for view in VIEWS}
@@ -142,6 +143,7 @@ def test_the_end_does_not_wait_for_a_stalled_viewer() -> None:
     server.join(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_a_flight_in_real_time_is_the_same_beside_a_stalled_viewer(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "uavctl", "loopback", "--udp", "--config", "paper", "--duration", "4"]
     command += ["--set", "solver.method=exact"]  # it needs no policy library

@@ -42,6 +42,7 @@ def test_recording_without_header_says_so(tmp_path: Path) -> None:
         header(path)
 
 
+@pytest.mark.slow
 def test_cut_anywhere_it_reads_to_the_last_whole_chunk(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     items = record_flight(path, 20)

@@ -47,6 +47,7 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None
     assert close.identical
 
 
+@pytest.mark.slow
 def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_are_others(flown: Memory) -> None:
     written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
     replayed = partial(replay, make_loop=lambda sink: make_loop(load_config("paper"), sink))
@@ -93,6 +94,7 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
     assert not result.identical
 
 
+@pytest.mark.slow
 def test_what_the_loop_says_beyond_the_recording_is_found(flown: Memory) -> None:
     for kind in (Plan, Setpoint, Event):
         poorer = [entry for entry in flown.entries if not isinstance(entry[2], kind)]

@@ -136,6 +136,7 @@ def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> N
     assert 2 <= len(segment_files(path)) < 8
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> None:
     clock = Clock()
     recorder = SyncRecorder(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024, segment_bytes=50_000), clock=clock)
@@ -270,6 +271,7 @@ def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     assert [line.level for line in lines if "disk gets low: 2000 bytes free" in line.message] == [Log.WARNING]
 
 
+@pytest.mark.slow
 @pytest.mark.fault(32)
 def test_32_a_flipped_byte_in_a_later_file_is_refused_or_restored(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"

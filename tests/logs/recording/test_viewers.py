@@ -58,6 +58,7 @@ def decoded(recording: Path) -> dict[str, list[tuple[str, int, Any]]]:
     return found
 
 
+@pytest.mark.slow
 def test_mcap_decodes_every_message_of_every_topic(
     recording: Path, decoded: dict[str, list[tuple[str, int, Any]]]
 ) -> None:

@@ -47,6 +47,7 @@ def room_html(room_flight: FlightData) -> str:
     return html_of(room_flight)
 
 
+@pytest.mark.slow
 def test_every_plot_is_there_and_says_what_it_shows(room_html: str) -> None:
     seen = walk(room_html)
     assert set(seen.plots) == ROOM_PLOTS
@@ -54,6 +55,7 @@ def test_every_plot_is_there_and_says_what_it_shows(room_html: str) -> None:
     assert seen.lang == "en"
 
 
+@pytest.mark.slow
 def test_sections_are_these_in_this_order(judged_html: str) -> None:
     assert re.findall(r"<h2[^>]*>(.*?)</h2>", judged_html) == SECTIONS
 
@@ -171,6 +173,7 @@ def test_paths_are_written_short(drawn: str, short: str) -> None:
     assert compact(drawn) == short
 
 
+@pytest.mark.slow
 def test_ten_minutes_stay_below_a_megabyte_and_a_half() -> None:
     page = html_of(FlightData.from_records(fly(room(), 600.0, blackout=(30.0, 40.0))))
     assert len(page.encode()) < 1_500_000
@@ -238,6 +241,7 @@ def test_a_flight_that_only_waited() -> None:
     assert "Nothing was flown in 2 s: no position yet." in text
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_no_number_is_left_out_of_the_drawing() -> None:
     def spoil(record: Record) -> Record:
         if isinstance(record, Estimate) and record.at_ns > 7_000_000_000:

@@ -142,6 +142,7 @@ def note(text: str, segment: int = 1) -> RecorderNote:
     return RecorderNote(at_ns=0, segment=segment, written=0, dropped=0, refused=0, failures=0, text=text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("last", "told", "breaks_off"),
     [

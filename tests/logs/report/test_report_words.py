@@ -91,6 +91,7 @@ def test_a_landing_is_told() -> None:
     assert "operator" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ordered", "told"), [(True, "Landed as ordered"), (False, "Landed at the end of the mission")]
 )
@@ -101,6 +102,7 @@ def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> 
     assert "fallback had the vehicle land" not in text and "by the fallback" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "told"),
     [
@@ -129,6 +131,7 @@ def test_what_went_amiss_is_told() -> None:
     assert "1 record was dropped because the disk was too slow, and missing from all figures." in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.03])
 def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: float) -> None:
     config = load_config("room-hahn-stursberg", (f"clock.latency_s={latency_s}",))

@@ -91,6 +91,7 @@ PROBLEMS: dict[str, Callable[[], ControlProblem]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_plan_is_cvxpy_s_optimum(name: str) -> None:
     given = PROBLEMS[name]()

@@ -92,6 +92,7 @@ def outlook_of(kind: str, given: ControlProblem, rng: np.random.Generator) -> Pr
     return NOMINAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slewed", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
@@ -125,6 +126,7 @@ def near(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]
     return target + rng.uniform(0.0, 0.3) * (x - target), target
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("where", [near, somewhere])
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
@@ -337,6 +339,7 @@ def pilot(given: ControlProblem, loss: float) -> BatchSmpc:
     return BatchSmpc(ConditionedDecider(solver, given.target), given.plant, given.horizon, given.horizon, 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0)), (0.1, (49.0, 19.0))]
 )

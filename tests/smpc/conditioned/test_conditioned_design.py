@@ -49,6 +49,7 @@ def quick(folder: Path) -> str:
     return str(file)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_no_other_design", "no_page")
 def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -124,6 +125,7 @@ def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
     assert (exact.rests >= design.rests).all() and (exact.rests > design.rests).any()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_recording_under_the_name_of_the_other_design_replays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

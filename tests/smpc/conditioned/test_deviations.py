@@ -55,6 +55,7 @@ def test_a_filter_settles_at_the_riccati_solution() -> None:
     np.testing.assert_allclose(found[: plant.n_x, : plant.n_x], form.estimate_cov, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_a_design_rests_on_what_the_flight_s_filter_does_not_know(preset: str) -> None:
     config = load_config(preset)

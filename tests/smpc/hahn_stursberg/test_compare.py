@@ -74,6 +74,7 @@ def test_the_paper_s_gain_beside_the_best() -> None:
     assert 0 < found.compared <= found.states == 5
 
 
+@pytest.mark.slow
 def test_means_are_over_the_states_that_both_can_leave() -> None:
     given = spec("paper")
     found = compare_gains(given, START, 6, 2, nothing)

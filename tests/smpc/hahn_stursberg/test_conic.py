@@ -81,6 +81,7 @@ def test_one_axis_has_36_variables_besides_reference_slacks_and_backoffs(paper_d
     assert layout.size == 36 + 2 + 2 * 7 + 7
 
 
+@pytest.mark.slow
 def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
     paper_design: Design, paper_solver: ConicSolver
 ) -> None:
@@ -98,6 +99,7 @@ def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
     assert worst < 1e-6
 
 
+@pytest.mark.slow
 def test_infeasible_where_the_printed_problem_is(paper_design: Design, paper_solver: ConicSolver) -> None:
     printed = PrintedSolver(paper_design)
     rng = np.random.default_rng(5)
@@ -321,6 +323,7 @@ def test_room_from_the_far_corner(room_solver: ConicSolver) -> None:
     assert answer.states[-1] == pytest.approx(answer.reference, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_room_s_offset_weight_is_exact_and_a_small_one_is_not(room_solver: ConicSolver) -> None:
     """Where 3e4 brings the plan into the target without slack, the preset's 300 does so too."""
     heavy, light = ConicSolver(room(offset_weight=3e4)), ConicSolver(room(offset_weight=1.0))
@@ -337,6 +340,7 @@ def test_the_room_s_offset_weight_is_exact_and_a_small_one_is_not(room_solver: C
     assert max(light.solve(0, x, ROOM_TARGET).offset for x in in_reach) > 1e-2
 
 
+@pytest.mark.slow
 def test_room_is_reached_by_replanning(room_solver: ConicSolver) -> None:
     design, x = room(), ROOM_CORNER
     for k in range(60):

@@ -48,6 +48,7 @@ def all_wrong(cuts: Cuts, places: list[tuple[int, int]]) -> dict[tuple[int, int]
     return {place: text for place, text in found.items() if text}
 
 
+@pytest.mark.slow
 @pytest.mark.fault(52)
 def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
     assert len(cuts.files) > 1 and len(cuts.chunks) > 8

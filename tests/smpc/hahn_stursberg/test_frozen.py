@@ -27,6 +27,7 @@ def answers(name: str) -> list[tuple[Asked, Answer, float, float]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_accepted_is_the_joint_optimum(name: str) -> None:
     one = case(name)
@@ -53,6 +54,7 @@ def test_near_the_target_it_is_nearly_always_accepted(name: str) -> None:
     assert methods.count("frozen") == 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_where_it_is_refused_its_best_mean_would_cost_more_than_the_optimum(name: str) -> None:
     """Without the KKT test wrong answers would pass."""

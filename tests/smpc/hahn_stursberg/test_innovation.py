@@ -138,6 +138,7 @@ def test_the_bound_holds_at_nearly_every_arrival() -> None:
         assert np.all(variances <= bound, axis=1).mean() >= 0.99
 
 
+@pytest.mark.slow
 def test_back_offs_of_the_first_stages_are_honest() -> None:
     """Monte Carlo: real filter, positions lost, and the error of its prediction as the plan has it."""
     design = room()

@@ -109,6 +109,7 @@ def from_capture(design: Design, late: int, x: Array, flown: Array) -> tuple[flo
     return float(problem.value), float(sum(part.value for part in stage[:late]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [1, 2, 5])
 @pytest.mark.parametrize(("x", "flown"), [((35.0, -2.0), -3.0), ((-20.0, 3.0), 2.0), ((2.0, 0.0), 0.5)])
 def test_a_late_plan_is_the_plan_from_the_capture(late: int, x: tuple[float, float], flown: float) -> None:
@@ -150,6 +151,7 @@ def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
     assert solver.solve(0, x, target, Preview(late=3)).status is SolveStatus.FAILED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "room-hahn-stursberg"])
 def test_back_offs_grow_with_the_age(preset: str) -> None:
     """Of every state row, in every stage before the feedback sets in."""
@@ -270,6 +272,7 @@ def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: floa
     assert promised[6] < 0.5 * build_delayed_link(one_a_step).outage(6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides: list[str], phase: float) -> None:
@@ -315,6 +318,7 @@ def late_flight() -> Memory:
     return lockstep("room-hahn-stursberg", 12.0, *LATE_LINK)
 
 
+@pytest.mark.slow
 def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) -> None:
     config = load_config("room-hahn-stursberg", list(LATE_LINK))
     design = build_design(config)
@@ -345,11 +349,13 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
     assert np.linalg.norm(positions[-1] - np.array(config.target.position_m)) < 0.3
 
 
+@pytest.mark.slow
 def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
     config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE_LINK])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
 
 
+@pytest.mark.slow
 def test_a_flight_on_late_positions_with_a_library() -> None:
     """Every plan comes from the late policies, with a certificate that the exact program confirms."""
     design = build_design(load_config("room-hahn-stursberg", list(LATE)))

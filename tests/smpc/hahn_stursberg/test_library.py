@@ -34,6 +34,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(maker, "MOST_LATE", 5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_the_same_design_and_seed_give_the_same_bytes_and_another_seed_others() -> None:
     design = small(late=1)
@@ -116,6 +117,7 @@ def test_states_are_drawn_all_over_the_box_and_around_the_target(name: str) -> N
             assert np.all(target <= upper[part.states] + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "design",
     [

@@ -55,6 +55,7 @@ def answered(name: str) -> list[tuple[Asked, Answer, Answer]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_certificate_is_never_wrong(name: str) -> None:
     methods: Counter[str] = Counter()
@@ -174,6 +175,7 @@ def bits_of(solver: LibrarySolver, asks: list[Asked]) -> list[bytes]:
     return [bits(solver.solve(0, ask.x, ask.target, ask.outlook)) for ask in asks]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_same_question_same_bits_whatever_came_before(name: str) -> None:
     one = case(name)
@@ -216,6 +218,7 @@ def test_another_process_gives_the_same_bits() -> None:
 # --- what cannot be met ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_an_answer_every_time_and_what_gave_way_is_named(name: str) -> None:
     one = case(name)
@@ -286,6 +289,7 @@ def test_a_position_later_than_the_design_knows_fails() -> None:
 # --- closed loops ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_along_closed_loops_every_answer_is_certified_and_nearly_all_to_a_tenth_of_that(name: str) -> None:
     """`tools/accept_library.py` does it with thousands of states."""

@@ -171,6 +171,7 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
             assert lower[k] == -limits[stage, part.rows_x[row.lower]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_its_policy(name: str) -> None:
     """Back-offs of the exact gains, the mean solved by another solver: the exact optimum, whatever is known ahead."""

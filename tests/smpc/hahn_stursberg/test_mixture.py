@@ -33,6 +33,7 @@ def optima(name: str) -> list[Optimum]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_optimum_is_between_the_bounds(name: str) -> None:
     one = case(name)

@@ -145,6 +145,7 @@ def questions() -> list[tuple[str, Array, Array, Preview]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("x", "target", "outlook"), [pytest.param(*q[1:], id=q[0]) for q in questions()])
 def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, outlook: Preview) -> None:
     design, solver = paper_case()
@@ -305,6 +306,7 @@ def extremes(
         yield x, Preview(limits=limits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "farthest"), [(250, 100.0), (50, 1e4)])
 def test_states_and_limits_far_beyond_sense_have_an_answer(count: int, farthest: float) -> None:
     design, solver = paper_case()

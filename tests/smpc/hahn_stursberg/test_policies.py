@@ -118,6 +118,7 @@ def keeps(design: Design, i: int, theta: Array) -> bool:
     return bool(np.linalg.eigvalsh(values)[0] >= -1e-9 * np.linalg.norm(part.sigma_xi, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_cut_is_below_the_cost_of_every_feasible_policy(name: str) -> None:
     design, rng = design_of(name), np.random.default_rng(10)
@@ -180,6 +181,7 @@ def multipliers(name: str) -> tuple[PolicyProgram, Policy, Multipliers]:
                 return program, policy, found
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-6, 1e-3, 0.1, 1.0]), st.sampled_from(PRESETS))
 @settings(max_examples=60, derandomize=True)
 def test_a_cut_from_any_multipliers_is_a_bound(seed: int, noise: float, name: str) -> None:
@@ -221,6 +223,7 @@ def test_a_cut_from_noise_alone_is_a_bound(seed: int) -> None:
             assert cut.level - cut.slope @ backoffs <= program.covariance.cost(theta) * (1.0 + 1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_best_policy_is_the_exact_program_s(name: str) -> None:
     """With its back-offs the mean, solved by another solver, and J_cov add up to the exact optimum."""
@@ -244,6 +247,7 @@ def test_the_best_policy_is_the_exact_program_s(name: str) -> None:
     assert checked > 15
 
 
+@pytest.mark.slow
 def test_a_proof_that_there_is_no_policy_serves_other_questions_and_harms_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same program for all questions, and with a new one for each."""
     design = build_design(load_config("room-hahn-stursberg", ["schedule.late=2"])).late[1]

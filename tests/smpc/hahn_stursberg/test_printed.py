@@ -112,6 +112,7 @@ def test_iteration_limit_is_told() -> None:
     assert PrintedSolver(paper(max_iterations=3)).solve(0, START, ORIGIN).status is SolveStatus.ITERATION_LIMIT
 
 
+@pytest.mark.slow
 def test_target_takes_the_place_of_the_origin() -> None:
     design = room()
     solver = PrintedSolver(design)

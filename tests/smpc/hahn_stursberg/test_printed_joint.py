@@ -13,6 +13,7 @@ from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
 START = np.array([35.0, -2.0, -20.0, -4.0])
 
 
+@pytest.mark.slow
 def test_the_joint_form_does_not_end_optimal_under_the_solver_s_own_settings() -> None:
     design = build_design(load_config("paper"))
     answer = PrintedSolver(design, joint=True, regularization=SOLVERS_OWN).solve(0, START, design.target)

@@ -41,6 +41,7 @@ def same_plan(name: str, units: Units, *, inputs: float = 1e-6) -> None:
     assert difference(answer.states / units.state, made.answer.states) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 def test_a_change_of_units_changes_nothing(name: str) -> None:
     plant = case(name).design.plant

@@ -131,6 +131,7 @@ def test_gradient_is_that_of_finite_differences(seed: int, discount: float) -> N
         assert gradient[index] == pytest.approx(numeric, rel=1e-6, abs=1e-6 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", [1, 2, 5])
 def test_no_gain_of_a_grid_is_better(tau: int) -> None:
     plant, q_x, q_u = one_axis(paper_plant()), np.diag([10.0, 0.1]), np.array([[0.1]])
@@ -159,6 +160,7 @@ def test_a_delayed_integrator_against_its_closed_form() -> None:
     assert found.cost == pytest.approx(best.fun, rel=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("side", "room"), [("u", [0.5]), ("x", [4.3, INF]), ("x", [INF, 1.2])])
 def test_limits_that_bind(side: str, room: list[float]) -> None:
     plant, q_x, q_u, tau = one_axis(paper_plant()), np.diag([10.0, 0.1]), np.array([[0.1]]), 4
