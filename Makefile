@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 # Not quiet: a download that takes a minute shows how far it is.
 PIP := $(VENV)/bin/python -m pip install --disable-pip-version-check -c constraints.txt
-# One stamp: the environment is made again only when what goes into it changes.
+# Stamps: the environment is made again only when what goes into it changes. To fly needs a fifth of what tests need.
+FLIES := $(VENV)/.flies
 STAMP := $(VENV)/.installed
 
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
@@ -11,7 +12,7 @@ CLIENTS := .venv-clients
 
 .PHONY: fly test test-all test-clients mutation docs clean
 
-fly: $(STAMP)
+fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
 
 # A person's loop, before each commit; test-all adds slow tests and the built wheel.
@@ -36,13 +37,18 @@ docs: $(STAMP)
 	$(VENV)/bin/python tools/check.py --write-docs
 	$(VENV)/bin/python tools/pictures.py
 
-$(STAMP): pyproject.toml constraints.txt
+$(FLIES): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
-	@echo "setting up $(VENV): once, a minute or two with the downloads"
+	@echo "setting up $(VENV), once"
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) setuptools wheel
+	$(PIP) --no-build-isolation -e .
+	touch $@
+
+$(STAMP): $(FLIES)
+	@echo "adding to $(VENV) what tests need, once: a minute or two with the downloads"
 	$(PIP) --no-build-isolation -e '.[dev]'
-	touch $(STAMP)
+	touch $@
 
 $(CLIENTS)/.installed: constraints-clients.txt
 	for client in mavsdk mavsdk3 mavproxy; do $(PYTHON) -m venv $(CLIENTS)/$$client; done
