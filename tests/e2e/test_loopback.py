@@ -157,6 +157,20 @@ def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path
     assert path.read_bytes() == before
 
 
+def test_a_flight_without_its_page_is_told_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise UavctlError("no room")
+
+    monkeypatch.setattr("uavctl.cli.flying.draw_page", fails)
+    assert run(["loopback", "--config", "room", "--duration", "1", "--out", str(tmp_path), "--json"]) == 0
+    told = capsys.readouterr()
+    found = json.loads(told.out)
+    assert found["report"] is None and Path(found["recording"]).exists()
+    assert "no room" in told.err
+
+
 def test_what_flies_loads_nothing_that_draws() -> None:
     names = "uavctl.cli.fly, uavctl.cli.loopback, uavctl.cli.ctl"
     script = f"import sys, {names}; print([name for name in sys.modules if name == 'matplotlib'])"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Protocol
 
 from cyclopts import Parameter
+from msgspec.structs import replace
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -351,6 +352,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
         draw_page(path, summary, page)
     except UavctlError as error:  # the flight and its recording are as they are
         messages().print(f"[yellow]warning:[/] no page: {escape(str(error))}", soft_wrap=True)
+        summary = replace(summary, report=None)
     return summary
 
 

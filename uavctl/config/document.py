@@ -1,4 +1,4 @@
-"""Line numbers of the keys of a TOML document: key path -> line number.
+"""A configuration document: its sections' types in words, its problems, and the line of each key.
 
 Parsers give values without places, or places without paths; a message that names the line of a
 wrong key needs both. The document must be valid TOML (the parser has seen it first).
