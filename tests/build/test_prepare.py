@@ -48,7 +48,8 @@ def test_it_is_told_that_a_library_is_made_and_nothing_when_there_is_one(
     design: Design, quick: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert not _ready(design).cached
-    assert capsys.readouterr() == ("", "policy library, made once for a design\n")
+    out, told = capsys.readouterr()
+    assert out == "" and "policy library" in told and told.count("\n") == 1
     assert _ready(design).cached
     assert capsys.readouterr() == ("", "")
 
@@ -70,7 +71,7 @@ def test_a_cache_that_cannot_be_used_is_told_once(
     monkeypatch.setenv("UAVCTL_CACHE", str(tmp_path / "file[b]"))
     assert _ready(design).path is None
     told = capsys.readouterr().err
-    assert told.count("set UAVCTL_CACHE to a folder that can be written") == 1 and "file[b]" in told
+    assert told.count("set UAVCTL_CACHE") == 1 and "file[b]" in told
 
 
 def test_what_is_prepared_decides_from_the_library(design: Design, stored: StoredLibrary) -> None:

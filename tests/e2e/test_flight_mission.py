@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 
@@ -13,6 +12,7 @@ from flight_rig import MS, TICKS, StubSolver, codes, inputs_of, make_controller,
 from loopback_rig import Memory, flight, lockstep, make_loop
 from numpy.typing import NDArray
 from report_rig import unwritten
+from told_numbers import numbers_in
 
 from logs.recording.replay import replay
 from logs.recording.summary import box_at, position_error_m, rows, summarise
@@ -170,8 +170,8 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
     assert memory.of(Truth)[-1].state[0] < -0.5
     data = flight(memory)
     (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "gave way" in text]
-    assert f"in {len(given)} flown a constraint gave way; at worst, in the plan of " in sentence
-    assert "the upper limit of north position gave way by " in sentence
+    assert f"in {len(given)} flown a constraint gave way" in sentence
+    assert "upper limit of north position" in sentence
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
     html = report_html(data, summarise(data, wall_s=1.0))
     (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "set out" in text]
-    assert sentence.startswith("It set out for waypoint 2 at ") and ", waypoint 3 at " in sentence
+    assert numbers_in(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
     assert position_error_m(data)[-1] < 0.3
     fenced = flight(flown(22.0, *FENCE))
@@ -202,13 +202,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     (sentence,) = [text for text in told if "follow a trajectory" in text]
     assert not any("from the target" in text or "waypoint" in text for text in told)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
-    found = re.fullmatch(
-        r"It was to follow a trajectory, (\S+) m from (\S+) s to (\S+) s; the distance from its place of the moment "
-        r"was (\S+) m meanwhile \(root mean square\), at most (\S+) m\.",
-        sentence,
-    )
-    assert found is not None
-    length_m, begun_s, ended_s, rms_m, most_m = map(float, found.groups())
+    length_m, begun_s, ended_s, rms_m, most_m = numbers_in(sentence)
     error_m = position_error_m(moving)
     assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
     assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
@@ -225,7 +219,7 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
     summary = summarise(fenced, wall_s=1.0)
     assert summary.state_violations == np.count_nonzero(beyond > 0) > 5
     (sentence,) = [text for text in story(fenced, summary) if "was outside its limits" in text]
-    assert f"at worst {beyond.max():.2g} m beyond a limit of north position" in sentence
+    assert f"{beyond.max():.2g} m beyond a limit" in sentence and "north position" in sentence
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:

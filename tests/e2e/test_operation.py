@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -190,14 +191,15 @@ def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end
             shutil.rmtree(air.folder / "f")
             until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
             found = air.status()["recorder"]
-            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted, moved or replaced")
+            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted")
             assert "in trouble, " in air.ctl("status")[1]
             until(lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0)
             process.send_signal(signal.SIGINT)
             _, told = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1
-    assert "warning: recording in trouble: flight.mcap deleted, moved or replaced" in told
-    assert "flight.mcap deleted, moved or replaced); what is in it is whole" in told and "Traceback" not in told
+    why = found["reason"]
+    assert f"warning: recording in trouble: {why}" in told  # as it happened
+    assert f"({why})" in told and "Traceback" not in told  # at the end
     rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
     assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
@@ -225,17 +227,14 @@ def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scen
         until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
         found = air.status()
         assert found["mode"] == "track" and found["recorder"]["dropped"] == 0
-        assert (
-            found["recorder"]["reason"]
-            == f"the recording was last written {found['recorder']['unwritten_s']:.1f} s ago"
-        )
+        assert f"last written {found['recorder']['unwritten_s']:.1f} s ago" in found["recorder"]["reason"]
         flag.unlink()
         until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
         flag.touch()
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1 and "Traceback" not in told
-    assert "records (the recording was last written " in told
+    assert re.search(r"records \(.* last written \d+\.\d s ago", told.replace("\n", " "))
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ def test_a_flight_may_begin_between_boundaries() -> None:
     samples = [sample(START_NS + first * TICK_NS - 10 * MS), *one_a_step()]
     outputs = run(make_controller(), inputs_of(range(first, first + TICKS), [samples[0], *samples[7:]]))
     assert modes(outputs) == [WAIT] * (TICKS - 1) + [TRACK]
-    assert outputs[0].decision.reason == "no position from before this boundary yet"
+    assert outputs[0].decision.reason.startswith("no position")
 
 
 def test_the_estimator_knows_the_input_after_the_last_gate() -> None:

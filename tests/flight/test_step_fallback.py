@@ -118,7 +118,7 @@ def test_a_vehicle_that_falls_silent_in_flight_is_braked_and_held_and_flown_agai
     silent = range(10, 30)
     outputs = run(make_controller(), inputs_of(range(40), moving(60, 0.5), status=silent_in(silent)))
     assert modes(outputs)[:11] == [TRACK] * 10 + [BRAKE]
-    assert outputs[10].decision.reason == "no vehicle is heard; the fallback's time runs on"
+    assert "no vehicle" in outputs[10].decision.reason
     assert set(modes(outputs)[10:30]) <= {BRAKE, HOLD}
     assert all(one.setpoint is not None for one in outputs)
     assert modes(outputs)[-5:] == [TRACK] * 5
@@ -157,7 +157,7 @@ def test_silence_of_the_vehicle_is_no_way_round_the_fresh_samples(silent: range,
     inputs = inputs_of(range(11 * TICKS), one_a_step(lost=range(1, 6)), status=silent_in(silent))
     outputs = run(make_controller(), inputs)
     assert modes(boundaries(outputs)) == [TRACK] * 4 + [HOLD] * (recovers - 4) + [TRACK] * (11 - recovers)
-    assert {outputs[tick].decision.reason for tick in silent} == {"no vehicle is heard; the fallback's time runs on"}
+    assert all("no vehicle" in outputs[tick].decision.reason for tick in silent)
 
 
 @pytest.mark.parametrize("status", [vehicle(armed=False), vehicle(external=False)])

@@ -23,6 +23,11 @@ def problems(folder: Path, *parts: str) -> list[str]:
     return [problem.removeprefix(f"{folder}/small.toml:") for problem in refused.value.problems]
 
 
+def by_key(told: list[str]) -> dict[str, str]:
+    """Return what is told of each key, of problems as "line: key: what"."""
+    return {key: what for _, key, what in (one.split(": ", 2) for one in told)}
+
+
 def same(one: Config, other: Config) -> bool:
     return msgspec.json.encode(one) == msgspec.json.encode(other)
 
@@ -76,18 +81,18 @@ def test_wrong_keys_and_values_are_told_at_once_with_line_and_nearest_name(tmp_p
         tmp_path, "stps = 20\nruns = 0\n", table("controller", "a", 'kind = "lgq"'), table("disturbance", "b")
     )
     assert [one.split(":")[0] for one in told] == ["3", "4", "7"]
-    assert 'stps: unknown key (nearest valid name "steps")' in told[0]
-    assert "runs: expected a whole number >= 1" in told[1]
-    assert any('controller[0].kind: there is no controller "lgq" (nearest valid name "lqg")' in one for one in told)
+    what = by_key(told)
+    assert '"steps"' in what["stps"] and ">= 1" in what["runs"]
+    assert '"lgq"' in what["controller[0].kind"] and '"lqg"' in what["controller[0].kind"]
 
 
 def test_a_quadrotor_which_campaigns_do_not_fly_is_refused_where_it_stands(tmp_path: Path) -> None:
     quadrotor = '"sim.start_position_m=[0, 0, -1.5]", "sim.plant=quadrotor"'
-    why = 'sim.plant is "quadrotor", and campaigns fly the linear plant; set sim.plant = "linear"'
+    why = 'sim.plant is "quadrotor"'
     (told,) = problems(tmp_path, f"set = [{quadrotor}]\n", controller("lqg"))
-    assert told.startswith(f"3: set[1]: {why}")
+    assert told.startswith(f"3: set[1]: {why}") and 'sim.plant = "linear"' in told
     (told,) = problems(tmp_path, controller("lqg", f"set = [{quadrotor}]"))
-    assert told.startswith(f"6: controller[0].set[1]: {why}")
+    assert told.startswith(f"6: controller[0].set[1]: {why}") and 'sim.plant = "linear"' in told
     text = (ROOT / "uavctl/presets/room-hahn-stursberg.toml").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(text.replace("[sim]", '[sim]\nplant = "quadrotor"'), encoding="utf-8")
     file = tmp_path / "campaign.toml"
@@ -105,14 +110,14 @@ def test_wrong_overrides_are_told_where_they_stand(tmp_path: Path) -> None:
         table("plant", "other", 'set = ["plant.a=[[1.0]]"]'),
     )
     assert len(told) >= 4
-    expected = {
-        'controller[0].set[0]: smpc.tua=3: smpc.tua: unknown key (nearest valid name "tau")': "6",
-        'link[0].set[0]: link.los=0.1: link.los: unknown key (nearest valid name "loss")': "9",
-        "link[0].set[1]: plant.dt_s=2: only link.* acts on what is flown": "9",
-        "plant[0].set: plant.b: is 4 x 2": "12",
-    }
-    for text, line in expected.items():
-        assert [one for one in told if one.startswith(f"{line}: {text}")], (text, told)
+    expected = (
+        ("6: controller[0].set[0]: smpc.tua=3: smpc.tua: ", '"tau"'),
+        ("9: link[0].set[0]: link.los=0.1: link.los: ", '"loss"'),
+        ("9: link[0].set[1]: plant.dt_s=2: ", "link.*"),
+        ("12: plant[0].set: plant.b: ", "4 x 2"),
+    )
+    for where, what in expected:
+        assert [one for one in told if one.startswith(where) and what in one], (where, told)
 
 
 def test_names_have_to_be_known_and_different(tmp_path: Path) -> None:
@@ -125,35 +130,39 @@ def test_names_have_to_be_known_and_different(tmp_path: Path) -> None:
         table("disturbance", "calm", "memory = 0.5"),
         '[[tuning]]\ncontrollers = ["lgq"]\nlinks = ["bed"]\nset = ["smpc.tau=3"]\n',
     )
-    text = "\n".join(told)
-    assert 'controller[1].name: "lqg" is there twice' in text
-    assert 'controller[0].link: there is no link "goood" (nearest valid name "good")' in text
-    assert 'link[2].name: "true" means' in text
-    assert 'disturbance[0].memory: has no meaning with kind "gaussian"' in text
-    assert 'tuning[0].controllers[0]: there is no controller "lgq" (nearest valid name "lqg")' in text
-    assert 'tuning[0].links[0]: there is no link "bed" (nearest valid name "bad")' in text
+    what = by_key(told)
+    for key, named in (
+        ("controller[1].name", ("lqg",)),
+        ("controller[0].link", ("goood", "good")),
+        ("link[2].name", ("true",)),
+        ("disturbance[0].memory", ("gaussian",)),
+        ("tuning[0].controllers[0]", ("lgq", "lqg")),
+        ("tuning[0].links[0]", ("bed", "bad")),
+    ):
+        assert all(f'"{name}"' in what[key] for name in named), (key, told)
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "key", "told"),
     [
-        ("start = [1.0]", "start: has 1 entries, n_x = 4"),
-        ("start_box = [[0.0, 0.0, 0.0, 0.0]]", "start_box: is not 2 rows of n_x = 4 numbers"),
-        ("start_box = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]]", "start_box: a lower limit is above the upper one"),
-        ("start = [0, 0, 0, 0]\nstart_box = [[0, 0, 0, 0], [1, 1, 1, 1]]", "start_box: there is a start too"),
-        ("controller = []", "controller: is empty"),
-        ('set = ["link.loss=2"]', "set[0]: link.loss=2: link.loss"),
+        ("start = [1.0]", "start", "n_x = 4"),
+        ("start_box = [[0.0, 0.0, 0.0, 0.0]]", "start_box", "2 rows of n_x = 4"),
+        ("start_box = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]]", "start_box", "lower limit"),
+        ("start = [0, 0, 0, 0]\nstart_box = [[0, 0, 0, 0], [1, 1, 1, 1]]", "start_box", "a start too"),
+        ("controller = []", "controller", "empty"),
+        ('set = ["link.loss=2"]', "set[0]", "link.loss=2: link.loss"),
     ],
 )
-def test_starts_and_lists_have_to_fit(tmp_path: Path, line: str, told: str) -> None:
+def test_starts_and_lists_have_to_fit(tmp_path: Path, line: str, key: str, told: str) -> None:
     parts = [f"{line}\n"] if line.startswith("controller") else [f"{line}\n", controller("lqg")]
-    assert any(told in one for one in problems(tmp_path, *parts))
+    assert told in by_key(problems(tmp_path, *parts))[key]
 
 
 def test_a_plant_of_another_size_is_refused(tmp_path: Path) -> None:
     step = table("plant", "slow", 'set = ["plant.dt_s=2.0"]')
     told = problems(tmp_path, controller("lqg"), step)
-    assert "plant[0].set: the plant has n_x, n_u = (4, 2), Δt = 2 s where the configuration has" in told[0]
+    what = by_key(told)["plant[0].set"]
+    assert "(4, 2)" in what and "Δt = 2 s" in what
 
 
 def test_a_file_that_is_none(tmp_path: Path) -> None:

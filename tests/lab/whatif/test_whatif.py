@@ -161,9 +161,9 @@ def test_too_few_positions_and_no_setpoints_are_refused() -> None:
         return msgspec.structs.replace(record, samples=()) if isinstance(record, StepInput) else record
 
     nothing = [(topic, at_ns, blind(record)) for topic, at_ns, record in flown(PAPER).entries]
-    with pytest.raises(RecordingError, match="a: only 0 positions came in it; a what-if needs at least 2"):
+    with pytest.raises(RecordingError, match=r"^a: .* 0 positions .* at least 2"):
         history_of(nothing, config_of(PAPER), "a")
-    with pytest.raises(RecordingError, match="the vehicle never took a setpoint"):
+    with pytest.raises(RecordingError, match="never took a setpoint"):
         history_of(stripped(PAPER, Setpoint), config_of(PAPER), "a")
     with pytest.raises(RecordingError, match="no decision"):
         history_of(stripped(PAPER, Decision), config_of(PAPER), "a")
@@ -177,7 +177,7 @@ def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
     shortened = history_of(cut, config, "x")
     response = response_of(shortened, config.plant)
     course = fly(shortened, config, build_controller(config), response, memory, lambda: 0)
-    assert course.end_ns == end_ns and course.ended == "no setpoint of the recording flies the vehicle any more"
+    assert course.end_ns == end_ns and "no setpoint" in course.ended
     assert memory.entries[-1][1] < end_ns + 1_000_000_000
     assert max(at_ns for _, at_ns, _ in until(memory.entries, end_ns)) == end_ns
 

@@ -82,9 +82,10 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
         capsys, "log", "whatif", str(flown), "--controller", "lqg", "--set", "link.loss=0.2", "--out", str(tmp_path)
     )
     assert code == 0
-    assert text.startswith("Reproduced with nothing changed, bit for bit.")
+    assert text.startswith("Reproduced")
     assert text.index("Reproduced") < text.index("Model (the recording's [plant])") < text.index("what-if")
-    assert "Changed: link.loss=0.2; controller lqg; link: configured." in text
+    (changed,) = [line for line in text.splitlines() if line.startswith("Changed: ")]
+    assert all(one in changed for one in ("link.loss=0.2", "controller lqg", "link: configured"))
     assert "lqg" in text and "Decision time" not in text
 
 
@@ -120,20 +121,17 @@ def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--set", "sim.seed=3"), "sim.seed is part of what was recorded"),
-        (("--set", "source.system_id=3"), "source.system_id is part of what was recorded"),
+        (("--set", "sim.seed=3"), "sim.seed is part of"),
+        (("--set", "source.system_id=3"), "source.system_id is part of"),
         (("--set", "smpc.horizn=3"), 'nearest valid name "horizon"'),
         (("--set", "nothing"), "is not an override"),
-        (("--set", "plant.dt_s=0.5"), "steps of 0.5 s, the recorded flight 4 states"),
+        (("--set", "plant.dt_s=0.5"), "steps of 0.5 s, the recorded"),
         (("--set", "link.loss=0.9"), "out of reach"),
-        (
-            ("--config", "room-hahn-stursberg"),
-            "room-hahn-stursberg: plant has 9 states, 3 inputs, axes north, east, down and steps of 0.2 s",
-        ),
+        (("--config", "room-hahn-stursberg"), "room-hahn-stursberg: plant has 9 states, 3 inputs"),
         (("--config", "missing.toml"), "no such file or preset"),
         (("--model", "room-hahn-stursberg"), "--model room-hahn-stursberg: plant has 9 states"),
         (("--seed", "4"), "--seed is of a simulated link"),
-        (("--link", "none"), "--link none: give `recorded` or `configured` alone, or KEY=VALUE"),
+        (("--link", "none"), "--link none: give `recorded` or `configured`"),
         (("--link", "recorded", "--link", "loss=0.1"), "give `recorded` or `configured` alone"),
         (("--link", "los=0.1"), 'nearest valid name "loss"'),
         (("--controller", "genius"), "genius"),

@@ -172,7 +172,7 @@ def test_a_torn_recording_is_exported_up_to_its_end(tmp_path: Path, capsys: pyte
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     assert run(["log", "export", str(path), "--to", "csv", "--json"]) == 0
     output = capsys.readouterr()
-    assert "the recording is torn: exported up to there" in output.err
+    assert "torn" in output.err
     document = json.loads(output.out)
     rows = {one["topic"]: one["rows"] for one in document["tables"]}
     events = [at_ns for topic, at_ns, _ in items if topic == "/uavctl/event"]
@@ -250,7 +250,8 @@ def test_places_that_cannot_be_written(flown: Path, tmp_path: Path, capsys: pyte
     (tmp_path / "file").write_text("")
     for to in ("csv", "parquet", "tlog"):
         assert run(["log", "export", str(flown), "--to", to, "--out", str(tmp_path / "file" / "out")]) == 2
-        assert "no folder can be made there" in capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert str(tmp_path / "file") in told.replace("\n", "") and "no folder can be made" in told
     with pytest.raises(UsageError, match="no folder can be made"):
         export_tables(flown, tmp_path / "file", TableFormat.CSV)
 

@@ -88,7 +88,7 @@ def test_a_disk_that_hangs_is_told_by_the_age_of_the_last_completed_write(tmp_pa
     clock.now_s = 12.3
     status = recorder.status()
     assert (status.ok, status.dropped, status.unwritten_s) == (False, 0, 12.3)
-    assert status.reason == "the recording was last written 12.3 s ago"
+    assert "last written 12.3 s ago" in status.reason
     told = recorder_health(status, tmp_path)
     assert (told.ok, told.reason, told.unwritten_s) == (False, status.reason, 12.3)
     disk.released.set()
@@ -108,7 +108,7 @@ def test_an_end_that_does_not_reach_the_disk_is_told(tmp_path: Path, disk: Hangi
     recorder = hung(tmp_path / "flight.mcap", disk, clock)
     clock.now_s = 2.5  # however short it was
     status = recorder.close(0.0)
-    assert not status.ok and "the recording was last written 2.5 s ago" in status.reason
+    assert not status.ok and "last written 2.5 s ago" in status.reason
 
 
 def removed(path: Path) -> None:

@@ -84,7 +84,7 @@ def test_torn_end_counts_as_loss(tmp_path: Path) -> None:
     result = recover(path, out)
     assert (result.finished, result.lossless, result.chunks_bad) == (False, False, 1)
     assert 0 < result.lost_bytes < 1100
-    assert "messages after the last restored one cannot be counted" in result.damage[-1]
+    assert "cannot be counted" in result.damage[-1]
     got = own(list(read(out)))
     assert got == flight(30)[: len(got)]
 
@@ -121,6 +121,6 @@ def test_full_disk_while_restoring(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(DiskFile, "write", write)
-    with pytest.raises(RecordingError, match="No space left on device; make room"):
+    with pytest.raises(RecordingError, match=r"No space left on device; .*room"):
         recover(path, out)
     assert not out.exists()

@@ -400,5 +400,5 @@ def test_a_bound_in_percent_is_never_rounded_below_itself(share: float, text: st
 
 def test_the_certified_gap_is_said_without_an_exponent() -> None:
     s = msgspec.structs.replace(figures(decision(0)), methods={"frozen": 3}, largest_gap=2.6e-5)
-    assert "3 frozen; certified gap at most 0.0026 % of the cost" in shown(s)
+    assert "3 frozen" in shown(s) and "0.0026 %" in shown(s)
     assert msgspec.json.decode(msgspec.json.encode(s))["largest_gap"] == 2.6e-5

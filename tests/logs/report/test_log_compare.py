@@ -88,7 +88,7 @@ def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -
     found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)]))
     assert {one.key: one.values for one in found.parameters} == {"cpu": ("", "another"), "versions.numpy": (None, "3")}
     assert found.likenesses[0].identical
-    assert "times were measured on different processors" in found.notes
+    assert any("different processors" in note for note in found.notes)
 
 
 def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> N
     found = compare(load_all([a, torn]))
     (likeness,) = found.likenesses
     assert likeness.parting is not None and likeness.parting.other == "its end"
-    assert "B is torn: compared up to its end" in found.notes
+    assert any(note.startswith("B is torn") for note in found.notes)
     assert any("different length" in note for note in found.notes)
     assert [one.finished for one in found.recordings] == [True, False]
 
@@ -158,7 +158,7 @@ def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, 
     text = shown(found, width)
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
-    assert "C is the same flight as A" in text and "B is the same as A for" in text
+    assert "C is the same flight" in text and "B is the same as A" in text
     for one in found.figures:
         assert text.count(f"│ {one.text}") >= 1
     for heading in ("B − A", "B / A", "C − A", "D / A"):

@@ -10,6 +10,7 @@ import pytest
 from loopback_rig import lockstep
 from report_rig import data, drawn, words_of
 from synthetic_scene import room
+from told_numbers import numbers_in
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
@@ -64,7 +65,7 @@ def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
     tiny = tuple(msgspec.structs.replace(plan, slack=1e-9, terminal_miss=1e-9) for plan in flight.plans)
     seen = words_of(dataclasses.replace(flight, plans=tiny))
     assert "plan-slack" not in seen.plots
-    assert "No plan that was flown gave way anywhere." in " ".join(seen.text)
+    assert "No plan that was flown gave way" in " ".join(seen.text)
 
 
 def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
@@ -75,7 +76,7 @@ def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
     ax = figures["Certified gap"].axes[0]
     low, high = ax.get_ylim()
     assert low <= 100.0 * gaps[0] and 100.0 * gaps[-1] <= high and high < 1000.0 * gaps[-1]
-    assert ax.get_ylabel() == "% of the cost (log scale)"
+    assert ax.get_yscale() == "log" and ax.get_ylabel().startswith("%")
     assert sum(low <= tick <= high for tick in ax.get_yticks()) >= 2
 
 
@@ -96,11 +97,11 @@ def test_arrivals_without_delay_are_drawn_from_zero(flight: FlightData) -> None:
 def test_a_short_flight_is_not_said_to_prove_anything(short: FlightData) -> None:
     seen = words_of(short)
     text = " ".join(seen.text)
-    assert "too few to judge the model" in text
+    assert "too few to judge" in text
     assert "where a right model stays" not in text  # a legend without a figure
-    assert "1 of 9 flown steps had no promise: it takes a plan that was flown in the step before" in text
+    assert "1 of 9 flown steps" in text  # had no promise
     told = judge_link(short, None).news
-    assert told.rate < 0.7 and "so few may still be chance" in text
+    assert told.rate < 0.7 and "may still be chance" in text
 
 
 def test_promised_risks_are_what_was_configured(short: FlightData) -> None:
@@ -130,12 +131,14 @@ def part_of(flight: FlightData, from_tick: int) -> FlightData:
 
 
 def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
-    text = " ".join(words_of(part_of(flight, 80)).text)
-    assert "Flight “room”, a part" in text
-    assert "This is a part of a flight: it begins at tick 80, 4 s into the flight. All times count from there." in text
-    assert "Part of a flight" in text and "begins at tick 80, 4 s into the flight" in text
-    assert "The controller was flying already, and flew 40 steps of 0.2 s." in text
-    assert "took over at the first tick" not in text
+    seen = words_of(part_of(flight, 80)).text
+    text = " ".join(seen)
+    assert "Flight “room”, a part" in text and "Part of a flight" in text
+    begins = [one for one in seen if "tick 80" in one]
+    assert len(begins) == 2 and all("tick 80, 4 s into" in one for one in begins)  # at the head, and in the table
+    (flew,) = [one for one in seen if "flew 40 steps" in one]
+    assert numbers_in(flew)[:2] == [40.0, 0.2]
+    assert "already" in flew and "took over" not in flew
 
 
 def note(text: str, segment: int = 1) -> RecorderNote:
@@ -147,9 +150,9 @@ def note(text: str, segment: int = 1) -> RecorderNote:
     ("last", "told", "breaks_off"),
     [
         ("end", "", False),
-        ("begin", "The recording breaks off here: it was not closed in order", True),
-        ("goes on in the next file", "The flight goes on in the next file.", False),
-        ("recovered from torn.mcap: 0 messages and 5 bytes lost", "The recording was recovered from torn.mcap", True),
+        ("begin", "not closed in order", True),
+        ("goes on in the next file", "in the next file", False),
+        ("recovered from torn.mcap: 0 messages and 5 bytes lost", "recovered from torn.mcap", True),
     ],
 )
 def test_a_recording_that_is_not_all_of_the_flight_says_so(
@@ -165,7 +168,8 @@ def test_a_recording_that_is_not_all_of_the_flight_says_so(
 def test_a_later_file_has_its_own_figures(flight: FlightData) -> None:
     part = dataclasses.replace(part_of(flight, 80), notes=(note("goes on after flight.mcap", 2), note("end", 2)))
     found, whole = summarise(part, wall_s=None), summarise(flight, wall_s=None)
-    assert "This is file 2 of a flight: it begins at tick 80, 4 s into the flight." in " ".join(words_of(part).text)
+    text = " ".join(words_of(part).text)
+    assert "file 2 of a flight" in text and "tick 80, 4 s into" in text
     first, last = part.truths[0], part.truths[-1]
     assert found.lost is not None
     assert (found.lost, found.received) == (last.lost - first.lost, last.sent - first.sent - found.lost)
@@ -180,7 +184,7 @@ def test_a_part_that_waits_first_tells_when_it_was_taken_over(flight: FlightData
         return msgspec.structs.replace(decision, mode=ControlMode.WAIT) if decision.tick < 90 else decision
 
     text = " ".join(words_of(dataclasses.replace(part, decisions=tuple(map(wait, part.decisions)))).text)
-    assert "The controller took over 0.5 s after the first tick" in text
+    assert "took over 0.5 s after" in text
 
 
 def test_a_whole_flight_is_no_part(flight: FlightData) -> None:

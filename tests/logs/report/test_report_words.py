@@ -69,8 +69,8 @@ HAND_OVER = {40: ControlMode.BRAKE, 50: ControlMode.HOLD, 51: ControlMode.LAND, 
 def test_the_operators_stop_is_no_fallback() -> None:
     text = ended_in(HAND_OVER, stop_tick=40)
     assert f"Ended by the operator after {40 * TICK_S:g} s" in text
-    assert "the vehicle was handed over to its own landing" in text
-    assert "The fallback was never needed." in text
+    assert "handed over to its own landing" in text
+    assert "fallback was never needed" in text
 
 
 def test_a_fallback_before_the_operators_stop_is_told() -> None:
@@ -80,25 +80,25 @@ def test_a_fallback_before_the_operators_stop_is_told() -> None:
 
 
 def test_a_hand_over_that_was_cut_off_is_told() -> None:
-    assert "the recording ends before the vehicle was handed over" in ended_in({40: ControlMode.BRAKE}, stop_tick=40)
-    assert "; the vehicle was handed over." in ended_in({40: ControlMode.STOPPED}, stop_tick=40)
+    cut_off = "recording ends before"
+    assert cut_off in ended_in({40: ControlMode.BRAKE}, stop_tick=40)
+    whole = ended_in({40: ControlMode.STOPPED}, stop_tick=40)
+    assert "the vehicle was handed over" in whole and cut_off not in whole
 
 
 def test_a_landing_is_told() -> None:
     text = ended_in(HAND_OVER)
-    assert f"Landed by the fallback after {51 * TICK_S:g} s." in text
-    assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s in all" in text
+    assert f"Landed by the fallback after {51 * TICK_S:g} s" in text
+    assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s" in text
     assert "operator" not in text
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ordered", "told"), [(True, "Landed as ordered"), (False, "Landed at the end of the mission")]
-)
+@pytest.mark.parametrize(("ordered", "told"), [(True, "Landed as ordered"), (False, "end of the mission")])
 def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> None:
     text = ended_in(HAND_OVER, order_tick=40 if ordered else None, due_tick=None if ordered else 40)
     assert told in text and f"{51 * TICK_S:g} s" in text
-    assert "The fallback was never needed." in text
+    assert "fallback was never needed" in text
     assert "fallback had the vehicle land" not in text and "by the fallback" not in text
 
 
@@ -106,9 +106,9 @@ def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> 
 @pytest.mark.parametrize(
     ("mode", "told"),
     [
-        (ControlMode.WAIT, "At the end the controller was waiting: why not."),
-        (ControlMode.TRACK, "At the end a plan was being flown."),
-        (ControlMode.HOLD, "The recording ends while the fallback held zero acceleration."),
+        (ControlMode.WAIT, "waiting: why not."),  # with its reason
+        (ControlMode.TRACK, "a plan was being flown"),
+        (ControlMode.HOLD, "held zero acceleration"),
     ],
 )
 def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
@@ -116,8 +116,9 @@ def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
 
 
 def test_a_simulated_flight_that_never_began_has_a_page() -> None:
-    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.WAIT})
-    assert "Nothing was flown in 4 s: why not." in ended_in({0: ControlMode.STOPPED}, stop_tick=0)
+    nothing = "Nothing was flown in 4 s: why not."  # with its reason
+    assert nothing in ended_in({0: ControlMode.WAIT})
+    assert nothing in ended_in({0: ControlMode.STOPPED}, stop_tick=0)
 
 
 def test_what_went_amiss_is_told() -> None:
@@ -126,9 +127,9 @@ def test_what_went_amiss_is_told() -> None:
     assert not any("missed" in sentence or "dropped" in sentence for sentence in story(flight, good))
     times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
     bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
-    told = story(flight, bad)
-    assert "3 ticks were missed; the latest tick began 73.4 ms late." in told
-    assert "1 record was dropped because the disk was too slow, and missing from all figures." in told
+    ticks, records = [one for one in story(flight, bad) if "missed" in one or "dropped" in one]
+    assert ticks.startswith("3 ticks were missed") and "73.4 ms late" in ticks
+    assert records.startswith("1 record was dropped") and "disk" in records
 
 
 @pytest.mark.slow
@@ -150,8 +151,8 @@ def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: 
         clock_rejected=0,
     )
     text = " ".join(words_of(dataclasses.replace(found, links=(stats,))).text)
-    taken = "The shortest delay is taken to be 30 ms (clock.latency_s)" in text
-    short = "Delays are short of the quickest one" in text
+    taken = "30 ms (clock.latency_s)" in text
+    short = "short of the quickest" in text
     assert (taken, short) == (latency_s > 0.0, latency_s == 0.0)
 
 
@@ -161,7 +162,7 @@ def test_the_ways_to_a_plan_and_slack_are_explained_where_they_stand() -> None:
     plans = tuple(msgspec.structs.replace(plan, method=ways[at % 2]) for at, plan in enumerate(found.plans))
     text = " ".join(words_of(dataclasses.replace(found, plans=plans)).text)
     assert [f"“{way}”: with " in text for way in ways] == [True, True, False]
-    assert "Slack is what state limits give way by" in text
+    assert "Slack is" in text
 
 
 def flown_blind(age_s: float, *, truth: bool = False) -> FlightData:

@@ -84,7 +84,8 @@ def test_correlation_that_comes_of_expecting_too_much_noise_is_told_and_is_cauti
     verdict = judged(too_noisy(4, 1500))
     assert all(one.whiteness_refuted and one.correlation[0] > 0.15 for one in verdict.axes)
     assert verdict.outcome is ModelOutcome.CAUTIOUS and not verdict.refuted
-    assert "an error tells a little of the next" in verdict.text and "the model is cautious" in verdict.text
+    assert "tells a little" in verdict.text and "the model is cautious" in verdict.text
+    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
 
 
 def test_expecting_too_much_noise_refutes_in_hardly_any_flight() -> None:
@@ -95,7 +96,8 @@ def test_expecting_too_much_noise_refutes_in_hardly_any_flight() -> None:
 def test_one_axis_with_larger_errors_refutes_all() -> None:
     verdict = judged(autoregressive(5, 800, 1.0, 0.0) * np.array([0.7, 1.0, 1.3]))
     assert verdict.outcome is ModelOutcome.REFUTED
-    assert "larger than foretold (1.3 × down)" in verdict.text and "smaller than foretold (0.7 × north)" in verdict.text
+    assert "larger than foretold (1.3 × down)" in verdict.text
+    assert "smaller than foretold (0.7 × north)" in verdict.text
 
 
 def test_ellipsoids_that_hold_more_than_promised_are_caution_and_fewer_are_not() -> None:
@@ -134,14 +136,16 @@ def test_the_summary_says_in_words_which_it_is() -> None:
     def row(model: ModelVerdict) -> str:
         return dict(verdict_rows(msgspec.structs.replace(others, model=model)))["Model of the vehicle"]
 
-    said = {
-        "cautious: errors were smaller than foretold": (0.8, 0.0),
-        "nothing in this flight speaks against it": (1.0, 0.0),
-        "refuted by this flight: errors were larger than foretold": (1.3, 0.0),
-        "refuted by this flight: errors were telling of the next": (1.0, 0.5),
-    }
-    for words, (scale, r) in said.items():
-        assert row(judged(autoregressive(8, 800, scale, r))) == words
+    said = (
+        ("cautious", {"smaller"}, 0.8, 0.0),
+        ("nothing", set(), 1.0, 0.0),
+        ("refuted", {"larger"}, 1.3, 0.0),
+        ("refuted", {"telling"}, 1.0, 0.5),
+    )
+    for outcome, why, scale, r in said:
+        words = row(judged(autoregressive(8, 800, scale, r)))
+        assert words.startswith(outcome)
+        assert {word for word in ("smaller", "larger", "telling") if word in words} == why
     assert row(judged(np.ones((10, 3)))) == "too little to judge"
 
 

@@ -51,7 +51,8 @@ def test_errors_that_tell_of_the_next_are_found() -> None:
     assert [one.correlation[0] for one in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
     assert len(verdict.axes[0].correlation) == LAGS
     assert verdict.refuted
-    assert "an error tells of the next" in verdict.text
+    assert "error tells of the next" in verdict.text
+    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
 
 
 @pytest.mark.parametrize(("scale", "outcome", "told"), [(1.3, "refuted", "too small"), (0.7, "cautious", "cautious")])

@@ -62,7 +62,8 @@ def test_violations_at_steps_with_news_are_trials() -> None:
     assert (first.name, first.measured.hits) == ("upper limit of north position", 2)
     assert verdict.unpromised == 1
     assert not verdict.refuted
-    assert "nothing speaks against the promise. One flight can refute a promise, but not prove it" in verdict.text
+    assert f"{states.measured.hits} of {states.measured.trials} steps" in verdict.text
+    assert "nothing speaks against" in verdict.text and "not prove it" in verdict.text
     assert verdict.source == "truth"
 
 
@@ -72,7 +73,7 @@ def test_too_many_violations_refute_the_promise() -> None:
     states = verdict.limits[0]
     assert states.refuted and states.p_value is not None and states.p_value < 1e-6
     assert states.measured.low > 0.05
-    assert verdict.text.startswith("The promise was broken: all states outside at 30 of")
+    assert f"all states outside at 30 of {states.measured.trials}" in verdict.text and "broken" in verdict.text
 
 
 def test_where_a_plan_gave_way_nothing_was_promised() -> None:
@@ -82,7 +83,7 @@ def test_where_a_plan_gave_way_nothing_was_promised() -> None:
     assert verdict.limits[0].measured.trials == 0
     assert verdict.unpromised == len(found.steps)
     assert not verdict.refuted
-    assert "No step was flown under a promise" in verdict.text
+    assert "No step was flown" in verdict.text
 
 
 def test_the_fallback_promises_nothing() -> None:
@@ -152,7 +153,7 @@ def test_a_warning_in_flight_that_the_verdict_does_not_share_is_explained(loss: 
     event = Event(at_ns=0, severity=Severity.WARNING, code=code, text="")
     verdict = judge_link(dataclasses.replace(found, events=(event,)), room_config())
     assert verdict.refuted == (loss == 0.5)
-    assert verdict.text.count("made in flight, on few steps") == said
+    assert verdict.text.count("made in flight") == said
 
 
 def stats(at_s: float, offset_s: float, **changes: object) -> LinkStats:

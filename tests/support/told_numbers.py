@@ -1,0 +1,10 @@
+"""Numbers of a sentence, so that tests hold what it says and not how it says it."""
+
+from __future__ import annotations
+
+import re
+
+
+def numbers_in(text: str) -> list[float]:
+    """Return the numbers of a text in its order; a minus counts only where nothing stands before it."""
+    return [float(one.replace("−", "-")) for one in re.findall(r"(?<![\w.])[-−]?\d+(?:\.\d+)?", text)]
