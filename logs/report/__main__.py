@@ -16,7 +16,7 @@ from uavctl.errors import UavctlError
 
 
 def main() -> int:
-    """Write the page; 1 if it cannot be, with the reason on standard error."""
+    """Write the page; return 0, or 1 with the reason on standard error if it cannot be written."""
     recording, page = Path(sys.argv[1]), Path(sys.argv[2])
     try:
         write_report(FlightData.from_records(read(recording), recording), pickle.load(sys.stdin.buffer), page)

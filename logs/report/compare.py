@@ -35,7 +35,7 @@ from uavctl.records import Header
 
 
 class ComparedFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """One of the recordings."""
+    """One recording of a comparison: its name there, where it is from, and how its flight ended."""
 
     name: str  # A, B, ...
     recording: str
@@ -50,7 +50,7 @@ class ComparedFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class LoadedFlight:
-    """A recording in memory."""
+    """One recording of a comparison in memory, with its records and its summary."""
 
     side: ComparedFlight
     flight: FlightData
@@ -58,7 +58,7 @@ class LoadedFlight:
 
 
 def load_all(paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: None) -> tuple[LoadedFlight, ...]:
-    """Read recordings.
+    """Read the recordings of a comparison, named A, B, … in their order.
 
     Raises:
         RecordingError: One cannot be read, or nothing was flown in it; names it.
@@ -89,7 +89,7 @@ def _load(path: Path, name: str) -> LoadedFlight:
 
 
 def _letter(number: int) -> str:
-    """A to Z, and then A1, B1 ..."""
+    """Return the name of recording `number`: A to Z, then A1, B1 and so on."""
     return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
 
 
@@ -100,7 +100,7 @@ Value = int | float | None
 
 
 class Figure(msgspec.Struct, frozen=True, kw_only=True):
-    """One figure of all flights; null where it was not measured."""
+    """One figure (error, cost, time, …) of all compared flights; null where it was not measured."""
 
     key: str
     group: str
@@ -112,7 +112,7 @@ class Figure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def figures(loaded: Sequence[LoadedFlight]) -> Iterator[Figure]:
-    """What at least one of the flights has a figure for."""
+    """Return the figures that at least one of the flights has."""
     measured = [{row.key: row for row in _rows(one)} for one in loaded]
     for key, row in {key: row for one in reversed(measured) for key, row in one.items()}.items():
         values = tuple(one[key].value if key in one else None for one in measured)
@@ -143,7 +143,7 @@ def _figure(row: _Row, values: tuple[Value, ...]) -> Figure:
 
 
 def _rows(one: LoadedFlight) -> Iterator[_Row]:
-    """Figures of a flight; those of the summary under its keys."""
+    """Return the figures of one flight; those of the summary keep its keys."""
     s, flight = one.summary, one.flight
     ages = [d.age_steps for d in flight.steps.decisions if d.age_steps is not None]
     error_m = position_error_m(flight)
@@ -211,7 +211,7 @@ _LONGEST = 72  # characters of a value
 
 
 class FirstDivergence(msgspec.Struct, frozen=True, kw_only=True):
-    """The first record in which two flights differ."""
+    """First record in which a flight differs from the first one."""
 
     topic: str
     flight_s: float  # since the first tick of the first recording
@@ -221,7 +221,7 @@ class FirstDivergence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Match(msgspec.Struct, frozen=True, kw_only=True):
-    """How far a flight is the same as that of the first recording, bit for bit; computing times do not count."""
+    """Agreement of a flight with that of the first recording, bit for bit; computing times do not count."""
 
     name: str
     identical: bool
@@ -230,14 +230,14 @@ class Match(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParameterDifference(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter in which the recordings differ; null where one has none."""
+    """Parameter in which the recordings differ; null where a recording does not have it."""
 
     key: str  # dotted name in the configuration, or design_id, library_id, cpu, versions.<package>
     values: tuple[object, ...]  # one each recording
 
 
 class FlightComparison(msgspec.Struct, frozen=True, kw_only=True):
-    """Flights beside each other; the first is what the others are compared with."""
+    """Result of `compare`: all flights against the first."""
 
     recordings: tuple[ComparedFlight, ...]
     likenesses: tuple[Match, ...]
@@ -276,12 +276,12 @@ def _likeness(first: LoadedFlight, other: LoadedFlight) -> Match:
 
 
 def _word(message: RecordedMessage) -> tuple[str, bytes, int]:
-    """What a message says: topic, bytes and time."""
+    """Return the content of a message that is compared: topic, bytes and log time [ns]."""
     return message.definition.topic, message.data, message.at_ns
 
 
 def _parting(left: RecordedMessage | None, right: RecordedMessage | None, origin_ns: int) -> FirstDivergence:
-    """Where two recordings part; at most one of the messages is None."""
+    """Return the first difference of two recordings; None for a message stands for a recording's end."""
     there = left or right
     assert there is not None
     topic, at_ns = there.definition.topic, there.at_ns
@@ -301,7 +301,7 @@ def _parting(left: RecordedMessage | None, right: RecordedMessage | None, origin
 
 
 def _frame(data: bytes) -> str:
-    """Raw bytes by the name of their MAVLink message."""
+    """Return raw bytes in words: the name of their first MAVLink message, and their number."""
     frames = scan(data, final=True).frames
     name = mavlink.mavlink_map[frames[0].message_id].msgname if frames else "no whole packet"
     return f"{name}, {len(data)} bytes"
@@ -312,7 +312,7 @@ def _short(text: str) -> str:
 
 
 def _parameters(one: LoadedFlight) -> dict[str, object]:
-    """What decides a flight beside what happened in it: configuration, design, versions, processor."""
+    """Return what a flight was set up with: configuration, design, library, versions, processor."""
     header: Header = one.flight.header
     try:
         config = tomllib.loads(header.config_toml)
@@ -328,7 +328,7 @@ def _parameters(one: LoadedFlight) -> dict[str, object]:
 
 
 def _dotted(value: object, path: str) -> Iterator[tuple[str, object]]:
-    """Keys of a configuration by their dotted names; tables of a list are numbered."""
+    """Return a configuration's values by dotted keys; tables of a list are numbered, as in `fence[0].side`."""
     if isinstance(value, Mapping):
         for key, one in value.items():
             yield from _dotted(one, f"{path}.{key}" if path else key)
@@ -377,7 +377,7 @@ _NONE = "–"
 
 
 def likeness(one: Match) -> str:
-    """How far a flight is the same as the first one."""
+    """Return a sentence on how long a flight is the same as the first one, and where it departs from it."""
     where = one.parting
     if where is None:
         alike = count(one.records, "record")
@@ -392,14 +392,14 @@ def likeness(one: Match) -> str:
 
 
 def parameter(value: object) -> str:
-    """A parameter's value."""
+    """Return a parameter's value as text."""
     if value is None:
         return _NONE
     return value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
 def for_people(figure: Figure) -> Figure:
-    """A figure in the unit that people read it in: a share that is far below one in percent."""
+    """Return a figure in the unit that it is shown in; the certified gap, a small share, in percent."""
     if figure.key != "largest_gap":
         return figure
     values, differences = (
@@ -410,19 +410,19 @@ def for_people(figure: Figure) -> Figure:
 
 
 def measured(value: Value) -> str:
-    """A figure: four digits, and no exponent where people count without one."""
+    """Return a figure as text: four digits, or all of those before the point up to a million."""
     if value is None:
         return _NONE
     return f"{value:.0f}" if isinstance(value, int) or 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
 
 
 def difference(value: Value) -> str:
-    """A difference of figures, with its sign."""
+    """Return a difference of figures as text, with its sign."""
     return f"+{measured(value)}" if value is not None and value > 0 else measured(value)
 
 
 def label(figure: Figure) -> str:
-    """What a figure is, with its unit."""
+    """Return the name of a figure with its unit."""
     return f"{figure.text}, {figure.unit}" if figure.unit else figure.text
 
 
@@ -450,7 +450,7 @@ def write_page(found: FlightComparison, loaded: Sequence[LoadedFlight], path: Pa
 
 
 def comparison_html(found: FlightComparison, loaded: Sequence[LoadedFlight]) -> str:
-    """The page as text."""
+    """Return the page of a comparison as HTML."""
     names = [one.side.name for one in loaded]
     story = [*map(likeness, found.likenesses), *(f"Mind: {note}." for note in found.notes)]
     title = f"Flights {', '.join(names)}"
@@ -540,12 +540,12 @@ def _overlay(
 
 
 def _width(place: int, flights: Sequence[FlightData]) -> float:
-    """Width of a flight's line [pt]."""
+    """Return the width of the line of flight `place` [pt]; the first is the widest, so that all are seen."""
     return float(np.linspace(_WIDEST, _FINEST, len(flights))[place])
 
 
 def _course(flight: FlightData) -> tuple[Floats, Floats]:
-    """Where it was: times (n,) [s] and positions (n, 3), local NED; the true ones where they are known."""
+    """Return times (n,) [s] and positions (n, 3) [m] in local NED: the true ones if known, else the estimated ones."""
     if flight.truths:
         points = [truth.position_m for truth in flight.truths]
         return flight.seconds([truth.at_ns for truth in flight.truths]), np.array(points)
@@ -554,7 +554,7 @@ def _course(flight: FlightData) -> tuple[Floats, Floats]:
 
 
 def _limits(flight: FlightData, axis: str) -> list[float]:
-    """Sides of the limits of a position, as people see the axis; open ones are left out."""
+    """Return the finite limits of an axis' position [m], with the sign that the axis is drawn with."""
     design = flight.design
     index = design.position_index[design.axes.index(axis)]
     sides = (SEEN[axis][1] * float(box[index]) for box in (design.state_box.lower, design.state_box.upper))
@@ -578,7 +578,7 @@ def _figures(found: FlightComparison) -> str:
 
 
 def _figures_of(found: FlightComparison, others: Sequence[int]) -> str:
-    """The first flight's figures beside those of some others."""
+    """Return a table of the first flight's figures beside those of some others."""
     names = {place: found.recordings[place].name for place in others}
     columns = ["figure", "A"]
     columns += [text for name in names.values() for text in (name, f"{name} − A", f"{name} / A")]

@@ -1,4 +1,4 @@
-"""Plots of control, link, solver, verdicts."""
+"""Plots of control, link, solver and verdicts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PICTURE_LABEL = "A flight from above within its limits, and the age of its posit
 
 
 def age(flight: FlightData) -> tuple[Drawing, Drawing]:
-    """Age of information with H, losses and fallback: for a wide page and for a narrow one."""
+    """Draw the age of information with the horizon H, losses and fallback, for a wide page and for a narrow one."""
     label = (
         f"Age of information over time in steps; the horizon is {flight.design.horizon} steps; "
         "lost positions and fallback spans are marked"
@@ -50,7 +50,7 @@ def age(flight: FlightData) -> tuple[Drawing, Drawing]:
 
 
 def draw_age(ax: Axes, flight: FlightData) -> None:
-    """Age at each tick, the horizon, and a strip of lost positions below zero."""
+    """Draw the age of information at each tick [steps], the horizon H, and ticks for lost positions below zero."""
     horizon = flight.design.horizon
     known = [(d.at_ns, float(d.age_steps)) for d in flight.decisions if d.age_steps is not None]
     t_s, ages = thin(flight.seconds([at for at, _ in known]), np.array([value for _, value in known]))
@@ -72,7 +72,7 @@ def draw_age(ax: Axes, flight: FlightData) -> None:
 
 
 def inputs(flight: FlightData) -> Iterator[Drawing]:
-    """Each input against its limits, coloured by the plan index that was flown."""
+    """Draw each input against its limits, coloured by the plan index that was flown."""
     steps, design = flight.steps, flight.design
     outside = input_outside(flight)
     index = np.array([-1 if d.plan_index is None else d.plan_index for d in steps.decisions], dtype=np.int64)
@@ -97,7 +97,7 @@ def inputs(flight: FlightData) -> Iterator[Drawing]:
 
 
 def _indices(flight: FlightData, index: NDArray[np.int64]) -> Drawing:
-    """How often each plan index was flown; the key to the colours, too."""
+    """Draw the share of steps in which each plan index was flown [%]; it is the key to the colours of inputs."""
     horizon = flight.design.horizon
     share = np.array([np.count_nonzero(index == at) for at in range(horizon)]) / max(1, len(index)) * 100
     with canvas("plan-index", 2.3) as one:
@@ -109,13 +109,13 @@ def _indices(flight: FlightData, index: NDArray[np.int64]) -> Drawing:
 
 
 def _draw_held(ax: Axes, t_s: Floats, values: Floats, dt_s: float, shade: str) -> None:
-    """Values held for a step each."""
+    """Draw values (n,) that are each held for one step."""
     kept = np.flatnonzero(np.isfinite(values))[:: _stride(len(values))]
     strokes(ax, (t_s[kept], values[kept]), (t_s[kept] + dt_s, values[kept]), shade, 2.2, zorder=3)
 
 
 def timing(flight: FlightData) -> Iterator[Drawing]:
-    """Decision times, if the shell measured any, and tick lateness, if there can be any."""
+    """Draw decision times and tick lateness; neither where no times were measured, no lateness in virtual time."""
     if not flight.timings:
         return
     solved = {d.tick for d in flight.decisions if d.solve is not None}
@@ -151,7 +151,7 @@ def _times(flight: FlightData, key: str, title: str, t_s: Floats, values_us: Flo
 
 
 def largest(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """The MARKS largest values evenly thinned below: outliers are never hidden."""
+    """Thin points to about `MARKS`: the largest third of them is kept, the rest evenly, so no outlier is hidden."""
     if len(values) <= MARKS:
         return t_s, values
     order = np.argsort(values)
@@ -164,7 +164,7 @@ def _stride(count: int) -> int:
 
 
 def picture(flight: FlightData) -> str:
-    """A drawing of the flight that stands alone: path from above beside the age of information, as SVG text."""
+    """Return a drawing of the flight as an SVG file: path from above beside the age of information."""
     with canvas("flight", 3.6, 9.0) as one:
         left, right = one.figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         left.set(title="The path, from above", xlabel="east [m]", ylabel="north [m]")
@@ -193,7 +193,7 @@ _LEAST_SPAN = 0.01  # of the axis: a delay configured without jitter is seen, to
 
 
 def link(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
-    """Histogram of the age, of the delay, and the estimate of the arrivals over time."""
+    """Draw histograms of the age and of the delay, and the estimated share of arrivals over time."""
     if verdict.ages:
         yield _ages(flight, verdict)
     if flight.link_estimates:
@@ -272,19 +272,19 @@ _WAYS = {
 
 
 def methods(flight: FlightData) -> list[tuple[str, str]]:
-    """Ways in which plans were found, each with its colour's role."""
+    """Return the methods by which plans were found, each with the role of its colour."""
     names = sorted({plan.method for plan in flight.plans})
     return [(name, _ROLES[place % len(_ROLES)]) for place, name in enumerate(names)]
 
 
 def ways(flight: FlightData) -> str:
-    """A sentence on the ways in which plans were found, and a space after it; empty where none is known."""
+    """Return a sentence on the methods by which plans were found, with a space after it; empty if none is known."""
     told = [f"“{name}”: {_WAYS[name]}" for name in sorted({plan.method for plan in flight.plans} & set(_WAYS))]
     return f"Plans were found in these ways: {'; '.join(told)}. " if told else ""
 
 
 def certificates(flight: FlightData) -> Iterator[Drawing]:
-    """Certified gap of each plan, and the slack of those that gave way."""
+    """Draw the certified gap of each plan, and the slack of those in which a constraint gave way."""
     if any(np.isfinite(plan.gap) for plan in flight.plans):
         yield _gaps(flight)
     gave = [plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE]
@@ -336,7 +336,7 @@ _MARGIN = 1.25
 
 
 def whiteness(axis: AxisVerdict) -> Drawing:
-    """Correlation of an axis' errors with those of later positions."""
+    """Draw the autocorrelation of an axis' one-step errors."""
     lags = np.arange(1, len(axis.correlation) + 1, dtype=np.float64)
     values = np.array(axis.correlation)
     with canvas(f"white-{axis.axis}", 2.3) as one:
@@ -354,7 +354,7 @@ def whiteness(axis: AxisVerdict) -> Drawing:
 
 
 def coverage(leads: tuple[LeadVerdict, ...]) -> Drawing:
-    """Share of the positions in their ellipsoids, by the time ahead."""
+    """Draw the share of positions inside their confidence ellipsoids over the time ahead."""
     t_s = np.array([one.lead_s for one in leads])
     with canvas("coverage", 2.3) as one:
         ax = one.axes("Positions in their ellipsoid", "time ahead [s]", "share [%]")
@@ -370,7 +370,7 @@ def coverage(leads: tuple[LeadVerdict, ...]) -> Drawing:
 
 
 def errors(flight: FlightData, axis: str, t_s: Floats, normalised: Floats) -> Drawing:
-    """One-step errors of an axis over time, in foretold deviations."""
+    """Draw the one-step errors of an axis over time, in foretold standard deviations."""
     with canvas(f"error-{axis}", 2.3) as one:
         ax = one.axes(f"Errors of the forecast, {axis}", "time [s]", "foretold deviations")
         reach = normal_reach()
@@ -384,7 +384,7 @@ def errors(flight: FlightData, axis: str, t_s: Floats, normalised: Floats) -> Dr
 
 
 def clocks(flight: FlightData, verdicts: tuple[ClockVerdict, ...]) -> Iterator[Drawing]:
-    """Offsets about their straight line, of clocks that strayed from it."""
+    """Draw clock offsets about their straight line, for clocks that strayed from it."""
     for number, verdict in enumerate(verdicts):
         if not verdict.residual_us:
             continue

@@ -48,7 +48,7 @@ _DESIGN = {
 
 
 def origin_sections(flight: FlightData) -> Iterator[PageSection]:
-    """Parameters, then what the flight was made with."""
+    """Return the sections on parameters and on how the flight was made."""
     design = list(_design(flight.header.design))
     parts = [page.facts(design)] if design else []
     assumptions = list(_assumptions(flight.header.design))
@@ -73,7 +73,7 @@ def _design(design: Mapping[str, object]) -> Iterator[tuple[str, str]]:
 
 
 def _text(value: object) -> str:
-    """A number, or numbers; equal ones in a row are told once."""
+    """Return a number, or a list of them, as text; a run of equal numbers is written once."""
     if isinstance(value, (int, float)):
         return f"{value:.4g}"
     if not isinstance(value, (list, tuple)):
@@ -105,14 +105,14 @@ _UNREADABLE = "The flight's configuration cannot be read by this version, so its
 
 
 def verdict_sections(flight: FlightData, judged: Judged) -> Iterator[PageSection]:
-    """Risk, model and clocks; the link's verdict stands with its figures."""
+    """Return the sections on risk, model and clocks; the link's verdict stands beside its figures."""
     yield _risk(judged.verdicts)
     yield _model(flight, judged)
     yield _clocks(flight, judged.verdicts)
 
 
 def verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
-    """One line for each verdict."""
+    """Return one row (name, outcome) for each verdict."""
     risk = verdicts.risk
     known = bool(risk.limits[0].measured.trials) and risk.limits[0].promised is not None
     link = verdicts.link
@@ -138,7 +138,7 @@ def _model_word(model: ModelVerdict | None) -> str:
 
 
 def _departure(model: ModelVerdict) -> str:
-    """What refutes a model, in a word each."""
+    """Return what refutes a model, each test in a few words."""
     found = [
         *(["larger than foretold"] if any(one.larger for one in model.axes) else ()),
         *(["off on average"] if any(one.mean_refuted for one in model.axes) else ()),
@@ -309,7 +309,7 @@ def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged:
 
 
 def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | None = None) -> str:
-    """The page as text."""
+    """Return the page of a flight as HTML."""
     judged = judge(flight) if judged is None else judged
     header = flight.header
     name = _config_name(header.config_toml)
@@ -416,7 +416,7 @@ def _link_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
 
 
 def _quickest(delay: DelayVerdict) -> str:
-    """What is known of delays where the sender's clock is only known by the quickest arrival."""
+    """Return a sentence on delays where the sender's clock is known by the quickest arrival only."""
     if delay.latency_ms:
         return (
             f" The shortest delay is taken to be {number(delay.latency_ms)} ms (clock.latency_s), as the sender's "
@@ -500,7 +500,7 @@ def _fallback_mark(flight: FlightData) -> tuple[Mark, ...]:
 
 
 def _config_name(config_toml: str) -> str | None:
-    """Name in the configuration; a damaged one is shown as it is, further down."""
+    """Return the name in a configuration; None if there is none, or the TOML is damaged."""
     try:
         name = tomllib.loads(config_toml).get("name")
     except tomllib.TOMLDecodeError:

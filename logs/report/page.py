@@ -1,4 +1,4 @@
-"""The HTML of a report: one file without scripts or anything from outside."""
+"""HTML of a report: one file without scripts, fonts or images from outside."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from logs.report.svg import FONT, Drawing, css_variables
 
 @dataclass(frozen=True)
 class Mark:
-    """One entry of a legend: how something is drawn, and what it is."""
+    """One entry of a legend: the kind of mark, its colour's role, its meaning."""
 
     kind: str  # line, thin, dashed, dotted, dot, ring, star, cross, tick, band
     role: str
@@ -22,7 +22,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading, a sentence on how to read it, a legend and HTML made by this module."""
+    """One section of a page: heading, a note on how to read it, its HTML, and its legend."""
 
     title: str
     note: str
@@ -33,7 +33,7 @@ class PageSection:
 def page(
     title: str, subtitle: str, story: Iterable[str], sections: Iterable[PageSection], heading: str = "What happened"
 ) -> str:
-    """A complete document; `title`, `subtitle`, `story` and the `heading` over it are plain text."""
+    """Return a complete HTML document; `title`, `subtitle`, `story` and its `heading` are plain text."""
     css = Template(resources.files("logs.report").joinpath("page.css").read_text(encoding="utf-8"))
     style = css.substitute(light=css_variables(False), dark=css_variables(True), font=FONT)
     sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in story)
@@ -56,30 +56,30 @@ def _section(section: PageSection) -> str:
 
 
 def grid(drawings: Sequence[Drawing]) -> str:
-    """Figures, two beside each other where there is room."""
+    """Return figures as HTML, two beside each other where there is room."""
     return f'<div class="grid">{"".join(figure(drawing) for drawing in drawings)}</div>'
 
 
 def wide_or_narrow(wide: Drawing, narrow: Drawing) -> str:
-    """One figure, drawn for wide pages and again for phones."""
+    """Return one figure as HTML in two drawings: for wide pages and for phones."""
     return f'<div class="grid">{figure(wide, " wide broad")}{figure(narrow, " wide narrow")}</div>'
 
 
 def figure(drawing: Drawing, classes: str = "") -> str:
-    """An accessible figure."""
+    """Return a figure as HTML, with its description for those who do not see it."""
     label = escape(drawing.label, quote=True)
     svg = drawing.svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
     return f'<figure id="{drawing.key}" class="plot{classes}">{svg}</figure>'
 
 
 def facts(pairs: Iterable[tuple[str, str]]) -> str:
-    """A table of names and values."""
+    """Return a table of names and values as HTML."""
     rows = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in pairs)
     return f'<div class="card"><table class="facts"><tbody>{rows}</tbody></table></div>'
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int]) -> str:
-    """A table with a head; columns in `numbers` are set flush right."""
+    """Return a table with a head as HTML; columns in `numbers` are set flush right."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
         kinds = [' class="number"' if place in numbers else "" for place in range(len(row))]
@@ -95,22 +95,22 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozen
 
 
 def paragraph(text: str) -> str:
-    """A paragraph of plain text."""
+    """Return plain text as an HTML paragraph."""
     return f"<p>{escape(text)}</p>"
 
 
 def note(text: str) -> str:
-    """A remark below a table or a figure."""
+    """Return plain text as a remark below a table or a figure."""
     return f'<p class="note">{escape(text)}</p>'
 
 
 def table_folded(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int]) -> str:
-    """A long table behind a line that opens it."""
+    """Return a long table as HTML, behind a line that opens it."""
     return f"<details><summary>{escape(title)}</summary>{table(columns, rows, numbers)}</details>"
 
 
 def folded(title: str, text: str) -> str:
-    """Long plain text behind a line that opens it."""
+    """Return long plain text as HTML, behind a line that opens it."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 

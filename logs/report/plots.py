@@ -1,4 +1,4 @@
-"""Path and axes over time, path in 3D."""
+"""Plots of path, axes over time, plans, and the path in 3D."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ RATE = {"north": "speed north", "east": "speed east", "down": "climb rate"}
 
 
 def path(flight: FlightData) -> Iterator[Drawing]:
-    """The path from above, and from the side if the plant moves vertically."""
+    """Draw the path from above, and from the side if the plant moves vertically."""
     yield path_view(flight, "path-above", "From above", ("east", "north"))
     if "down" in flight.design.axes:
         yield path_view(flight, "path-side", "From the south", ("east", "down"))
 
 
 def path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, str]) -> Drawing:
-    """Path, samples, limits, start and target in one plane."""
+    """Draw path, samples, limits, start and target in one plane."""
     (x_name, _), (y_name, _) = (SEEN[axis] for axis in axes_shown)
     with canvas(key, 3.7) as one:
         ax = one.axes(title, f"{x_name} [m]", f"{y_name} [m]")
@@ -47,7 +47,7 @@ def path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, s
 
 
 def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None:
-    """Path, samples, limits, start and target on given axes, to scale."""
+    """Draw path, samples, limits, start and target on given axes, to scale."""
     pick = [AXIS_NUMBER[axis] for axis in axes_shown]
     sign = np.array([SEEN[axis][1] for axis in axes_shown])
 
@@ -74,14 +74,14 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
 
 
 def _places(flight: FlightData) -> Floats:
-    """Each target once, or all of a motion."""
+    """Return the targets as points: each waypoint once, or the whole of a trajectory."""
     _, states = flight.targets
     changes = np.flatnonzero(np.any(states[1:] != states[:-1], axis=1)) + 1
     return np.asarray(states[[0, *changes]])
 
 
 def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> None:
-    """Position limits as a frame; an open side is left open."""
+    """Draw the position limits as a frame; an open side has no line."""
     (x0, x1), (y0, y1) = (_limits(design, axis) for axis in axes_shown)
     if np.isfinite([x0, x1, y0, y1]).all():
         corners = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
@@ -94,7 +94,7 @@ def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> Non
 
 
 def _limits(design: DesignView, axis: str) -> tuple[float, float]:
-    """Limits of an axis' position as it is drawn; infinite if open."""
+    """Return the position limits of an axis with the sign that it is drawn with [m]; infinite if open."""
     if axis not in design.axes:
         return -np.inf, np.inf
     index = design.position_index[design.axes.index(axis)]
@@ -103,7 +103,7 @@ def _limits(design: DesignView, axis: str) -> tuple[float, float]:
 
 
 def axes_over_time(flight: FlightData) -> Iterator[Drawing]:
-    """Position and velocity of each axis against their limits."""
+    """Draw position and velocity of each axis over time against their limits."""
     for axis, position, velocity in zip(
         flight.design.axes, flight.design.position_index, flight.design.velocity_index, strict=True
     ):
@@ -135,7 +135,7 @@ def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, ti
 
 
 def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
-    """What the mission wanted of a state: steps between waypoints, or a motion."""
+    """Draw the target of a state over time: steps between waypoints, or a trajectory."""
     t_s, states = flight.targets
     ends_s = np.append(t_s, flight.duration_s)
     values = sign * np.append(states[:, index], states[-1, index])
@@ -143,7 +143,7 @@ def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
 
 
 def draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
-    """Limits of a state, and the reserve that each plan keeps from them at its far end."""
+    """Draw the limits of a state, and the reserve that each plan keeps from them at its end."""
     box = flight.design.state_box
     plans = list(flight.flown_plans.values())
     t_s = flight.seconds([plan.base_ns for plan in plans])
@@ -168,13 +168,13 @@ def draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
 
 
 def _played_until_s(flight: FlightData) -> float:
-    """End of the last tick that flew a plan [s]."""
+    """Return the end of the last tick that flew a plan [s]."""
     last = next(d for d in reversed(flight.decisions) if d.plan_seq in flight.flown_plans)
     return float(flight.seconds([last.at_ns + flight.tick_ns])[0])
 
 
 def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
-    """A handful of plans over what was then flown, axis by axis."""
+    """Draw a few plans over what was then flown, axis by axis."""
     chosen = choose_plans(flight)
     if not chosen:
         return
@@ -200,7 +200,7 @@ def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
 
 
 def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawing:
-    """The same plans from above."""
+    """Draw a few plans over what was then flown, from above."""
     design = flight.design
     position = (
         [t.position_m for t in flight.truths]
@@ -227,7 +227,7 @@ def _component(flight: FlightData, index: int) -> list[float]:
 
 
 def _draw_plan(ax: Axes, flight: FlightData, plan: Plan, index: int, sign: float) -> None:
-    """Predicted mean, and the back-off that the plan keeps for what it cannot know."""
+    """Draw a plan's predicted mean, and its back-off: the reserve for disturbance and estimation error."""
     t_s = _plan_times(flight, plan)
     mean = np.array([state[index] for state in plan.states])
     box, rows = flight.design.state_box, np.array(plan.backoff_x)
@@ -245,7 +245,7 @@ def _plan_times(flight: FlightData, plan: Plan) -> Floats:
 
 
 def choose_plans(flight: FlightData) -> list[Plan]:
-    """Within the way to the target: of each sixth, the plan that was played out the longest."""
+    """Choose at most six plans on the way to the target: of each sixth of it the one flown longest."""
     steps, plans = flight.steps, flight.flown_plans
     error_m = position_error_m(flight)
     if not plans or not len(steps):
@@ -266,18 +266,18 @@ def choose_plans(flight: FlightData) -> list[Plan]:
 
 
 def shade_fallback(ax: Axes, flight: FlightData) -> None:
-    """Spans of time in which the fallback flew."""
+    """Shade the spans of time in which the fallback flew."""
     for begun_s, ended_s in flight.fallback_spans:
         ax.axvspan(begun_s, ended_s, color=colour("fallback"), alpha=0.22, lw=0)
 
 
 def span(ax: Axes, flight: FlightData) -> None:
-    """Time axis over the whole flight."""
+    """Set the time axis to the whole flight."""
     ax.set_xlim(0, max(flight.duration_s, flight.design.dt_s))
 
 
 def thin(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """At most about POINTS points, keeping each bucket's smallest and largest value; no NaN, no infinity."""
+    """Thin points to about `POINTS`, keeping each bucket's smallest and largest value; drop what is not finite."""
     kept = np.isfinite(values)
     t_s, values = t_s[kept], values[kept]
     if len(values) <= POINTS:
@@ -293,7 +293,7 @@ def thin(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def along(points: Floats) -> Floats:
-    """At most about POINTS rows (n, 3) of a way, evenly by the way gone: a long stay takes none from the journey."""
+    """Thin a path (n, 3) to about `POINTS` rows, evenly by distance flown, so a long hover takes none from the way."""
     points = points.reshape(-1, 3)
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) <= POINTS:
@@ -303,7 +303,7 @@ def along(points: Floats) -> Floats:
 
 
 def _thin(points: Floats) -> Floats:
-    """At most about POINTS rows, evenly; none that is not finite."""
+    """Thin rows evenly to about `POINTS`; drop those that are not finite."""
     finite = points[np.isfinite(points).all(axis=1)]
     return finite[:: max(1, -(-len(finite) // POINTS))]
 
@@ -320,9 +320,9 @@ _SHOWN = np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])
 
 
 def path_3d(flight: FlightData) -> tuple[Drawing, Drawing] | None:
-    """Path, plans with their spread, limits and target, for a wide page and for a narrow one.
+    """Draw path, plans with their spread, limits and target in 3D, for a wide page and for a narrow one.
 
-    None for a plant that does not move in three axes, or where nobody knows where it was.
+    None for a plant that does not move in three axes, or where no position is known.
     """
     if len(flight.design.axes) < 3 or not len(_flown_m(flight)):
         return None
@@ -348,14 +348,15 @@ def _view(flight: FlightData, key: str, width_in: float, height_in: float) -> Dr
 
 
 def shown(places_m: Floats) -> Floats:
-    """Places in local NED (n, 3) [m] as they lie on the page (n, 2)."""
+    """Project places in local NED (n, 3) [m] onto the page (n, 2)."""
     return np.asarray(places_m @ _SHOWN.T)
 
 
 def outline(semi_axes_m: Floats) -> tuple[float, float, float]:
-    """Width, height and tilt [degrees] of the ellipse that an axis-parallel ellipsoid (3,) [m] is on the page.
+    """Return width, height and tilt [degrees] of the ellipse on the page that outlines an ellipsoid.
 
-    The shadow of {x | xᵀ D⁻² x <= 1} under P is {y | yᵀ (P D² Pᵀ)⁻¹ y <= 1}.
+    The ellipsoid is axis-parallel, with semi-axes (3,) [m]. The shadow of
+    {x | xᵀ D⁻² x <= 1} under P is {y | yᵀ (P D² Pᵀ)⁻¹ y <= 1}.
     """
     sizes, directions = np.linalg.eigh(_SHOWN @ np.diag(semi_axes_m**2) @ _SHOWN.T)
     height, width = 2.0 * np.sqrt(np.maximum(sizes, 0.0))
@@ -363,14 +364,14 @@ def outline(semi_axes_m: Floats) -> tuple[float, float, float]:
 
 
 def _flown_m(flight: FlightData) -> Floats:
-    """Where it was (n, 3) [m], by the truth if that is known, thinned along the way."""
+    """Return the flown path (n, 3) [m], thinned: by the truth if that is known, else by the estimate."""
     design = flight.design
     places = np.array([t.position_m for t in flight.truths] or [design.position_of(e.mean) for e in flight.estimates])
     return along(places)
 
 
 def _room(design: DesignView, path_m: Floats) -> tuple[Floats, Floats]:
-    """Corners of the room (3,) [m]: limits, or a little beyond the flight where a side is open."""
+    """Return two corners of the room (3,) [m]: the limits, or a little beyond the flight where a side is open."""
     box = design.state_box
     seen = np.vstack([path_m, design.target_m])
     low = np.array(design.position_of(box.lower.tolist()))
@@ -382,7 +383,7 @@ def _room(design: DesignView, path_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _draw_room_3d(ax: Axes, lower: Floats, upper: Floats) -> None:
-    """Floor, grid on it, edges and their lengths."""
+    """Draw the floor with its grid, and the edges of the room with their lengths."""
     corners = np.array(list(product(*zip(lower, upper, strict=True))))
     floor = [corners[1], corners[5], corners[7], corners[3]]  # down is positive: the floor is the upper limit
     ax.fill(*shown(np.array(floor)).T, color=colour("grid"), alpha=0.45, lw=0, zorder=0)
@@ -402,7 +403,7 @@ def _draw_room_3d(ax: Axes, lower: Floats, upper: Floats) -> None:
 
 
 def grid_m(lower: float, upper: float) -> Floats:
-    """Places of grid lines [m]: each metre, or each 10, 100, … in a room of more than so many."""
+    """Return places of grid lines [m]: each metre, or each 10, 100, … in a larger room."""
     step = 10.0 ** max(0.0, np.ceil(np.log10(max(upper - lower, 1.0) / _LINES)))
     return np.asarray(step * np.arange(np.ceil(lower / step), np.floor(upper / step) + 1.0))
 
@@ -419,7 +420,7 @@ def _label(ax: Axes, at_m: Floats, off: tuple[int, int], text: str, ha: str, va:
 
 
 def _draw_path(ax: Axes, path_m: Floats, floor_m: float, role: str) -> None:
-    """The path, its shadow on the floor, and lines between them for the eye."""
+    """Draw the path, its shadow on the floor, and vertical lines between them."""
     shadow = path_m.copy()
     shadow[:, 2] = floor_m
     ax.plot(*shown(shadow).T, color=colour("muted"), lw=1.0, alpha=0.6, zorder=2)
@@ -430,7 +431,7 @@ def _draw_path(ax: Axes, path_m: Floats, floor_m: float, role: str) -> None:
 
 
 def _draw_plan_3d(ax: Axes, design: DesignView, plan: Plan) -> None:
-    """A plan's mean, and the ellipsoids with its back-offs as semi-axes in a few stages."""
+    """Draw a plan's mean and, at a few stages, ellipsoids with its back-offs as semi-axes."""
     places = np.array([design.position_of(state) for state in plan.states])
     ax.plot(*shown(places).T, color=colour("plan"), lw=1.2, marker=".", ms=3, zorder=4)
     for stage in _STAGES:
@@ -445,7 +446,7 @@ def _draw_plan_3d(ax: Axes, design: DesignView, plan: Plan) -> None:
 
 
 def _reach(design: DesignView, backoff: Sequence[float]) -> list[float]:
-    """Largest back-off from a limit of each state (n_x,), in its unit; 0 without limits."""
+    """Return the largest back-off from a limit of each state (n_x,), in its unit; 0 without limits."""
     box, reach = design.state_box, [0.0] * len(design.target)
     for state in design.position_index:
         for row in (int(box.row_lower[state]), int(box.row_upper[state])):
@@ -455,7 +456,7 @@ def _reach(design: DesignView, backoff: Sequence[float]) -> list[float]:
 
 
 def _draw_places(ax: Axes, flight: FlightData, path_m: Floats, floor_m: float) -> None:
-    """Start and targets, each over its point of the floor."""
+    """Draw start and targets, each over its point of the floor."""
     _, states = flight.targets
     targets = np.unique(np.array([flight.design.position_of(state) for state in states]), axis=0)
     if not flight.moving_target:

@@ -1,4 +1,4 @@
-"""Tests of what a flight shows against what was promised: exact where there is an exact one, never simulated."""
+"""Statistical tests of a flight against what was promised; exact ones where they exist, none by simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEVEL = 0.99
 
 
 class Share(msgspec.Struct, frozen=True, kw_only=True):
-    """How often something happened, with the exact interval of its probability (Clopper and Pearson, 1934)."""
+    """Share of trials in which something happened, with its exact interval (Clopper and Pearson, 1934)."""
 
     hits: int
     trials: int
@@ -27,7 +27,7 @@ class Share(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def share(hits: int, trials: int, tests: int = 1, worth: float = 1.0) -> Share:
-    """A count with its interval; without trials that is all from 0 to 1.
+    """Return a share of trials with its interval; without trials the interval is 0 to 1.
 
     Args:
         hits: Number of trials in which it happened.
@@ -44,7 +44,7 @@ def share(hits: int, trials: int, tests: int = 1, worth: float = 1.0) -> Share:
 
 
 def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, float]:
-    """Interval of a probability by quantiles of the beta distribution (Clopper and Pearson, 1934).
+    """Return the interval of a probability by quantiles of the beta distribution (Clopper and Pearson, 1934).
 
     Args:
         hits: Independent trials in which it happened; parts of one where a trial is worth less than one.
@@ -56,37 +56,37 @@ def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, floa
 
 
 def at_least(hits: int, trials: int, probability: float) -> float:
-    """P(X >= hits) for X binomial: how likely so many are, if each has `probability` at most."""
+    """Return P(X >= hits) for X binomial: the p-value of so many hits if each has `probability` at most."""
     if hits <= 0:
         return 1.0
     return float(betainc(hits, trials - hits + 1, probability))
 
 
 def two_sided_normal(z: float) -> float:
-    """P(|Z| >= |z|) for Z standard normal."""
+    """Return P(|Z| >= |z|) for Z standard normal."""
     return float(2.0 * ndtr(-abs(z)))
 
 
 def normal_reach(tests: int = 1) -> float:
-    """z with P(|Z| > z) = (1 - LEVEL) / tests."""
+    """Return z with P(|Z| > z) = (1 - LEVEL) / tests, Z standard normal."""
     return float(-ndtri(0.5 * (1.0 - LEVEL) / tests))
 
 
 def variance_bounds(count: int, tests: int = 1) -> tuple[float, float]:
-    """What the mean of `count` squared standard normal numbers is within, by the χ² distribution."""
+    """Return bounds of the mean of `count` squared standard normal numbers, by the χ² distribution."""
     tail = 0.5 * (1.0 - LEVEL) / tests
     low, high = (2.0 * float(gammaincinv(0.5 * count, p)) / count for p in (tail, 1.0 - tail))
     return low, high
 
 
 def variance_p(squares: float, count: int) -> float:
-    """Two-sided p-value of a sum of `count` squared standard normal numbers."""
+    """Return the two-sided p-value of a sum of `count` squared standard normal numbers."""
     above = float(gammaincc(0.5 * count, 0.5 * squares))
     return min(1.0, 2.0 * min(above, 1.0 - above))
 
 
 def autocorrelation(values: Floats, lags: int) -> Floats:
-    """Correlation of a sequence (n,) with itself 1 … `lags` places on (lags,); 0 where nothing varies."""
+    """Return the autocorrelation of a sequence (n,) at 1 … `lags` (lags,); 0 where nothing varies."""
     centred = values - values.mean() if len(values) else values
     size = float(centred @ centred)
     if size == 0.0:
@@ -97,7 +97,7 @@ def autocorrelation(values: Floats, lags: int) -> Floats:
 
 
 def ljung_box(correlation: Floats, count: int) -> tuple[float, float]:
-    """Q = n (n+2) Σ r_k² / (n-k) of Ljung and Box (1978) and its p-value; χ² with as many degrees of freedom as lags.
+    """Return Q = n (n+2) Σ r_k² / (n-k) of Ljung and Box (1978), and its p-value: χ² with `lags` degrees of freedom.
 
     Args:
         correlation: r_k, k = 1 … (lags,).
@@ -109,5 +109,5 @@ def ljung_box(correlation: Floats, count: int) -> tuple[float, float]:
 
 
 def chi2_quantile(probability: float, degrees: int) -> float:
-    """Quantile of the χ² distribution."""
+    """Return a quantile of the χ² distribution."""
     return 2.0 * float(gammaincinv(0.5 * degrees, probability))

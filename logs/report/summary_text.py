@@ -1,4 +1,4 @@
-"""What happened in a flight, in sentences made from its figures."""
+"""Sentences on what happened in a flight, made from its figures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STILL = 0.05
 
 
 def story(flight: FlightData, summary: FlightSummary) -> list[str]:
-    """Sentences that say what happened; each is true of this flight's data."""
+    """Return sentences on what happened in a flight, each made from its data."""
     if summary.final_error_m is None or summary.settled_error_m is None:
         last = (flight.flown or flight.decisions)[-1]
         nothing = f"Nothing was flown in {number(flight.duration_s)} s: {last.reason}."
@@ -45,7 +45,7 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
 
 
 def part_begins(flight: FlightData) -> str:
-    """Where in its flight a recording begins that lacks the first ticks, as a later file does; empty if it has them."""
+    """Return where in its flight a recording begins that lacks the first ticks, in words; empty if it has them."""
     first = flight.decisions[0]
     if not flight.part:
         return ""
@@ -60,7 +60,7 @@ def _part(flight: FlightData) -> list[str]:
 
 
 def _cut(flight: FlightData) -> list[str]:
-    """Why there is no more of it, where that is not the flight's end."""
+    """Return a sentence on why the recording ends before the flight does; empty if it does not."""
     if not flight.notes:
         return []
     text = flight.notes[-1].text
@@ -137,7 +137,7 @@ def _state_limits(flight: FlightData, s: FlightSummary) -> str:
 
 
 def _worst(flight: FlightData) -> str:
-    """The largest excess over an axis-parallel limit, named."""
+    """Return the largest excess over an axis-parallel state limit, in words with its unit."""
     outside = state_outside(flight)
     states = flight.steps.state[outside]
     lower, upper = box_at(flight, flight.steps.t_s[outside])
@@ -167,7 +167,7 @@ def _plans(flight: FlightData, s: FlightSummary) -> str:
 
 
 def _amiss(s: FlightSummary) -> list[str]:
-    """What went wrong beside the flight: time, and the record of it."""
+    """Return sentences on missed ticks and on records that were dropped."""
     told = []
     if s.missed_ticks:
         late = (
@@ -183,7 +183,7 @@ def _amiss(s: FlightSummary) -> list[str]:
 
 
 def _gave_way(flight: FlightData) -> str:
-    """What gave way the most in any plan flown."""
+    """Return the constraint that gave way most in any plan flown, in words."""
     names = flight.design.names
     plans = [plan for plan in flight.flown_plans.values() if plan.gave_way]
     if not plans:
@@ -194,7 +194,7 @@ def _gave_way(flight: FlightData) -> str:
 
 
 def _waypoints(flight: FlightData) -> list[str]:
-    """When the waypoints after the first were set out for."""
+    """Return sentences on when later waypoints were set out for, and where the vehicle was ordered to."""
     told = [(d.at_ns, d.waypoint) for d in flight.flown if d.waypoint is not None]
     left = [(at_ns, then) for (_, now), (at_ns, then) in pairwise(told) if then != now]
     ordered = ", ".join(
@@ -208,13 +208,13 @@ def _waypoints(flight: FlightData) -> list[str]:
 
 
 def _place(flight: FlightData, target: tuple[float, ...]) -> str:
-    """A target's position, local NED."""
+    """Return the position of a target in words, local NED [m]."""
     values = (f"{target[index]:.4g}" for index in flight.design.position_index)
     return f"({', '.join(values)}) m ({', '.join(flight.design.axes)})"
 
 
 def _trajectory(flight: FlightData) -> list[str]:
-    """How far and how long the target moved, and how near to it the vehicle was meanwhile."""
+    """Return a sentence on how far and how long the target moved, and how near the vehicle was to it."""
     times_s, states = flight.targets
     moves = np.linalg.norm(np.diff(states[:, list(flight.design.position_index)], axis=0), axis=1)
     (moved,) = np.nonzero(moves > _STILL * moves.max(initial=0.0))

@@ -1,4 +1,4 @@
-"""Drawings as inline SVG whose colours follow the page: light, dark and on paper."""
+"""Drawings as inline SVG whose colours follow the page: light, dark, and on paper."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ _ROLES = {
 
 
 def colour(role: str) -> str:
-    """Colour of a role while drawing; becomes a CSS variable in the SVG."""
+    """Return the colour of a role while drawing; it becomes a CSS variable in the SVG."""
     return PALETTE[role][0]
 
 
 def ramp(index: int, count: int) -> str:
-    """Colour of plan index `index` of `count`."""
+    """Return the colour of plan index `index` of `count`."""
     place = (len(RAMP) - 1) * index / max(1, count - 1)
     left = min(int(place), len(RAMP) - 2)
     part = place - left
@@ -93,13 +93,13 @@ def ramp(index: int, count: int) -> str:
 
 
 def css_variables(dark: bool) -> str:
-    """CSS declarations of the palette."""
+    """Return the palette as CSS declarations."""
     return "".join(f"--{role}:{pair[dark]};" for role, pair in PALETTE.items())
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure for the page: inline SVG and what it shows, in words."""
+    """A figure for the page: inline SVG, and a description of it."""
 
     key: str
     svg: str
@@ -114,7 +114,7 @@ class Canvas:
     svg: str = field(default="", init=False)
 
     def axes(self, title: str, x_label: str, y_label: str, left_in: float = _LEFT_IN) -> Axes:
-        """One titled and labelled set of axes that fills the figure, with room for labels of usual lengths.
+        """Add one set of axes, titled and labelled, that fills the figure.
 
         Margins that are known need no second drawing to find them, which would double the time of a page.
         """
@@ -133,7 +133,7 @@ class Canvas:
 
 @contextmanager
 def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[Canvas]:
-    """A styled figure; `key` keeps its ids apart from those of the page's other figures."""
+    """Return a styled figure; `key` keeps its ids apart from those of the page's other figures."""
     with style.context([_STYLE, {name: colour(role) for name, role in _ROLES.items()}, {"svg.hashsalt": key}]):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         one = Canvas(figure)
@@ -144,12 +144,12 @@ def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[C
 
 
 def power_of_ten(value: float, _place: object = None) -> str:
-    """A tick of a logarithmic axis, as in "10⁻⁹": no markup, as figures have none."""
+    """Return a tick of a logarithmic axis as text, as in "10⁻⁹": figures have no markup."""
     return "10" + str(round(np.log10(value))).translate(_RAISED)
 
 
 def dots(ax: Axes, x: Floats, y: Floats, role: str, size_pt: float, zorder: float = 2) -> None:
-    """Round dots: strokes without length."""
+    """Draw round dots, as strokes without length."""
     points = (x, y)
     strokes(ax, points, points, colour(role), size_pt, zorder)
 
@@ -157,7 +157,7 @@ def dots(ax: Axes, x: Floats, y: Floats, role: str, size_pt: float, zorder: floa
 def strokes(
     ax: Axes, begin: tuple[Floats, Floats], end: tuple[Floats, Floats], paint: str, width_pt: float, zorder: float = 2
 ) -> None:
-    """Separate strokes between points (x, y), as one path: a tenth of the bytes of as many lines or markers."""
+    """Draw separate strokes between points (x, y) as one path, a tenth of the bytes of as many lines."""
     if not len(begin[0]):
         return
     points = np.stack([np.column_stack(begin), np.column_stack(end)], axis=1).reshape(-1, 2)
@@ -167,7 +167,7 @@ def strokes(
 
 
 def standalone(svg: str, label: str) -> str:
-    """An SVG file of its own from an inline one: colours, background and fonts come with it."""
+    """Return an inline SVG as a file of its own, with colours, background and fonts."""
     look = (
         f"<style>:root{{{css_variables(False)}}}"
         f"@media (prefers-color-scheme:dark){{:root{{{css_variables(True)}}}}}"
@@ -180,7 +180,7 @@ def standalone(svg: str, label: str) -> str:
 
 
 def _inline(text: str, key: str) -> str:
-    """Strip what HTML does not need, keep ids apart, shorten numbers, and let the page colour it."""
+    """Return an SVG for HTML: without what HTML does not need, ids apart, numbers short, colours from the page."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text).replace("xlink:href=", "href=")
@@ -196,7 +196,7 @@ def _inline(text: str, key: str) -> str:
 
 
 def compact(path: str) -> str:
-    """Straight lines in tenths of a point, each from the end of the last: a third of the bytes. Curves keep theirs.
+    """Return a path's straight lines in relative tenths of a point, a third of the bytes; curves stay as they are.
 
     Args:
         path: As Matplotlib writes it: commands M, L and z with absolute places.
@@ -224,10 +224,10 @@ def compact(path: str) -> str:
 
 @cache
 def _tenths(value: int) -> str:
-    """A tenth of a whole number, as short as SVG allows."""
+    """Return a tenth of a whole number as text, as short as SVG allows."""
     return f"{value / 10:.1f}".removesuffix(".0").replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}"
 
 
 def _shorten(attribute: str) -> str:
-    """Two decimals of a point are finer than any screen."""
+    """Return a number with two decimals: a hundredth of a point is finer than any screen."""
     return re.sub(r"-?\d+\.\d{3,}", lambda number: f"{float(number.group()):.2f}", attribute)

@@ -1,4 +1,4 @@
-"""The flight as lanes along the time: who flew, what the vehicle said, where news was lost, what went amiss."""
+"""Timeline of a flight in lanes: who flew, the vehicle's mode, lost positions, plans that gave way, events."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _HANDS = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settlin
 
 @dataclass(frozen=True)
 class Span:
-    """A bar of a lane, with its text where there is room."""
+    """A bar of a lane, with its text where there is room for it."""
 
     begun_s: float
     ended_s: float
@@ -56,7 +56,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Lane:
-    """A row: bars, and marks of a colour."""
+    """A lane of the timeline: bars, and marks by colour."""
 
     name: str
     spans: tuple[Span, ...] = ()
@@ -64,7 +64,7 @@ class Lane:
 
 
 def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...]]:
-    """The lanes, for a wide page and for a narrow one, and what their marks mean."""
+    """Draw the lanes for a wide page and for a narrow one; return both with the legend of their marks."""
     rows = list(lanes(flight))
     label = "Timeline of the flight: " + ", ".join(lane.name for lane in rows)
     drawings = []
@@ -85,7 +85,7 @@ def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...]]:
 
 
 def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
-    """What bars mean that are too short for their text on the narrow page, by colour."""
+    """Return legend entries for bars that are too short for their text on the narrow page."""
     shown_s = max(flight.duration_s, flight.design.dt_s)
     character_s = _character_s(shown_s, WIDTH_IN)
     texts: dict[str, dict[str, None]] = {}
@@ -97,7 +97,7 @@ def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
 
 
 def lanes(flight: FlightData) -> Iterator[Lane]:
-    """The rows that this flight has something for."""
+    """Return the lanes that this flight has something for."""
     yield Lane("controller", tuple(_modes(flight)))
     found = (
         Lane("hand-over", tuple(_hand_over(flight))),
@@ -121,7 +121,7 @@ def _modes(flight: FlightData) -> Iterator[Span]:
 
 
 def _hand_over(flight: FlightData) -> Iterator[Span]:
-    """States of the hand-over, out of its events' texts: "before -> after (mode, armed)"."""
+    """Return the states of the hand-over, read from its events: "before -> after (mode, armed)"."""
     told = [event for event in flight.events if event.code == "hand-over" and " -> " in event.text]
     states = [event.text.split(" -> ", 1)[1].split(" (", 1)[0] for event in told]
     begins = flight.seconds([event.at_ns for event in told]).tolist()
@@ -133,7 +133,7 @@ def _hand_over(flight: FlightData) -> Iterator[Span]:
 
 
 def _vehicle(flight: FlightData) -> Iterator[Span]:
-    """What the vehicle's heartbeats said."""
+    """Return mode and arming of the vehicle, as its heartbeats said."""
     told = [(one.at_ns, f"{one.mode}{'' if one.armed else ', disarmed'}", one) for one in flight.vehicles]
     changes = [next(group) for _, group in groupby(told, key=lambda one: one[1])]
     begins = flight.seconds([at_ns for at_ns, _, _ in changes]).tolist()
@@ -143,14 +143,14 @@ def _vehicle(flight: FlightData) -> Iterator[Span]:
 
 
 def _positions(flight: FlightData) -> Iterator[tuple[str, Floats]]:
-    """Steps without news; positions that were refused."""
+    """Return the times of steps without a new position, and of refused positions [s]."""
     silent = [d.at_ns for d in flight.flown if d.boundary and d.age_steps]
     yield "lost", flight.seconds(silent)
     yield "fallback", flight.seconds([d.at_ns for d in flight.decisions if d.rejected])
 
 
 def _plans(flight: FlightData) -> Iterator[tuple[str, Floats]]:
-    """Plans in which a constraint gave way; solves without an optimum."""
+    """Return the times of plans in which a constraint gave way, and of solves without an optimum [s]."""
     gave = [
         plan.base_ns for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE
     ]
@@ -171,7 +171,7 @@ def _orders(flight: FlightData) -> Floats:
 
 
 def _character_s(shown_s: float, width_in: float) -> float:
-    """Seconds that a character of a bar's text takes."""
+    """Return the width of a character of a bar's text, as time [s]."""
     return _INK_PER_CHARACTER_IN * shown_s / (width_in - 1.1)
 
 
@@ -197,6 +197,6 @@ def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
 
 
 def _apart(times_s: Floats, shown_s: float) -> Floats:
-    """Times, of those too near to be told apart the first only."""
+    """Return times (n,) [s], of several too near to be told apart only the first."""
     _, first = np.unique(np.floor(times_s / shown_s * MARKS), return_index=True)
     return times_s[first]

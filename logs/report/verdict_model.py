@@ -1,4 +1,4 @@
-"""Verdict on the model: are the errors of its forecasts as large as it says, and nothing more to learn from them?
+"""Verdict on the model: whether the errors of its forecasts are as large as foretold, and white.
 
 A model can be wrong on the safe side: one that foretells larger errors than were measured is cautious, not refuted.
 """
@@ -50,7 +50,7 @@ SETTLING = 5
 
 @dataclass(frozen=True, eq=False)
 class InnovationSamples:
-    """Positions against what was foretold of them, both measured in flight."""
+    """Positions against their forecasts, by the flight's own filter."""
 
     t_s: Floats  # capture times of the report (n,) [s]
     error_m: Floats  # position minus what the ones before it foretell (n, axes) [m]
@@ -65,7 +65,7 @@ class InnovationSamples:
 
 
 def innovations(flight: FlightData, config: Config) -> InnovationSamples:
-    """Run the filter of a configuration over a flight.
+    """Run the filter of a configuration over a flight; return the errors of its forecasts.
 
     Raises:
         DesignError: The configuration has no plant.
@@ -85,7 +85,7 @@ def innovations(flight: FlightData, config: Config) -> InnovationSamples:
 
 
 class Track:
-    """Positions and inputs of a flight along the time of capture.
+    """Positions and inputs of a flight in order of capture.
 
     Args:
         dead_ns: From sending an input until it begins to act, as the flight's filter believed [ns].
@@ -109,7 +109,7 @@ class Track:
         self.spans_ns = _flown_ns(flight)
 
     def one_ahead(self) -> Iterator[tuple[Belief, Floats, Floats]]:
-        """Belief after each position of flown time, the position's error and its foretold deviation (axes,)."""
+        """Yield the belief after each position, and the position's error and foretold deviation (axes,) [m]."""
         belief, since = None, 0
         for at_ns, sample in self.samples:
             if belief is None:
@@ -123,10 +123,10 @@ class Track:
                 yield belief, error, np.sqrt(np.diagonal(cov))
 
     def many_ahead(self, beliefs: list[Belief], horizon: int) -> Iterator[tuple[int, float]]:
-        """(steps ahead, squared distance) of the last position in each step of windows of `horizon` steps.
+        """Yield (steps ahead, squared Mahalanobis distance) of each step's last position, window by window.
 
-        The next window begins where this one's last position was seen, so each outcome is known when the next
-        forecast is made: for each lead, hits are independent trials.
+        A window has `horizon` steps. The next one begins at this one's last position, so each outcome is known when
+        the next forecast is made: for each lead, hits are independent trials.
         """
         dt_ns = self.kalman.propagation.dt_ns
         times = [at_ns for at_ns, _ in self.samples]
@@ -147,7 +147,7 @@ class Track:
                 yield lead, float(error @ np.linalg.solve(cov, error))
 
     def to(self, belief: Belief, at_ns: int) -> Belief:
-        """The belief moved on by the inputs that acted."""
+        """Return a belief moved on to `at_ns` by the inputs that acted."""
         place = bisect_right(self.input_ns, belief.at_ns)
         u = self.inputs[place - 1] if place else None
         while place < len(self.input_ns) and self.input_ns[place] < at_ns:
@@ -157,7 +157,7 @@ class Track:
         return predicted(self.kalman, self.origin_ns, belief, u, at_ns)
 
     def _error(self, belief: Belief, sample: PositionSample) -> tuple[Floats, Floats]:
-        """Position minus belief (axes,), and the covariance that it should have (axes, axes)."""
+        """Return position minus belief (axes,) [m], and the covariance that it should have (axes, axes) [m²]."""
         values, variances = shown_by(self.kalman, sample)
         axes = len(self.kalman.axes)
         index = self.kalman.shown[:axes]
@@ -169,7 +169,7 @@ class Track:
 
 
 def _flown_ns(flight: FlightData) -> list[tuple[int, int]]:
-    """Spans in which the controller flew [ns]."""
+    """Return the spans in which the controller flew [ns]."""
     flown = [d for d in flight.flown if d.mode in FLOWN]
     spans: list[tuple[int, int]] = []
     begun = last = None
@@ -197,7 +197,7 @@ BANDS = 4  # of frequencies, equally wide: of 30 errors each still has seven
 
 
 def band_powers(normalised: Floats) -> tuple[Floats, Floats]:
-    """Mean squares of errors by frequency, from slow to quick, and how many independent squares each is the mean of.
+    """Return the mean squares of errors in bands of frequency, slow to quick, and the independent squares in each.
 
     Each is about 1 where errors are white and as large as foretold; sums of squares of `count` coordinates in an
     orthonormal basis, so for errors whose covariance is at most the identity none is larger than χ² is.
@@ -220,7 +220,7 @@ def band_powers(normalised: Floats) -> tuple[Floats, Floats]:
 
 
 def power_bounds(counts: Floats, tests: int) -> Floats:
-    """What powers (`BANDS`,) stay below, all of `tests` together with `LEVEL`, if errors are as foretold or smaller."""
+    """Return bounds of `band_powers` (`BANDS`,) that hold together with `LEVEL` if errors are as foretold."""
     return np.asarray(chdtri(counts, (1.0 - LEVEL) / tests) / counts)
 
 
@@ -231,7 +231,7 @@ _TESTS_PER_AXIS = 3  # mean, spread, whiteness
 
 
 class ModelOutcome(StrEnum):
-    """What a flight says of the model."""
+    """Outcome of the tests of a model."""
 
     HOLDS = "holds"  # nothing speaks against it
     CAUTIOUS = "cautious"  # errors were smaller than foretold, and that explains all else
@@ -240,7 +240,7 @@ class ModelOutcome(StrEnum):
 
 
 class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """One-step errors of one axis, over the deviation that was foretold for each."""
+    """Tests of one axis' one-step errors, over the deviation foretold for each."""
 
     axis: str
     count: int
@@ -264,24 +264,24 @@ class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def smaller(self) -> bool:
-        """Errors were smaller than foretold; if not white, by their size alone, without the other tests."""
+        """Return whether errors were smaller than foretold; if they are not white, by their size alone."""
         seldom = self.variance_refuted or (self.whiteness_refuted and self.variance_p < 1.0 - LEVEL)
         return seldom and self.variance < 1.0
 
     @property
     def larger(self) -> bool:
-        """Errors were larger than foretold, at all frequencies together or at some."""
+        """Return whether errors were larger than foretold, at all frequencies together or in one band."""
         return self.variance_refuted and self.variance > 1.0
 
     @property
     def telling(self) -> bool:
-        """Errors tell of the next, and too large a foretold noise cannot be why."""
+        """Return whether an error tells of the next, by more than noise foretold too large explains."""
         stronger = any(power > bound for power, bound in zip(self.power, self.power_bound, strict=True))
         return self.whiteness_refuted and not (self.smaller and not stronger)
 
 
 class LeadVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Positions within the ellipsoid foretold some steps before."""
+    """Test of the positions some steps after their forecast: the share inside the 95 % ellipsoid."""
 
     lead_steps: int
     lead_s: float
@@ -291,12 +291,12 @@ class LeadVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def too_few(self) -> bool:
-        """Fewer positions were inside than promised."""
+        """Return whether fewer positions were inside than promised."""
         return self.refuted and self.inside.rate < self.promised
 
 
 class ModelVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """The model against what was flown."""
+    """Verdict on the model."""
 
     outcome: ModelOutcome
     refuted: bool  # the outcome is
@@ -306,7 +306,7 @@ class ModelVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_innovations(found: InnovationSamples, axes: tuple[str, ...], dt_s: float) -> ModelVerdict:
-    """Test errors of forecasts, wherever they come from.
+    """Test the errors of forecasts; return the verdict on the model.
 
     Args:
         dt_s: Δt [s].
@@ -340,7 +340,7 @@ def _outcome(axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...]) -> M
 
 
 def judge_axis(axis: str, normalised: Floats, error_m: Floats, tests: int) -> AxisVerdict:
-    """Mean, spread and whiteness of one axis' normalised errors (n,).
+    """Test mean, spread and whiteness of one axis' normalised errors (n,).
 
     Args:
         normalised: Errors over foretold deviations (n,), n > `LAGS`.
@@ -412,7 +412,7 @@ def _text(outcome: ModelOutcome, axes: tuple[AxisVerdict, ...], leads: tuple[Lea
 
 
 def _departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
-    """What departs from the model, and what that means."""
+    """Return sentences on what departs from the model, and what that means for the flight."""
     large = _times([one for one in axes if one.larger])
     small = _times([one for one in axes if one.smaller])
     tells = _each([one for one in axes if one.telling], lambda one: one.correlation[0])
@@ -437,12 +437,12 @@ def _departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
 
 
 def _times(axes: list[AxisVerdict]) -> str:
-    """Sizes of errors of some axes over the foretold ones, as in "0.8 × east, 0.7 × down"; empty without any."""
+    """Return sizes of some axes' errors over the foretold ones, as in "0.8 × east, 0.7 × down"; empty without any."""
     return ", ".join(f"{one.variance**0.5:.2g} × {one.axis}" for one in axes)
 
 
 def _each(axes: list[AxisVerdict], value: Callable[[AxisVerdict], float]) -> str:
-    """A figure of some axes, as in "0.8 north, 0.7 east"; empty without any."""
+    """Return a figure of some axes, as in "0.8 north, 0.7 east"; empty without any."""
     return ", ".join(f"{value(one):.2g} {one.axis}" for one in axes).replace("-", "−")
 
 

@@ -1,4 +1,4 @@
-"""Verdicts: risk, link, clocks."""
+"""Verdicts of a flight: risk, link, clocks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOVING_MPS = 0.05
 
 
 class ClockVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """A connection's clock against ours."""
+    """Clock of a connection's sender, measured against ours."""
 
     link: str
     text: str
@@ -49,7 +49,7 @@ class ClockVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StampVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """By how much capture times are off, by where the vehicle truly was."""
+    """Error of capture times, measured against the true path of the vehicle."""
 
     text: str
     late_ms: float  # stamps are later than the capture by this
@@ -58,7 +58,7 @@ class StampVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_clocks(flight: FlightData) -> tuple[ClockVerdict, ...]:
-    """One verdict for each connection that ever told an offset, in order of their names."""
+    """Judge the clock of each connection that told an offset, in order of their names."""
     told: defaultdict[str, list[LinkStats]] = defaultdict(list)
     for one in flight.links:
         told[one.link].append(one)
@@ -66,7 +66,7 @@ def judge_clocks(flight: FlightData) -> tuple[ClockVerdict, ...]:
 
 
 def offsets(flight: FlightData, link: str) -> tuple[Floats, Floats]:
-    """Times of the report (n,) [s] and a connection's offsets less their straight line (n,) [s]."""
+    """Return report times (n,) [s], and a connection's clock offsets less their straight line (n,) [s]."""
     known = _offsets([one for one in flight.links if one.link == link])
     t_s = flight.seconds([one.at_ns for one in known])
     return t_s, _residual_s(t_s, known)[0]
@@ -77,7 +77,7 @@ def _offsets(rows: list[LinkStats]) -> list[LinkStats]:
 
 
 def _residual_s(t_s: Floats, known: list[LinkStats]) -> tuple[Floats, float]:
-    """Offsets less their straight line (n,) [s], and the line's slope."""
+    """Return offsets less their straight line (n,) [s], and the line's slope [s/s]."""
     first_ns = known[0].clock_offset_ns or 0
     off_s = np.array([((one.clock_offset_ns or 0) - first_ns) * 1e-9 for one in known])
     if len(known) < _FEWEST:
@@ -116,7 +116,7 @@ _SOURCES = {
 
 
 def plain(value: float) -> str:
-    """A figure for people: three digits, all of those before the point, never an exponent."""
+    """Return a figure as text: three digits, all of those before the point, never an exponent."""
     told = f"{value:.0f}" if abs(value) >= 999.5 or abs(value) < 5e-4 else f"{value:.3g}"
     return told.removeprefix("-") if told == "-0" else told.replace("-", "−")
 
@@ -134,7 +134,7 @@ def _clock_text(found: ClockVerdict) -> str:
 
 
 def judge_stamps(flight: FlightData) -> StampVerdict | None:
-    """Delay of the stamps that fits the positions to the true path best; None without truth or without motion.
+    """Return by which delay of the stamps positions fit the true path best [ms]; None without truth or motion.
 
     Least squares of position - truth(stamp) = -delay · velocity + noise.
     """
@@ -163,7 +163,7 @@ def judge_stamps(flight: FlightData) -> StampVerdict | None:
 def _true_path(
     truths: tuple[Truth, ...], known_ns: np.ndarray, samples: list[PositionSample], axes: list[int]
 ) -> tuple[Floats, Floats]:
-    """Where the vehicle truly was at the stamps, and how fast (n, axes), by cubics between the truths."""
+    """Return true positions [m] and velocities [m/s] at the stamps (n, axes), by cubics between the truths."""
     at = np.array([one.captured_ns for one in samples])
     left = np.searchsorted(known_ns, at, side="right") - 1
     span_s = ((known_ns[left + 1] - known_ns[left]) * 1e-9)[:, None]
@@ -194,7 +194,7 @@ _WARNED = " The events' warnings of the link were made in flight, on few steps; 
 
 
 class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """How long positions were on their way, from capture to arrival."""
+    """Delay of positions from capture to arrival."""
 
     p50_ms: float
     p95_ms: float
@@ -207,7 +207,7 @@ class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LinkVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What was seen of the link, at the flown boundaries, against what the design counts on."""
+    """Link as measured at the flown boundaries, against what the design counts on."""
 
     refuted: bool
     text: str
@@ -223,7 +223,7 @@ class LinkVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_link(flight: FlightData, config: Config | None) -> LinkVerdict:
-    """Hold the link's news, ages and delays against the configuration."""
+    """Judge arrivals, ages and delays of positions against the configuration."""
     ages = [d.age_steps for d in flight.steps.decisions if d.age_steps is not None]
     arrived = [age == 0 for age in ages]
     statistic = _bursts(arrived)
@@ -249,7 +249,7 @@ def judge_link(flight: FlightData, config: Config | None) -> LinkVerdict:
 
 
 def delays_s(flight: FlightData) -> Floats:
-    """Time from capture to arrival of the positions used (n,) [s]."""
+    """Return the delay of each position used, from capture to arrival (n,) [s]."""
     return np.array([(one.received_ns - one.captured_ns) * 1e-9 for one in flight.samples])
 
 
@@ -261,7 +261,7 @@ def _bursts(arrived: list[bool]) -> float:
 
 
 def _worth(arrived: list[bool]) -> float:
-    """Independent steps that one is worth: (1 - r) / (1 + r) with r the correlation with the next."""
+    """Return how many independent steps one is worth: (1 - r) / (1 + r), r the correlation with the next step."""
     r = float(autocorrelation(np.array(arrived, dtype=np.float64), 1)[0])
     return (1.0 - r) / (1.0 + r)
 
@@ -272,7 +272,7 @@ def _shares(ages: list[int]) -> tuple[float, ...]:
 
 
 def _promises(config: Config | None) -> tuple[float | None, tuple[float, ...]]:
-    """Least share of news, and the distribution of the age in the long run."""
+    """Return the least share of steps with a new position, and the stationary distribution of the age (n,)."""
     if config is None:
         return None, ()
     try:
@@ -289,7 +289,7 @@ def _promises(config: Config | None) -> tuple[float | None, tuple[float, ...]]:
 
 
 def _lost(flight: FlightData) -> Share | None:
-    """Positions lost from the first truth to the last; their losses are taken for independent."""
+    """Return the share of positions lost between first and last truth; losses count as independent."""
     if len(flight.truths) < 2:
         return None
     sent = sum(after.sent - before.sent for before, after in pairwise(flight.truths))
@@ -319,7 +319,7 @@ def _delay(flight: FlightData, config: Config | None) -> DelayVerdict | None:
 
 
 def _from_quickest(flight: FlightData) -> bool:
-    """Whether the clock of the positions' sender was found by the quickest arrivals."""
+    """Return whether the clock of the positions' sender was found by the quickest arrivals."""
     told = [one for one in flight.links if one.samples]
     return bool(told) and told[-1].clock_source == "minimum"
 
@@ -359,7 +359,7 @@ Flags = NDArray[np.bool_]
 
 
 class LimitRisk(msgspec.Struct, frozen=True, kw_only=True):
-    """One limit, or all of a kind together."""
+    """Measured risk of one limit, or of all limits of a kind together."""
 
     name: str
     promised: float | None  # largest risk; that of all limits of its kind together. None: not known
@@ -371,7 +371,7 @@ class LimitRisk(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RiskVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Promised risk against the share of violations."""
+    """Share of limit violations against the promised risk."""
 
     refuted: bool
     text: str
@@ -381,7 +381,7 @@ class RiskVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
-    """Count violations against the promise."""
+    """Judge violations of limits against the promised risk."""
     steps = flight.steps
     trial, promised = _trials(flight)
     rows = _rows_outside(flight)
@@ -406,7 +406,7 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
 
 
 def _risk(likelihood: float | None) -> float | None:
-    """What is left to 1, in the decimals that people write a likelihood with: 0.05, not 0.050000000000000044."""
+    """Return 1 - likelihood, rounded to what people write: 0.05, not 0.050000000000000044."""
     return None if likelihood is None else round(1.0 - likelihood, 12)
 
 
@@ -425,7 +425,7 @@ def _limit(name: str, promised: float | None, outside: Flags, trial: Flags, test
 
 
 def _trials(flight: FlightData) -> tuple[Flags, Flags]:
-    """Which flown boundaries (n,) are trials of the promise, and which were promised anything."""
+    """Return which flown boundaries (n,) are trials of the promise, and which had a promise at all."""
     decisions = flight.steps.decisions
     whole = {
         seq
@@ -440,7 +440,7 @@ def _trials(flight: FlightData) -> tuple[Flags, Flags]:
 
 
 def _rows_outside(flight: FlightData) -> Flags:
-    """Which rows of the state set are broken at each flown boundary (n, rows)."""
+    """Return which rows of the state set are violated at each flown boundary (n, rows)."""
     limits = limits_at(flight, flight.steps.t_s)
     reached = flight.steps.state @ np.array(flight.design.c_x).reshape(-1, flight.steps.state.shape[1]).T
     return np.asarray(~(reached <= limits + RELATIVE_TOLERANCE * np.maximum(1.0, np.abs(limits))))
@@ -485,7 +485,7 @@ class Verdicts(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Verdicts, and the errors of the forecast that the model's is from; None where there is none."""
+    """Verdicts of a flight, and the forecast errors behind that on the model; None where there are none."""
 
     verdicts: Verdicts
     innovations: InnovationSamples | None
@@ -508,7 +508,7 @@ def judge(flight: FlightData) -> Judged:
 
 
 def flown_config(flight: FlightData) -> Config | None:
-    """The configuration that was flown; None where this version cannot read it, or it is another plant's."""
+    """Return the configuration that was flown; None if this version cannot read it or it is another plant's."""
     try:
         config = parse(flight.header.config_toml, "the recording's configuration").config
     except ConfigError:
