@@ -1,1 +1,1 @@
-"""What happened: recording, reading, replaying, reporting."""
+"""Recordings of flights: written, read, replayed, reported."""

@@ -1,4 +1,4 @@
-"""Topics derived for viewers, as Protobuf."""
+"""Topics derived from records for viewers, as Protobuf messages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
 
 
 class Axes(Record, frozen=True, kw_only=True):
-    """One number for each axis of local NED; NaN for an axis that the plant has not."""
+    """One number for each axis of local NED; NaN for an axis that the plant does not have."""
 
     north: float = math.nan
     east: float = math.nan
@@ -50,7 +50,7 @@ class Axes(Record, frozen=True, kw_only=True):
 
 
 class AgePlot(Record, frozen=True, kw_only=True):
-    """Age of the newest position, and what a tick made of it."""
+    """Age of the newest position at a tick, and the control mode that followed."""
 
     age_s: float  # from its capture to this tick
     age_steps: float  # as the controller counts it
@@ -70,7 +70,7 @@ class InputPlot(Record, frozen=True, kw_only=True):
 
 
 class SetpointPlot(Record, frozen=True, kw_only=True):
-    """Acceleration that was sent [m/s²]."""
+    """Acceleration setpoint that was sent [m/s²]."""
 
     accel_mps2: Axes
     limited: bool  # the last gate changed it
@@ -86,7 +86,7 @@ class StatePlot(Record, frozen=True, kw_only=True):
 
 
 class LimitsPlot(Record, frozen=True, kw_only=True):
-    """Limits of position and velocity, and what the newest plan left of them at its end; infinite where open."""
+    """Limits of position and velocity, and the newest plan's tightened ones at its end; infinite where open."""
 
     position_lower_m: Axes
     position_upper_m: Axes
@@ -97,7 +97,7 @@ class LimitsPlot(Record, frozen=True, kw_only=True):
 
 
 class SolvePlot(Record, frozen=True, kw_only=True):
-    """How a plan was found; how long it took is in `/plot/timing`."""
+    """Method and outcome of a solve; its computing time is in `/plot/timing`."""
 
     status: str
     method: str
@@ -119,7 +119,7 @@ class TimingPlot(Record, frozen=True, kw_only=True):
 
 
 class LinkPlot(Record, frozen=True, kw_only=True):
-    """The link that carries the positions: what is believed of it, and what the design counts on."""
+    """Estimate of the link that carries the positions, and what the design counts on."""
 
     arrival_mean: float
     arrival_lower: float
@@ -143,7 +143,7 @@ class CounterPlot(Record, frozen=True, kw_only=True):
 
 
 class TruthPlot(Record, frozen=True, kw_only=True):
-    """The simulator's own state."""
+    """True state of the simulated vehicle."""
 
     position_m: Axes
     velocity_mps: Axes
@@ -152,7 +152,7 @@ class TruthPlot(Record, frozen=True, kw_only=True):
 
 
 class VehiclePlot(Record, frozen=True, kw_only=True):
-    """The vehicle as it tells."""
+    """Mode and state of the vehicle, as its telemetry says."""
 
     mode: str
     armed: bool
@@ -161,17 +161,17 @@ class VehiclePlot(Record, frozen=True, kw_only=True):
 
 
 def axes_of(design: DesignView, values: Sequence[float] | Floats) -> Axes:
-    """Numbers in the order of the plant's axes, by name."""
+    """Name numbers that are in the order of the plant's axes."""
     return Axes(**dict(zip(design.axes, map(float, values), strict=True)))
 
 
 def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
-    """The values at some places."""
+    """Return the values at some indices."""
     return [float(values[i]) for i in index]
 
 
 def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
-    """Age in a tick; `captured_ns` is the capture time of the newest position so far."""
+    """Return the age at a tick; `captured_ns` is the capture time of the newest position so far."""
     return _same(
         AgePlot,
         decision,
@@ -184,21 +184,21 @@ def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) ->
 
 
 def input_plot(design: DesignView, decision: Decision) -> InputPlot:
-    """Input of a tick."""
+    """Return the input that a tick chose."""
     box = design.input_box
     chosen = Axes() if decision.input is None else axes_of(design, decision.input)
     return InputPlot(chosen=chosen, lower=axes_of(design, box.lower), upper=axes_of(design, box.upper))
 
 
 def setpoint_plot(setpoint: Setpoint) -> SetpointPlot:
-    """What was sent."""
+    """Return the setpoint that was sent."""
     north, east, down = setpoint.accel_mps2
     accel = Axes(north=north, east=east, down=down)
     return SetpointPlot(accel_mps2=accel, limited=bool(setpoint.limited), source=setpoint.source.value)
 
 
 def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
-    """An estimate by axis."""
+    """Return an estimate by axis."""
     std = [math.sqrt(max(0.0, estimate.cov[i][i])) for i in design.position_index]
     return StatePlot(
         position_m=axes_of(design, pick(estimate.mean, design.position_index)),
@@ -208,7 +208,7 @@ def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
 
 
 def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
-    """Limits and the tightened ones of a plan."""
+    """Return the limits, and the tightened ones of a plan."""
     box = design.state_box
     lower, upper = tightened(design, plan.backoff_x, -1)
     return LimitsPlot(
@@ -222,7 +222,7 @@ def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
 
 
 def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
-    """Sides of the state box less the back-offs of a stage: lower and upper (n_x,)."""
+    """Return the state limits less the back-offs of a stage: lower and upper (n_x,)."""
     lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
     for side, closed in zip((lower, upper), design.closed_sides, strict=True):
         for state, row, size in closed:
@@ -231,12 +231,12 @@ def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, 
 
 
 def solve_plot(plan: Plan) -> SolvePlot:
-    """How a plan was found."""
+    """Return method and outcome of a solve."""
     return _same(SolvePlot, plan, status=plan.status.value)
 
 
 def timing_plot(timing: Timing) -> TimingPlot:
-    """Run time of a tick."""
+    """Return the computing times of a tick."""
     return TimingPlot(
         lateness_us=timing.lateness_ns * 1e-3,
         step_us=timing.step_ns * 1e-3,
@@ -246,12 +246,12 @@ def timing_plot(timing: Timing) -> TimingPlot:
 
 
 def link_plot(link: LinkEstimate) -> LinkPlot:
-    """What is believed of the link."""
+    """Return the link estimate."""
     return _same(LinkPlot, link)
 
 
 def counter_plot(stats: LinkStats) -> CounterPlot:
-    """Counters of a connection."""
+    """Return the counters of a connection."""
     return _same(
         CounterPlot,
         stats,
@@ -263,18 +263,18 @@ def counter_plot(stats: LinkStats) -> CounterPlot:
 
 
 def truth_plot(truth: Truth) -> TruthPlot:
-    """The simulator's state."""
+    """Return the true state of the simulated vehicle."""
     position, velocity = (Axes(north=v[0], east=v[1], down=v[2]) for v in (truth.position_m, truth.velocity_mps))
     return _same(TruthPlot, truth, position_m=position, velocity_mps=velocity)
 
 
 def vehicle_plot(status: VehicleStatus) -> VehiclePlot:
-    """The vehicle as it tells."""
+    """Return mode and state of the vehicle."""
     return _same(VehiclePlot, status, battery_v=_number(status.battery_v))
 
 
 def _same(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
-    """A record of `kind` with the fields of the same name of `record`, but for `others`."""
+    """Return a record of `kind`: fields of the same name are copied from `record`, the others given."""
     return kind(**{name: getattr(record, name) for name in kind.__struct_fields__ if name not in others}, **others)
 
 
@@ -299,7 +299,7 @@ _SCALARS: Mapping[object, FieldDescriptorProto.Type.ValueType] = {
 
 @cache
 def message_class(kind: type[Record]) -> type[Message]:
-    """Message type `uavctl.<name of the record>`.
+    """Make the message class `uavctl.<name of the record>` of a record type.
 
     Args:
         kind: its fields are floats, integers, booleans, texts, tuples of one of these, and records of such fields.
@@ -315,7 +315,7 @@ def message_class(kind: type[Record]) -> type[Message]:
 
 
 def pack(record: Record) -> bytes:
-    """A record as the message of its type.
+    """Pack a record as the message of its type.
 
     Raises:
         ValueError: an integer that does not fit 64 bits, or a text that is none.
@@ -325,12 +325,12 @@ def pack(record: Record) -> bytes:
 
 
 def schema_of(kind: type[Message]) -> bytes:
-    """Descriptors of a message type and of all that it uses, as MCAP wants them."""
+    """Return the descriptors of a message type and of all types in it, as MCAP wants them."""
     return build_file_descriptor_set(kind).SerializeToString()
 
 
 def _describe(message: DescriptorProto, kind: type[msgspec.Struct], scope: str) -> None:
-    """Fill in a message type; types of its fields go inside it, so that no name is taken twice."""
+    """Fill in the descriptor of a message type; types of its fields are nested in it, so no name is taken twice."""
     message.name = kind.__name__
     scope = f"{scope}.{message.name}"
     for number, field in enumerate(msgspec.structs.fields(kind), start=1):
@@ -362,7 +362,7 @@ PATH_SCENE, LINK_SCENE = "/view/scene/path", "/view/scene/link"
 
 @dataclass(frozen=True)
 class DerivedTopic:
-    """A topic of protobuf messages of one type: a well-known one, or that of a record."""
+    """A topic of Protobuf messages of one type: a well-known type, or that of a record."""
 
     name: str
     kind: type[Message] | type[Record]
@@ -370,7 +370,7 @@ class DerivedTopic:
 
     @cached_property
     def message(self) -> type[Message]:
-        """The message type."""
+        """Return the class of the topic's messages."""
         return self.kind if issubclass(self.kind, Message) else message_class(self.kind)
 
     @property
@@ -380,7 +380,7 @@ class DerivedTopic:
 
     @cached_property
     def schema(self) -> bytes:
-        """Descriptors, as MCAP wants them."""
+        """Return the descriptors of the message type, as MCAP wants them."""
         return schema_of(self.message)
 
 

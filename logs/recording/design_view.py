@@ -1,4 +1,4 @@
-"""What people's pages need to know of a design: limits, weights, target, the meaning of the states."""
+"""The part of a design that reports and viewers need: limits, weights, target, meaning of the states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
 
 
 class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
-    """The part of `Header.design` that people's pages need; other keys are ignored.
+    """The part of `Header.design` that reports and viewers need; other keys are ignored.
 
     Each field is the key of the same name: admissible sets {x | c_x x <= b_x} and
     {u | c_u u <= b_u}, full weights q_x (n_x, n_x) and q_u (n_u, n_u), the target equilibrium
@@ -63,7 +63,7 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def names(self) -> Names:
-        """What states and limits are called."""
+        """Return the names of states and limits."""
         return names_of(self.c_x, len(self.target), self.axes, self.position_index, self.velocity_index)
 
     @property
@@ -73,18 +73,18 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def target_m(self) -> Vec3:
-        """Target position; axes that the plant has not are 0."""
+        """Position of the target [m]; 0 along axes that the plant does not have."""
         return self.position_of(self.target)
 
     def position_of(self, state: Sequence[float]) -> Vec3:
-        """Position in local NED [m] within a state (n_x,); axes that the plant has not are 0."""
+        """Return the position in a state (n_x,), local NED [m]; 0 along axes that the plant does not have."""
         position = [0.0, 0.0, 0.0]
         for axis, index in zip(self.axes, self.position_index, strict=True):
             position[AXIS_NUMBER[axis]] = float(state[index])
         return (position[0], position[1], position[2])
 
     def positions_of(self, states: Matrix | Floats) -> Floats:
-        """The same of many states (n, n_x): (n, 3)."""
+        """Return the positions in many states (n, n_x), local NED (n, 3) [m]."""
         positions = np.zeros((len(states), 3))
         if isinstance(states, np.ndarray):
             positions[:, self._columns] = states[:, self.position_index]
@@ -96,11 +96,11 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def _columns(self) -> list[int]:
-        """Where each axis stands among north, east, down."""
+        """Return the index of each axis among north, east, down."""
         return [AXIS_NUMBER[axis] for axis in self.axes]
 
     def state_name(self, index: int) -> str:
-        """Name of a state for people, e.g. "north position"."""
+        """Return the name of a state, e.g. "north position"."""
         if self.state_names:
             return self.state_names[index]
         for axis, position, velocity in zip(self.axes, self.position_index, self.velocity_index, strict=True):
@@ -110,12 +110,12 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def state_box(self) -> Box:
-        """Axis-parallel limits of the states."""
+        """Return the axis-parallel limits of the states."""
         return Box.of(self.c_x, self.b_x, len(self.target))
 
     @cached_property
     def closed_sides(self) -> tuple[tuple[tuple[int, int, float], ...], ...]:
-        """Of the lower sides of the states that are not open, and of the upper ones: state, row, its coefficient."""
+        """Return the finite lower, then upper limits of the states: state, row, the row's coefficient of it."""
         box = self.state_box
         return tuple(
             tuple((state, row, self.c_x[row][state]) for state, row in enumerate(rows.tolist()) if row >= 0)
@@ -124,7 +124,7 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def position_rows(self) -> tuple[tuple[int, int, float], ...]:
-        """Rows that limit a position: state, row, size of the row's coefficient."""
+        """Return the rows that limit a position: state, row, magnitude of the row's coefficient."""
         box = self.state_box
         return tuple(
             (state, row, abs(self.c_x[row][state]))
@@ -135,13 +135,13 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def input_box(self) -> Box:
-        """Axis-parallel limits of the inputs."""
+        """Return the axis-parallel limits of the inputs."""
         return Box.of(self.c_u, self.b_u, len(self.q_u))
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Axis-parallel sides of a polytope; open sides are infinite and have row -1."""
+    """Axis-parallel limits of a polytope; open sides are infinite and have row -1."""
 
     lower: Floats  # (n,)
     upper: Floats  # (n,)
@@ -150,7 +150,7 @@ class Box:
 
     @classmethod
     def of(cls, c: Matrix, b: Vector, n: int) -> Self:
-        """Tightest sides among the rows of {x | c x <= b} that bound a single coordinate."""
+        """Return the tightest limits by the rows of {x | c x <= b} that bound a single coordinate."""
         lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
         row_lower, row_upper = np.full(n, -1), np.full(n, -1)
         for row, (normal, limit) in enumerate(zip(c, b, strict=True)):
@@ -182,7 +182,7 @@ def design_view(header: Header) -> DesignView:
 
 
 def _free_input(header: Header) -> float:
-    """What plans leave of each input to be flown against a bias: flown inputs may use it [input units]."""
+    """Return how much of each input plans leave free to act against a bias [input units]."""
     try:
         estimator = tomllib.loads(header.config_toml).get("estimator", {})
     except tomllib.TOMLDecodeError:

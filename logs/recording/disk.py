@@ -1,4 +1,4 @@
-"""The disk under a recording: files that keep what they were given, names of segments, free space."""
+"""Disk under a recording: files that keep what was written, names of segments, free space."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from uavctl.errors import RecordingError
 
 
 class OutputFile(Protocol):
-    """What a segment asks of a file; every method may raise OSError."""
+    """Interface of a file that a segment writes to; every method may raise OSError."""
 
     def write(self, data: bytes) -> None:
         """Hand all of `data` to the operating system."""
@@ -33,7 +33,7 @@ class OutputFile(Protocol):
 
 
 class DiskFile:
-    """A new file without a buffer of its own: what `write` took survives the end of the process.
+    """A new file without a buffer of its own: bytes that `write` took survive the end of the process.
 
     Raises:
         FileExistsError: a recording never overwrites.
@@ -65,19 +65,19 @@ class DiskFile:
 
 
 def segment_path(path: Path, segment: int) -> Path:
-    """File of a recording's segment; the first is the recording's own name."""
+    """Return the path of segment `number`; the first is the recording's own path."""
     return path if segment == 1 else path.with_name(f"{path.stem}-{segment}{path.suffix}")
 
 
 def later_segments(path: Path) -> tuple[Path, ...]:
-    """Existing files named as later segments of the recording `path`, in order."""
+    """Return the existing later segments of the recording `path`, in order."""
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
     found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
     return tuple(found[number] for number in sorted(found))
 
 
 def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
-    """Whether a file is where it was made, and holds no less than was written to it.
+    """Return whether a file is still where it was made, and no shorter than what was written to it.
 
     Args:
         opened: what it is, while it is open. Of a closed one some file systems (FAT) change the number.
@@ -92,7 +92,7 @@ def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> boo
 
 
 def free_bytes(folder: Path) -> int | None:
-    """Free space where a folder is [bytes]; None if it cannot be told."""
+    """Return the free space of a folder's file system [bytes]; None if it cannot be told."""
     try:
         return shutil.disk_usage(folder).free
     except OSError:
@@ -100,7 +100,7 @@ def free_bytes(folder: Path) -> int | None:
 
 
 class RoomWatch:
-    """Tells when the disk under a recording gets low, when recording should rest, and when it may go on.
+    """Watch of the free space: tells when it gets low, when recording must pause, and when it may go on.
 
     Attributes:
         low: less than `low_bytes` are free.
@@ -117,7 +117,7 @@ class RoomWatch:
         self.text = ""
 
     def look(self) -> None:
-        """Ask for the free space."""
+        """Look at the free space."""
         free = self._free(self._folder)
         if free is None:
             return
@@ -129,7 +129,7 @@ class RoomWatch:
 
 
 def check_room(path: Path, free_bytes: int) -> int:
-    """Free space for the new recording `path` [bytes]; its folder is made.
+    """Make the folder of the new recording `path`; return the free space there [bytes].
 
     Raises:
         RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.

@@ -1,4 +1,4 @@
-"""Records as rows of tables: nested values spread over columns, whose number the recording's own values tell.
+"""Export of records as rows of tables, nested values spread over columns.
 
 A field keeps its name, and with it its unit. What it holds follows it:
 
@@ -40,7 +40,7 @@ _AXES = ("x", "y", "z")
 
 
 class ColumnKind(Enum):
-    """What a column holds."""
+    """Kind of a column's values."""
 
     INTEGER = "integer"
     FLOAT = "float"
@@ -58,29 +58,29 @@ class TableColumn:
 
 
 class _Form(Protocol):
-    """How values of one type stand in columns; told all values first, then asked for the cells of each."""
+    """Columns of values of one type; learns from all values first, then writes the cells of each."""
 
     def learn(self, value: Any) -> None:
-        """See how many columns a value needs."""
+        """Look at a value to find the columns that it needs."""
         ...
 
     def columns(self, name: str) -> Iterator[TableColumn]:
-        """The columns that all values need, each beginning with `name`."""
+        """Return the columns that all values need, each name beginning with `name`."""
         ...
 
     def put(self, value: Any, row: list[Cell]) -> None:
-        """Append a value's cells, one for each column."""
+        """Append the cells of a value, one for each column."""
         ...
 
 
 class _Leaf:
-    """One column; `cell` makes a cell of a value."""
+    """A single column; `cell` makes a cell of a value."""
 
     def __init__(self, kind: ColumnKind, cell: Callable[[Any], Cell] = lambda value: value) -> None:
         self._kind, self._cell = kind, cell
 
     def learn(self, value: Any) -> None:
-        """Nothing depends on the value."""
+        """Do nothing: there is one column whatever the value."""
 
     def columns(self, name: str) -> Iterator[TableColumn]:
         yield TableColumn(name, self._kind)
@@ -90,7 +90,7 @@ class _Leaf:
 
 
 class _Parts:
-    """The columns of a value's parts, one after another.
+    """Columns of a value's parts, one part after another.
 
     Args:
         mark: between the value's name and the part's key.
@@ -135,7 +135,7 @@ _LEAVES = {
 
 
 def _form(kind: Any) -> _Form:
-    """The form of a field's type; None is an empty cell of any type.
+    """Return the form of a field's type; None makes an empty cell of any type.
 
     Raises:
         TypeError: no table has a place for such values.
@@ -163,7 +163,7 @@ def _form(kind: Any) -> _Form:
 
 
 def _present(kind: Any) -> Any:
-    """The type without None."""
+    """Return a type without None."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
         (rest,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
         return rest
@@ -175,7 +175,7 @@ def _is_record(kind: Any) -> bool:
 
 
 class _Table:
-    """Columns and rows of one type of record, after columns of its own."""
+    """Columns and rows of one type of record, after columns that the table adds."""
 
     def __init__(self, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> None:
         self._lead = lead
@@ -197,7 +197,7 @@ class _Table:
 
 
 def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struct]]]:
-    """Fields that are lists of records, and what the records are."""
+    """Return the fields that are lists of records, with the type of those records."""
     for field in msgspec.structs.fields(kind):
         arguments = typing.get_args(_present(field.type))
         if arguments and arguments[-1] is Ellipsis and _is_record(arguments[0]):
@@ -205,7 +205,7 @@ def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struc
 
 
 class Tables:
-    """The tables of a recording, by topic; a list of records within has the name `<topic>.<field>`.
+    """Tables of a recording, by topic; a list of records within has the table `<topic>.<field>`.
 
     Each table begins with `log_time_ns`. That of a list goes on with `row`, the row (from 0) of the topic's table that
     the list belongs to, and `place`, the place in the list (from 0).
@@ -215,7 +215,7 @@ class Tables:
         self._tables: dict[str, _Table] = {}
 
     def learn(self, topic: str, record: Record) -> None:
-        """See what columns a record needs. All records are seen before the first row is asked for."""
+        """Look at a record to find the columns that it needs; all records come before the first row is asked for."""
         table = self._table(topic, ("log_time_ns",), type(record))
         table.learn(record)
         for field, kind in table.lists:
@@ -223,11 +223,11 @@ class Tables:
                 self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind).learn(one)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
-        """Columns of each table, by its name."""
+        """Return the columns of each table, by its name."""
         return {name: self._tables[name].columns() for name in sorted(self._tables)}
 
     def rows(self, topic: str, at_ns: int, record: Record) -> Iterator[tuple[str, list[Cell]]]:
-        """A record's rows, each with its table's name; records come in the order of the recording."""
+        """Return the rows of a record, each with its table's name; records come in the order of the recording."""
         table = self._tables[topic]
         number = table.rows
         yield topic, table.row((at_ns,), record)
@@ -259,7 +259,7 @@ class TableFormat(StrEnum):
 
 
 class ExportedTable(msgspec.Struct, frozen=True, kw_only=True):
-    """One file that was written."""
+    """One table file that was written."""
 
     file: str
     topic: str  # with the field's name after a dot: a list of records within
@@ -268,7 +268,7 @@ class ExportedTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Exported(msgspec.Struct, frozen=True, kw_only=True):
-    """What was written of a recording."""
+    """Result of an export."""
 
     tables: tuple[ExportedTable, ...]
     unknown: dict[str, int]  # records left out, by topics that this version does not know
@@ -279,12 +279,12 @@ Watch = Callable[[Iterable[RecordedMessage], int | None, str], Iterable[Recorded
 
 
 def unwatched(messages: Iterable[RecordedMessage], _total: int | None, _what: str) -> Iterable[RecordedMessage]:
-    """Nobody looks."""
+    """Ignore progress."""
     return messages
 
 
 def known_number(flight: Path) -> int | None:
-    """How many messages `good_messages` will give, by the recording's own statistics; None of a torn recording.
+    """Return how many messages `good_messages` will yield, by the recording's statistics; None if it is torn.
 
     Raises:
         RecordingError: There is no such recording.
@@ -345,12 +345,12 @@ def export_tables(
 
 
 def file_stem(table: str) -> str:
-    """File name of a table, without its suffix; two tables never share one."""
+    """Return the file name of a table without its suffix; no two tables share one."""
     return ".".join(quote(part, safe="") for part in table.strip("/").split("/"))
 
 
 def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
-    """Columns of all tables; records of unknown topics, counted; and the number of messages."""
+    """Return the columns of all tables, the number of records of unknown topics, and the number of messages."""
     tables, unknown = Tables(), Counter[str]()
     total = 0
 
@@ -383,7 +383,7 @@ def _is_known(topic: str) -> bool:
 
 
 class _Writer(Protocol):
-    """Writes one table."""
+    """Writer of one table's file."""
 
     def __enter__(self) -> Self: ...
 
@@ -395,7 +395,7 @@ class _Writer(Protocol):
 
 
 def _writer(kind: TableFormat) -> Callable[[Path, tuple[TableColumn, ...]], _Writer]:
-    """What writes a table of a format.
+    """Return the writer of a table format.
 
     Raises:
         UsageError: `pyarrow` is not there.
@@ -412,7 +412,7 @@ def _writer(kind: TableFormat) -> Callable[[Path, tuple[TableColumn, ...]], _Wri
 
 
 class _CsvFile:
-    """RFC 4180 with a line of names; floats with the digits that give the same float back; bytes in hexadecimal."""
+    """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
 
     def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
         self._file = path.open("w", newline="", encoding=CSV_ENCODING)
@@ -434,7 +434,7 @@ class _CsvFile:
 
 
 class _ParquetFile:
-    """One row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
+    """Parquet with one row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
 
     def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
         import pyarrow as pa

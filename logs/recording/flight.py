@@ -1,4 +1,4 @@
-"""A flight in memory: its records by type, and the arrays that summary and report are made from."""
+"""A flight in memory: its records by type, and the arrays for summary and report."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
 
 
 class Landing(NamedTuple):
-    """When a landing began that was wanted [ns], and whether the operator ordered it or the mission ended in it."""
+    """Begin of a wanted landing [ns], and whether the operator ordered it or the mission ended with it."""
 
     at_ns: int
     ordered: bool
@@ -78,7 +78,7 @@ class FlightData:
 
     @classmethod
     def from_records(cls, records: Iterable[tuple[str, int, Record]], path: Path | None = None) -> Self:
-        """Sort (topic, log_time_ns, record) by record type; types that nobody reads here are left out.
+        """Sort (topic, log_time_ns, record) by record type; types that no report needs are left out.
 
         Args:
             path: The file that they are from, which errors name.
@@ -136,23 +136,23 @@ class FlightData:
 
     @cached_property
     def flown(self) -> tuple[Decision, ...]:
-        """Ticks up to the operator's stop: what comes after it is the hand-over, not the flight."""
+        """Return the ticks up to the operator's stop; after it comes the hand-over, not the flight."""
         stopped = self.stopped_ns
         return tuple(d for d in self.decisions if stopped is None or d.at_ns < stopped)
 
     @cached_property
     def stopped_ns(self) -> int | None:
-        """When the operator asked for the hand-over [ns]; None if nobody did."""
+        """Return the time at which the operator asked for the hand-over [ns]; None if nobody did."""
         return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
 
     @cached_property
     def breach(self) -> Event | None:
-        """What the envelope found that cannot be, for which the vehicle was let go."""
+        """Return the envelope's event on an impossible observation, for which the vehicle was let go; else None."""
         return next((one for one in self.events if one.code in BREACHES), None)
 
     @cached_property
     def landing(self) -> Landing | None:
-        """The landing that somebody wanted, if one began before the operator's stop and no plan was flown after it."""
+        """Return the wanted landing that began before the operator's stop with no plan flown after it; else None."""
         after_ns = max((d.at_ns for d in self.flown if d.mode is ControlMode.TRACK), default=-1)
         ordered = [
             Landing(one.at_ns, ordered=True)
@@ -165,7 +165,7 @@ class FlightData:
 
     @cached_property
     def fallen(self) -> tuple[Decision, ...]:
-        """Flown ticks of the fallback; its braking and holding before a landing that was wanted is none."""
+        """Return the flown ticks of the fallback, without braking and holding before a wanted landing."""
         wanted = self.landing
         before = (one for one in self.flown if wanted is None or one.at_ns < wanted.at_ns)
         return tuple(one for one in before if one.mode in FALLBACK)
@@ -181,39 +181,39 @@ class FlightData:
 
     @property
     def part(self) -> bool:
-        """Whether the first ticks are not in it, as in a later file of a recording."""
+        """Whether the recording lacks the first ticks of its flight, as a later file does."""
         return bool(self.decisions[0].tick)
 
     @property
     def breaks_off(self) -> bool:
-        """Whether the recorder was not able to end it: killed, without power, or the file was cut."""
+        """Whether the recorder could not close the recording: killed, without power, or the file was cut."""
         return bool(self.notes) and not self.notes[-1].text.startswith((END, GOES_ON))
 
     @cached_property
     def virtual_time(self) -> bool:
-        """Whether ticks were measured and none was late by a single nanosecond: no real clock does that."""
+        """Return whether the flight was in virtual time: no measured tick was late by a single nanosecond."""
         return bool(self.timings) and not any(timing.lateness_ns for timing in self.timings)
 
     @cached_property
     def tick_ns(self) -> int:
-        """Time between two ticks; 0 when there was only one."""
+        """Return the time between two ticks [ns]; 0 if there was only one."""
         first, last = self.decisions[0], self.decisions[-1]
         return (last.at_ns - first.at_ns) // max(1, last.tick - first.tick)
 
     @cached_property
     def duration_s(self) -> float:
-        """From the first tick to the end of the last one [s]."""
+        """Return the time from the first tick to the end of the last one [s]."""
         return (self.decisions[-1].at_ns - self.origin_ns + self.tick_ns) * 1e-9
 
     @cached_property
     def flown_plans(self) -> dict[int, Plan]:
-        """Plans that were flown, by their number."""
+        """Return the plans that were flown, by their number."""
         seqs = {decision.plan_seq for decision in self.decisions}
         return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
 
     @cached_property
     def targets(self) -> tuple[Floats, Floats]:
-        """Where the mission wanted the vehicle to be: times (n,) [s] and states (n, n_x), one each boundary.
+        """Return times (n,) [s] and targets (n, n_x) of the mission, one for each boundary.
 
         A recording without any says what its design was made for.
         """
@@ -223,7 +223,7 @@ class FlightData:
 
     @cached_property
     def moving_target(self) -> bool:
-        """Whether a trajectory was to be followed: a target that moves from one boundary to the next, and on.
+        """Return whether a trajectory was to be followed: the target moves from boundary to boundary.
 
         A place that was ordered is no waypoint either, and stays where it is.
         """
@@ -233,7 +233,7 @@ class FlightData:
 
     @cached_property
     def ordered_places(self) -> tuple[tuple[int, tuple[float, ...]], ...]:
-        """When the vehicle was sent to a place by an order, and where that is: (time [ns], target (n_x,))."""
+        """Return the places that the vehicle was ordered to: (time [ns], target (n_x,))."""
         if self.moving_target:
             return ()
         told = [(d.at_ns, d.target, d.waypoint) for d in self.flown if d.boundary and d.target is not None]
@@ -246,21 +246,21 @@ class FlightData:
 
     @cached_property
     def last_flown(self) -> Estimate | None:
-        """The estimate at the last flown boundary."""
+        """Return the estimate at the last flown boundary."""
         at_ns = self.steps.decisions[-1].at_ns if len(self.steps) else None
         return next((one for one in reversed(self.estimates) if one.at_ns == at_ns), None)
 
     @cached_property
     def steps(self) -> Steps:
-        """The flown Δt boundaries."""
+        """Return the flown Δt boundaries."""
         return Steps.of(self)
 
     def seconds(self, at_ns: Sequence[int]) -> Floats:
-        """Times on the report's axis (n,) [s]."""
+        """Return times on the report's axis (n,) [s], 0 at the first tick."""
         return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
     def spans(self, modes: Collection[ControlMode]) -> list[tuple[float, float]]:
-        """Spans of flown time [s], so none after the operator's stop, in which the mode was one of `modes`."""
+        """Return the spans of flown time [s] in which the mode was one of `modes`; none after the operator's stop."""
         spans: list[tuple[float, float]] = []
         begun: int | None = None
         for decision in self.flown:
@@ -275,7 +275,7 @@ class FlightData:
         return spans
 
     def lost_at_s(self) -> Floats:
-        """When the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
+        """Return when the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
         times = [b.at_ns for a, b in pairwise(self.truths) for _ in range(b.lost - a.lost)]
         return self.seconds(times)
 
@@ -314,13 +314,13 @@ class Steps:
 
     @property
     def decided(self) -> Floats:
-        """Inputs as decided (n, n_u), before the wire; NaN where there was none."""
+        """Inputs as decided (n, n_u), before they were sent; NaN where there was none."""
         width = self.input.shape[1]
         return np.array([d.input or (np.nan,) * width for d in self.decisions]).reshape(-1, width)
 
 
 def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the known time nearest to each wanted one (0 when nothing is known)."""
+    """Return the index of the known time nearest to each wanted one; 0 if none is known."""
     right = np.clip(np.searchsorted(known, wanted), 0, max(0, len(known) - 1))
     left = np.maximum(right - 1, 0)
     if not len(known):
@@ -329,7 +329,7 @@ def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.
 
 
 def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
-    """Input of the plant in each step (n, n_u).
+    """Return the input of the plant in each step (n, n_u).
 
     The setpoint reaches the vehicle shortly after the boundary, so the last truth within the step
     tells what was applied; the one at the boundary may still show the step before.

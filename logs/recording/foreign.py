@@ -1,4 +1,4 @@
-"""MCAP files of other programs: MAVLink out of whatever channels hold it.
+"""MAVLink out of MCAP files of other programs, whatever channels hold it.
 
 There is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a stream of
 frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped first. The
@@ -74,11 +74,11 @@ Definitions = dict[str, list[_RosField]]
 
 
 class UnreadableError(Exception):
-    """A message or a definition is not what it should be; says why."""
+    """A message or its definition is not as it should be; says why."""
 
 
 def unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes) -> Callable[[bytes], bytes] | None:
-    """What makes a frame of each message of a channel, if they are MAVLink as ROS wraps it.
+    """Return a function that makes a frame of each message of a channel, if they are MAVLink wrapped by ROS.
 
     Such messages are known by their fields, those of mavros_msgs/Mavlink, wherever they stand in the definition.
 
@@ -102,12 +102,12 @@ def unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes)
 
 
 def _plain(name: str) -> str:
-    """A type's name as ROS 1 has it: without `msg` between package and type."""
+    """Return a type's name as ROS 1 has it: without `msg` between package and type."""
     return name.replace("/msg/", "/")
 
 
 def _parse(top: str, text: str) -> Definitions:
-    """Fields of all types of a definition; constants and comments are nothing to a message."""
+    """Return the fields of all types in a ROS message definition, without constants and comments."""
     types: Definitions = {}
     for number, part in enumerate(_BORDER.split(text)):
         lines = [line.partition("#")[0].strip() for line in part.splitlines()]
@@ -122,7 +122,7 @@ def _parse(top: str, text: str) -> Definitions:
 
 
 def _field(line: str, owner: str) -> _RosField | None:
-    """A field of a definition; None for a constant."""
+    """Return a field of a definition; None for a constant."""
     found = _FIELD.match(line)
     if found is None:
         raise UnreadableError(f"cannot make sense of {line!r}")
@@ -138,7 +138,7 @@ def _field(line: str, owner: str) -> _RosField | None:
 
 
 class _RosReader:
-    """Reads one message."""
+    """Reader of one serialised ROS message."""
 
     def __init__(self, data: bytes, types: Mapping[str, list[_RosField]], encoding: str) -> None:
         self._types, self._cdr = types, encoding == ROS2
@@ -151,7 +151,7 @@ class _RosReader:
             self._data = data[_HEAD_BYTES:]
 
     def record(self, kind: str) -> dict[str, Value]:
-        """All fields of a type."""
+        """Read all fields of a type."""
         if kind not in self._types:
             raise UnreadableError(f"its definition says nothing of {kind}")
         return {field.name: self._field(field) for field in self._types[kind]}
@@ -195,7 +195,7 @@ class _RosReader:
 
 
 def _frame(fields: Mapping[str, Value]) -> bytes:
-    """The frame that was wrapped: https://mavlink.io/en/guide/serialization.html."""
+    """Return the MAVLink frame that was wrapped: https://mavlink.io/en/guide/serialization.html."""
     magic, length, message_id = _whole(fields, "magic"), _whole(fields, "len"), _whole(fields, "msgid")
     sender = (_whole(fields, "seq"), _whole(fields, "sysid"), _whole(fields, "compid"))
     signature = b""
@@ -238,7 +238,7 @@ def _list(fields: Mapping[str, Value], name: str) -> list[Value]:
 
 @dataclass(frozen=True)
 class Cut:
-    """What a stream holds."""
+    """Frames of a stream of bytes, and what was left out of it."""
 
     # Its frames in the order of the stream, each at the time of the piece that its last byte came in
     packets: tuple[TlogPacket, ...]
@@ -278,7 +278,7 @@ def cut(pieces: list[tuple[int, bytes]]) -> Cut:
 
 
 def _next_marker(data: bytes, start: int) -> int:
-    """Index of the next byte that could begin a frame, or the end."""
+    """Return the index of the next byte that could begin a frame, or the end."""
     found = [index for marker in MARKERS if (index := data.find(marker, start)) >= 0]
     return min(found, default=len(data))
 
@@ -292,7 +292,7 @@ _DAMAGE = (McapError, ValueError, OverflowError, RuntimeError, struct.error, zst
 
 @dataclass(frozen=True)
 class ForeignMcap:
-    """MAVLink of an MCAP."""
+    """MAVLink packets of an MCAP file of another program."""
 
     packets: tuple[TlogPacket, ...]  # in order of arrival, which is the log time; one frame each
     topics: tuple[str, ...]  # those that hold them
@@ -337,7 +337,7 @@ class _ChannelStream:
             self._look(data)
 
     def packets(self) -> tuple[tuple[TlogPacket, ...], tuple[str, ...]]:
-        """Its packets, none if it is no MAVLink, and what there is to say.
+        """Return the channel's packets, none if it holds no MAVLink, and remarks on it.
 
         Raises:
             RecordingError: Its log times are all zero.
@@ -360,12 +360,12 @@ class _ChannelStream:
         return found.packets, (*notes, *clock.notes(self.topic))
 
     def listed(self) -> str:
-        """What it holds, for an error."""
+        """Return what the channel holds in words, for an error."""
         kind = f", {self.kind}" if self.kind else ""
         return f"{self.topic} ({self.encoding or 'no encoding'}{kind}, {self.messages})"
 
     def _look(self, data: bytes) -> None:
-        """Look for a first frame, and keep nothing of a channel that has none for long."""
+        """Look for a first frame; a channel without one for long is not kept."""
         assert self._probe is not None
         self._probe += data[: _PROBED_BYTES - len(self._probe)]
         if len(self._probe) < _PROBED_BYTES:
@@ -377,7 +377,7 @@ class _ChannelStream:
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a file is an MCAP with messages and none of ours among its topics.
+    """Return whether a file is an MCAP with messages, none of them of our topics.
 
     What cannot be read up to its first topic is left to the reader of our recordings, which says what is wrong.
 
@@ -405,7 +405,7 @@ def is_foreign(path: Path) -> bool:
 
 
 def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
-    """All MAVLink packets of an MCAP: raw frames, cut into messages anywhere, or wrapped by ROS one by one.
+    """Read all MAVLink packets of an MCAP: raw frames, cut into messages anywhere, or wrapped by ROS one by one.
 
     Args:
         path: The file; chunks may be stored, or packed with lz4 or zstd.
@@ -441,7 +441,7 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
 
 
 def _collect(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
-    """Take the messages of these topics, or of all if there are none; whether the file is torn."""
+    """Take the messages of some topics, or of all if none is given; return whether the file is torn."""
     schemas: dict[int, Schema] = {}
     try:
         for record in _records(file, size):
@@ -463,7 +463,7 @@ def _collect(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int
 
 
 def _records(file: BinaryIO, size: int) -> Iterator[object]:
-    """Channels and messages of a file in file order, each chunk by its checksum if it has one."""
+    """Yield channels and messages in file order; each chunk is checked by its checksum if it has one."""
     # A damaged length must not ask for more memory than the file has bytes.
     yield from StreamReader(file, validate_crcs=True, record_size_limit=size).records
 

@@ -1,4 +1,4 @@
-"""What is in a recording: duration, topics, gaps, losses, and how it was made."""
+"""Contents of a recording: duration, topics, gaps, losses, and how it was made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLAIN_NOTES = ("begin", END)
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """One topic's messages."""
+    """Messages of one topic."""
 
     topic: str
     encoding: str
@@ -63,14 +63,14 @@ class SegmentInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NoteInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """What the recorder had to say: why a file was begun, that the disk got low, that records were lost."""
+    """A note of the recorder: why a file was begun, that the disk got low, that records were lost."""
 
     at_s: float  # since the recording's first message
     text: str
 
 
 class ConnectionInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """What came over one connection, by its last counters."""
+    """Counters of one connection at the end of the recording."""
 
     link: str
     datagrams: int
@@ -81,7 +81,7 @@ class ConnectionInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PositionLoss(msgspec.Struct, frozen=True, kw_only=True):
-    """Steps without news on the link that carries the positions."""
+    """Share of steps without a new position, on the link that carries the positions."""
 
     believed: float | None  # at the end: mean of its posterior; None if there was no estimate
     below_promise: bool  # at the end: worse than the design counts on
@@ -115,7 +115,7 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Course:
-    """One topic's times as they go by."""
+    """Times of one topic's messages, taken one by one."""
 
     def __init__(self, message: RecordedMessage) -> None:
         self.encoding = message.definition.encoding
@@ -154,7 +154,7 @@ class _Segment:
 
 
 class _Account:
-    """What the records of the recording itself and of its links say, as they go by."""
+    """Notes of the recorder and counters of the links, taken record by record."""
 
     def __init__(self) -> None:
         self.note: RecorderNote | None = None
@@ -211,7 +211,7 @@ class _Account:
 
 
 def info(path: Path) -> RecordingInfo:
-    """Summary of a recording, finished, torn or damaged.
+    """Summarise a recording, be it finished, torn or damaged.
 
     Raises:
         RecordingError: there is no such recording, it holds nothing, or a file of it is none.

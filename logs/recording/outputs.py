@@ -1,4 +1,4 @@
-"""Files whole or not at all."""
+"""Output files that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uavctl.errors import RecordingError, UsageError
 
 @contextmanager
 def no_empty_folders(files: Iterable[Path]) -> Iterator[None]:
-    """Folders that are made for some files within this, and are empty in the end, are gone again."""
+    """Remove in the end the folders that were made within this block and are empty."""
     missing = {folder for file in files for folder in file.parents if not _is_there(folder)}
     try:
         yield
@@ -28,7 +28,7 @@ def no_empty_folders(files: Iterable[Path]) -> Iterator[None]:
 
 @contextmanager
 def all_or_none(files: Sequence[Path]) -> Iterator[None]:
-    """After an error or an interruption none of the files is there that was not before, nor a folder made for them."""
+    """After an error or an interruption, remove files and folders that were not there before."""
     new = [file for file in files if not _is_there(file)]
     with no_empty_folders(files):
         try:
@@ -41,7 +41,7 @@ def all_or_none(files: Sequence[Path]) -> Iterator[None]:
 
 
 def _is_there(path: Path) -> bool:
-    """Whether something is there; what cannot be looked at is not ours to take away."""
+    """Return whether a path exists; one that cannot be looked at counts as existing, so it is not removed."""
     try:
         return path.exists()
     except OSError:
@@ -55,7 +55,7 @@ _UNFINISHED = ".part"
 
 
 def spare_recording(target: Path) -> None:
-    """Refuse to put anything else where a recording is: a slip of the command line would cost the flight.
+    """Refuse to overwrite a recording with another output: a slip on the command line would cost the flight.
 
     Raises:
         UsageError: A recording of ours is there, or the name is that of one (which may be damaged).
@@ -69,7 +69,7 @@ def spare_recording(target: Path) -> None:
 
 
 def check_free(targets: Sequence[Path], *, force: bool) -> None:
-    """Refuse to overwrite.
+    """Refuse to overwrite files, unless `force` is given.
 
     Raises:
         UsageError: One of the files exists, and `force` is not given, or it is a recording, or no file.
@@ -85,7 +85,7 @@ def check_free(targets: Sequence[Path], *, force: bool) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text; where it cannot be written whole, what was there stays as it was.
+    """Write a text file; if it cannot be written whole, the file of before stays as it was.
 
     Raises:
         RecordingError: It cannot be written.
@@ -108,7 +108,7 @@ def write_whole(path: Path, text: str) -> None:
 
 @contextmanager
 def unfinished(targets: Sequence[Path]) -> Iterator[Mapping[Path, Path]]:
-    """Where to write each file; in the end all get their names, but after an error they are removed.
+    """Return a temporary path for each file; in the end they get their names, after an error they are removed.
 
     Raises:
         UsageError: Their folder cannot be made.

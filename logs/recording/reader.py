@@ -1,4 +1,4 @@
-"""What a recording's file still holds: whole chunks, and where it is damaged.
+"""Reader of a recording's files: whole chunks, and where a file is damaged.
 
 Nothing of a chunk is used before its checksum was right. After damage the search goes on byte by
 byte for the next whole chunk, since a flipped length would lead astray.
@@ -59,13 +59,13 @@ class RecordedMessage(NamedTuple):
 
 @dataclass
 class ReadingOrder:
-    """Where a reader is that wants all of a recording or none; goes from file to file with it."""
+    """Place of a reader that wants all of a recording or nothing; kept from file to file."""
 
     path: Path  # the recording, for the error
     following: int | None = None  # number that the next message has; None before the first
 
     def broken(self, sequence: int) -> RecordingError:
-        """The error of a message that does not follow."""
+        """Return the error of a message that does not follow the last one."""
         return RecordingError(
             f"{self.path}: message {sequence} where {self.following} should be (is a segment file gone?); "
             f"`uavctl log recover {self.path} OUT` restores the rest"
@@ -73,14 +73,14 @@ class ReadingOrder:
 
 
 class Contents:
-    """Messages of chunks; remembers the schemas that it has seen."""
+    """Reader of the messages in chunks; remembers the schemas seen so far."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
         self._known: dict[bytes, tuple[int, Definition]] = {}
 
     def messages(self, content: bytes, offset: int, order: ReadingOrder | None = None) -> Iterator[RecordedMessage]:
-        """Messages of one chunk, whose checksum is right.
+        """Read the messages of one chunk whose checksum is right.
 
         Args:
             order: where the reader is, moved on; then without those for viewers, which are half of a recording.
@@ -107,7 +107,7 @@ class Contents:
             yield RecordedMessage(definition, sequence, at_ns, content[begin:at], offset)
 
     def _define(self, content: bytes, at: int, channels: dict[int, Definition]) -> int:
-        """Take a channel or schema; the place after it."""
+        """Take a channel or schema; return the offset after it."""
         opcode, length = _RECORD.unpack_from(content, at)
         at += _RECORD.size
         if opcode == Opcode.CHANNEL:
@@ -161,25 +161,25 @@ class Damage:
 
 @dataclass(frozen=True)
 class EndOfFile:
-    """The file is read."""
+    """End of a file."""
 
     finished: bool  # it has its index and footer
     complete: bool  # the end of the data was there: no chunk is missing after the last one
 
 
 class _BadRecordError(Exception):
-    """What stands here is not the record that it should be."""
+    """The bytes here are not the record that is expected."""
 
 
 class _TornRecordError(_BadRecordError):
-    """The record goes on beyond the end of the file."""
+    """A record goes on beyond the end of the file."""
 
 
 Buffer = bytes | mmap.mmap
 
 
 def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
-    """Messages and damage of one file in file order, and then its `End`.
+    """Yield messages and damage of one file in file order, then its `EndOfFile`.
 
     Args:
         order: where the reader is, moved on; what was made for viewers is then looked at for its number only.
@@ -199,7 +199,7 @@ def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMess
 
 
 def last_chunk(path: Path) -> list[RecordedMessage] | None:
-    """Messages of a file's last chunk as its index tells; the others are not looked at.
+    """Return the messages of a file's last chunk, found by its index; the others are not read.
 
     Returns:
         None if the file does not end with an index and footer that are whole; nothing if the chunk is not.
@@ -219,7 +219,7 @@ def last_chunk(path: Path) -> list[RecordedMessage] | None:
 
 
 def _last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
-    """The same, by the summary at `at`, whose checksum is right."""
+    """Return the messages of the last chunk by the summary at `at`, whose checksum is right."""
     offset = length = 0
     while data[at] != Opcode.FOOTER:
         if data[at] == Opcode.CHUNK_INDEX:
@@ -282,7 +282,7 @@ def _hint(path: Path) -> str:
 
 
 def _whole(data: Buffer, at: int) -> int:
-    """Length of the record at `at`, its head included, if it may stand between chunks and is not torn."""
+    """Return the length of the record at `at` with its head, if it may stand between chunks and is not torn."""
     if at + _RECORD.size > len(data):
         raise _TornRecordError("is torn")
     opcode, length = _RECORD.unpack_from(data, at)
@@ -305,7 +305,7 @@ def _whole(data: Buffer, at: int) -> int:
 
 
 def _header_length(data: Buffer, inner: int, length: int) -> int:
-    """Length of a header record as its two strings tell; -1 if they do not fit."""
+    """Return the length of a header record by its two strings; -1 if they do not fit."""
     if length < 8:
         return -1
     (profile,) = struct.unpack_from("<I", data, inner)
@@ -315,7 +315,7 @@ def _header_length(data: Buffer, inner: int, length: int) -> int:
 
 
 def _chunk(data: Buffer, at: int, length: int) -> bytes:
-    """Content of the chunk at `at`, if its checksum is right."""
+    """Return the content of the chunk at `at`, if its checksum is right."""
     _, _, first, last, size, crc, name, inner = _CHUNK.unpack_from(data, at)
     if name != 0 or inner != length - _CHUNK.size or size != inner or first > last:
         raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
@@ -326,7 +326,7 @@ def _chunk(data: Buffer, at: int, length: int) -> bytes:
 
 
 def _next_chunk(data: Buffer, start: int) -> int | None:
-    """Offset of the next whole chunk from `start` on."""
+    """Return the offset of the next whole chunk from `start` on."""
     at = data.find(bytes([Opcode.CHUNK]), start)
     while 0 <= at <= len(data) - _CHUNK.size:
         try:
@@ -339,7 +339,7 @@ def _next_chunk(data: Buffer, start: int) -> int | None:
 
 
 def _data_end(data: Buffer) -> int | None:
-    """Offset of the end of data as the footer tells, if the footer and what it points to are whole."""
+    """Return the offset of the end of data by the footer, if the footer and what it points to are whole."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     if at < 0:
         return None
@@ -351,13 +351,13 @@ def _data_end(data: Buffer) -> int | None:
 
 
 def _crc(data: Buffer, end: int) -> int:
-    """CRC-32 of everything before `end`."""
+    """Return the CRC-32 of everything before `end`."""
     with memoryview(data) as view:
         return zlib.crc32(view[:end])
 
 
 def _summary_ok(data: Buffer, start: int) -> bool:
-    """Whether all from `start` to the end is a summary with the right checksum, footer and magic."""
+    """Return whether the bytes from `start` on are a summary with the right checksum, footer and magic."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     if at < start or data[at + _FOOTER.size :] != MAGIC:
         return False
@@ -367,7 +367,7 @@ def _summary_ok(data: Buffer, start: int) -> bool:
 
 
 def _is_torn(data: Buffer) -> bool:
-    """Whether a file without a good summary just ends too early: neither footer nor magic is where it should be."""
+    """Return whether a file without a good summary was cut short: it has neither footer nor magic at its end."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     return data[at + _FOOTER.size :] != MAGIC and _RECORD.unpack_from(data, at) != (Opcode.FOOTER, 20)
 
@@ -381,7 +381,7 @@ R = TypeVar("R", bound=Record)
 
 
 def segment_files(path: Path) -> tuple[Path, ...]:
-    """Files of a recording in order: the named one, and those that go on after a failed write.
+    """Return the files of a recording in order: the named one, and those that go on after a failed write.
 
     Raises:
         RecordingError: there is none, or the path is that of a folder.
@@ -400,7 +400,7 @@ def segment_files(path: Path) -> tuple[Path, ...]:
 
 
 def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
-    """Messages and damage of all segments; header and library that later segments repeat are marked.
+    """Yield messages and damage of all segments; header and library that later segments repeat are marked.
 
     Args:
         order: see `logs.recording.reader.scan`.
@@ -419,7 +419,7 @@ def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMess
 
 
 def read(path: Path) -> Iterator[tuple[str, int, Record]]:
-    """Topic, log time [ns] and record of each message, in file order; what was made for viewers is left out.
+    """Yield topic, log time [ns] and record of each message in file order, without messages for viewers.
 
     Raises:
         RecordingError: no recording, or damaged; names file and offset. What came before is good.
@@ -430,7 +430,7 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
 
 
 def finished(path: Path) -> bool:
-    """Whether every file of a recording was closed in order, and the last of them with the recorder's last word.
+    """Return whether every file of a recording was closed in order, the last one with the recorder's end note.
 
     Raises:
         RecordingError: there is no such recording.
@@ -439,7 +439,7 @@ def finished(path: Path) -> bool:
 
 
 def lacks_end(path: Path) -> str:
-    """Why a recording's end is not there, in words; nothing if it is.
+    """Return why a recording's end is missing, in words; empty if it is there.
 
     Only the recorder's last word says that it is: index and footer stand in a file that was full or could not be
     written on, and in one that was recovered, too.
@@ -463,12 +463,12 @@ def lacks_end(path: Path) -> str:
 
 
 def is_end(note: RecorderNote) -> bool:
-    """Whether the end of a recording is there if this is what was noted last."""
+    """Return whether a note is the last one of a whole recording."""
     return note.text.startswith(END) or (note.text.startswith(RECOVERED) and NO_END not in note.text)
 
 
 def last_note(path: Path) -> RecorderNote | None:
-    """What the recorder, or who restored the recording, said last; None where a file was not closed in order.
+    """Return the last note of the recorder, or of a recovery; None where a file was not closed in order.
 
     Raises:
         RecordingError: there is no such recording.
@@ -477,7 +477,7 @@ def last_note(path: Path) -> RecorderNote | None:
 
 
 def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
-    """The last one of a file's last chunk."""
+    """Return the last note in a file's last chunk."""
     for message in reversed(end or []):
         if message.definition.topic == RECORDER:
             note = decode(RECORDER, message.data, message.at_ns)
@@ -487,7 +487,7 @@ def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
 
 
 def records(path: Path, kind: type[R]) -> Iterator[R]:
-    """The records of one type, in file order.
+    """Yield the records of one type in file order.
 
     Raises:
         RecordingError: as `read`.
@@ -501,7 +501,7 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
 
 
 def header(path: Path) -> Header:
-    """The recording's header.
+    """Return the header of a recording.
 
     Raises:
         RecordingError: as `read`, or it has none.
@@ -512,7 +512,7 @@ def header(path: Path) -> Header:
 
 
 def good_messages(path: Path) -> Iterator[RecordedMessage]:
-    """The messages themselves, also of topics that this version does not know; no repetitions, nothing for viewers.
+    """Yield the messages, also of topics unknown to this version, without repetitions and those for viewers.
 
     Raises:
         RecordingError: as `read`.
@@ -533,7 +533,7 @@ def _is(topic: str, kind: type[Record]) -> bool:
 
 
 def _continues(path: Path) -> bool:
-    """Whether a file goes on with another one (and is no recording of its own with such a name)."""
+    """Return whether a file is followed by another one of the same recording."""
     for count, item in enumerate(scan(path)):
         if not isinstance(item, RecordedMessage):
             return True  # empty or damaged: better told than passed over

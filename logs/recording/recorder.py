@@ -1,4 +1,4 @@
-"""A recording's bounded queue: what is taken from it, what is made beside it for viewers, and what is noted.
+"""Recorder: a bounded queue of records, the messages for viewers made beside them, and notes on what was lost.
 
 A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
 wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and recording
@@ -44,15 +44,15 @@ Watcher = Callable[[Definition, int, bytes], None]
 
 
 class ViewMaker(Protocol):
-    """Makes messages for viewers; `logs.recording.views.Views` is one."""
+    """Interface of what makes messages for viewers, as `logs.recording.views.Views`."""
 
     def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-        """Topic and message of all that a record gives rise to."""
+        """Return topic and message of all that is derived from a record."""
         ...
 
 
 class DerivedTopics:
-    """Makes what is written beside a record, and shows both.
+    """Derives messages for viewers from records, and passes both on to a watcher.
 
     Args:
         views: makes the messages for viewers; None: there are none.
@@ -70,7 +70,7 @@ class DerivedTopics:
         self.reason = ""
 
     def beside(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
-        """Topic, log time [ns] and message of all that goes beside a record, whose own message is `data`."""
+        """Return topic, log time [ns] and message of all that is derived from a record, whose message is `data`."""
         made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
         if self._watch is not None:
             for name, time_ns, message in ((topic, at_ns, data), *made):
@@ -94,7 +94,7 @@ LAST_TRIES = 3  # files that closing may begin on a failing disk
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """How a recorder is doing."""
+    """State of a recorder."""
 
     ok: bool  # the disk takes records, and none was lost
     written: int  # records on the disk
@@ -113,7 +113,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WriteQueue:
-    """What comes out of a bounded queue goes into files; nothing raises once it is made.
+    """Writes the records of a bounded queue into files; once it is made, nothing raises.
 
     `drop` and `status` may be called, and `queue` appended to, beside a thread that runs the other methods.
 
@@ -173,7 +173,7 @@ class WriteQueue:
             self._dropped += 1
 
     def drain(self, records: int, views: int) -> None:
-        """Write up to so many of the waiting records; once a second see to it that the disk has them.
+        """Write up to `records` waiting records, and once a second wait until the disk has them.
 
         Args:
             views: records whose messages for viewers are made then, these or earlier ones.
@@ -219,7 +219,7 @@ class WriteQueue:
         self.finished = True
 
     def status(self) -> RecorderStatus:
-        """How it is doing."""
+        """Return the state of the recorder."""
         files = self._files
         parts = files.parts()
         waiting = len(self.queue) + files.open_messages
@@ -251,7 +251,7 @@ class WriteQueue:
         )
 
     def _ready(self) -> bool:
-        """Whether there is a file to write to; begins one if something waits for it."""
+        """Return whether there is a file to write to; one is begun if something waits for it."""
         files = self._files
         if files.is_open and not files.is_full:
             return True
@@ -267,7 +267,7 @@ class WriteQueue:
         return True
 
     def _rest(self) -> None:
-        """Close the file in order while the disk has room for that."""
+        """Close the file in order while the disk still has room for that."""
         if not self._room.resting or self.closed:
             return
         self._files.reason = self._room.text
@@ -292,7 +292,7 @@ class WriteQueue:
             self._files.commit()
 
     def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
-        """Write what viewers want beside a record."""
+        """Write the messages for viewers that are derived from a record."""
         self._files.unwritten.extend(self._onlookers.beside(topic, at_ns, record, data))
         self._files.write_unwritten()
 
@@ -304,7 +304,7 @@ class WriteQueue:
             self._tell_note(f"disk {'gets low' if self._told_low else 'has room again'}: {self._room.text}")
 
     def _tell_note(self, text: str) -> None:
-        """Write a note that those who look on see, too."""
+        """Write a note, which watchers see too."""
         note = self._write_note(text)
         self._show(RECORDER, note.at_ns, note, encode(note))
 
@@ -344,7 +344,7 @@ STOP_S = 1.0  # for viewers to take their leave
 
 @contextmanager
 def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: None) -> Iterator[Watcher | None]:
-    """Serve every message that the watcher is given, but raw bytes and the policy library.
+    """Serve every message that the watcher is given to viewers, without raw bytes and the policy library.
 
     Args:
         port: TCP port on the loopback address, 0 for a free one; None: nobody looks, and nothing is imported.
@@ -417,7 +417,7 @@ BACKLOG_SHARE = 8
 
 
 class _Base:
-    """A journal and how it is begun; arguments and errors are those of `WriteQueue`."""
+    """Base of the recorders: a write queue and its begin; arguments and errors are those of `WriteQueue`."""
 
     def __init__(
         self,
@@ -446,7 +446,7 @@ class _Base:
             self._journal.drop()
 
     def _begin(self) -> None:
-        """What has to run beside the journal."""
+        """Start what runs beside the queue."""
         return
 
 
@@ -466,7 +466,7 @@ class SyncRecorder(_Base):
         return self.status()
 
     def status(self) -> RecorderStatus:
-        """How it is doing."""
+        """Return the state of the recorder."""
         return self._journal.status()
 
 
@@ -478,7 +478,7 @@ class Recorder(_Base):
     """
 
     def catch_up(self) -> None:
-        """Begin a round now: right after a tick, when the control loop has the longest time until it needs anything."""
+        """Begin a round now: right after a tick, when the control loop has the longest time until the next one."""
         self._due.set()
 
     def _begin(self) -> None:
@@ -496,7 +496,7 @@ class Recorder(_Base):
         return self.status()
 
     def status(self) -> RecorderStatus:
-        """How it is doing."""
+        """Return the state of the recorder."""
         status = self._journal.status()
         return msgspec.structs.replace(status, ok=status.ok and (self._thread.is_alive() or self._journal.closed))
 
@@ -510,5 +510,5 @@ class Recorder(_Base):
 
 
 def portion(waiting: int, at_once: int) -> int:
-    """How many of `waiting` are taken in a round: up to `at_once`, or a share of a large backlog."""
+    """Return how many of `waiting` records are taken in a round: `at_once`, or a share of a large backlog."""
     return max(at_once, waiting // BACKLOG_SHARE)

@@ -1,4 +1,4 @@
-"""Restores what a torn or damaged recording still holds into a clean one."""
+"""Recovery of a torn or damaged recording into a clean one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHUNK_BYTES = 16384
 
 
 class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What was restored, and what was not."""
+    """Numbers of what was restored, and what was lost."""
 
     messages: int  # restored
     messages_lost: int  # by their running numbers; those after the last restored one cannot be known
@@ -34,7 +34,7 @@ class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Tally:
-    """Counts losses while the messages go by."""
+    """Counter of losses, fed message by message."""
 
     def __init__(self) -> None:
         self.messages = 0

@@ -1,4 +1,4 @@
-"""Replay: a recording's inputs through the same control loop, everything that it says compared.
+"""Replay: a recording's inputs go through the same control loop, and all its output is compared.
 
 The raw bytes go through parser, clock offset and frames again; the ticks through the same
 `step()`. Each record that comes out (step inputs, estimates, plans, decisions, setpoints, bytes
@@ -71,7 +71,7 @@ _STAGE = {"inputs": "stage", "states": "stage", "backoff_x": "stage", "backoff_u
 
 
 class ReplayDifference(msgspec.Struct, frozen=True, kw_only=True):
-    """One place where recording and replay part."""
+    """First difference of recording and replay."""
 
     topic: str
     at_ns: int  # log time
@@ -88,7 +88,7 @@ class ReplayDifference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Chosen(msgspec.Struct, frozen=True, kw_only=True):
-    """What a tick decided."""
+    """Decision of a tick: mode, plan and input."""
 
     mode: str
     age_steps: int | None
@@ -99,7 +99,7 @@ class Chosen(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Context(msgspec.Struct, frozen=True, kw_only=True):
-    """The tick of the first difference: what came before, what it was given, what it decided."""
+    """Tick of the first difference: what came before, its inputs, its decisions."""
 
     decisions_before: int  # identical ones
     records_before: int  # of those compared, likewise
@@ -115,7 +115,7 @@ class Context(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FieldDivergence(msgspec.Struct, frozen=True, kw_only=True):
-    """One field from the first difference on; entries of a vector are taken together."""
+    """Difference of one field from the first one on; entries of a vector are taken together."""
 
     topic: str
     field: str  # empty: there is a record on one side only
@@ -129,7 +129,7 @@ class FieldDivergence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FieldNames:
-    """Names and units of fields, as far as they are known.
+    """Names and units of recorded fields, as far as they are known.
 
     Args:
         plant: of the controller; its states and inputs have names.
@@ -143,7 +143,7 @@ class FieldNames:
         )
 
     def meaning(self, topic: str, path: str) -> tuple[str, str]:
-        """What a leaf is, and its unit; either may be empty."""
+        """Return the meaning of a leaf, and its unit; either may be empty."""
         numbers = [int(one) for one in _NUMBER.findall(path)]
         name = plain(path)
         if not numbers:
@@ -158,7 +158,7 @@ class FieldNames:
 
 
 def plain(path: str) -> str:
-    """A path without numbers of entries."""
+    """Return a path without the indices of entries."""
     return _NUMBER.sub("", path)
 
 
@@ -167,12 +167,12 @@ def _unit(name: str) -> str:
 
 
 def stage(topic: str) -> str:
-    """What comes into question if this topic is the first that differs."""
+    """Return which stage of a tick is in question if this topic is the first to differ."""
     return _SAID_BY.get(topic, _SENT if raw_link(topic) is not None else "")
 
 
 def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
-    """Leaves where two records of a topic differ in any bit."""
+    """Return the leaves in which two records of a topic differ in any bit."""
     return list(_unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed), ""))
 
 
@@ -194,20 +194,20 @@ def _same_bits(left: object, right: object) -> bool:
 
 
 def close(left: object, right: object, tolerance: float) -> bool:
-    """Whether two leaves that differ count as the same: numbers, relative to the larger of 1 and their size."""
+    """Return whether two leaves that differ count as the same: numbers, relative to the larger of 1 and their size."""
     if not isinstance(left, int | float) or not isinstance(right, int | float) or tolerance == 0.0:
         return False
     return math.isclose(left, right, rel_tol=tolerance, abs_tol=tolerance)
 
 
 def change(recorded: object, replayed: object) -> float | None:
-    """Difference of two numbers; None of anything else."""
+    """Return the difference of two numbers; None of anything else."""
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (recorded, replayed))
     return float(replayed - recorded) if numbers else None  # type: ignore[operator]  # both are numbers
 
 
 def brief(record: Record | None) -> str:
-    """A record in a few words."""
+    """Return a record in a few words."""
     match record:
         case None:
             return NOTHING
@@ -220,7 +220,7 @@ def brief(record: Record | None) -> str:
 
 
 def chosen(record: Record | None) -> Chosen | None:
-    """What a decision says."""
+    """Return what a decision chose."""
     if not isinstance(record, Decision):
         return None
     return Chosen(
@@ -236,7 +236,7 @@ def chosen(record: Record | None) -> Chosen | None:
 def context(
     inp: StepInput, decisions_before: int, records_before: int, recorded: Record | None, replayed: Record | None
 ) -> Context:
-    """The tick `inp` and the decisions that it led to."""
+    """Return the inputs of the tick `inp`, and the decisions that it led to."""
     newest: PositionSample | None = max(inp.samples, key=lambda one: one.captured_ns, default=None)
     return Context(
         decisions_before=decisions_before,
@@ -277,7 +277,7 @@ MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "met
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a replay found; the four before the last are there if there is a difference."""
+    """Result of a replay; the four fields before the last are there if there is a difference."""
 
     decisions: int
     compared: int
@@ -291,7 +291,7 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def recorded_library(path: Path) -> PolicyLibrary:
-    """The policy library that a recording was flown with.
+    """Return the policy library that a recording was flown with.
 
     Raises:
         RecordingError: it cannot be read, or carries none.
@@ -305,7 +305,7 @@ def recorded_library(path: Path) -> PolicyLibrary:
 
 
 class _Produced:
-    """Sink that keeps what the replayed loop says until the recording's word is read."""
+    """Sink that keeps the replayed loop's output until the recorded one is read."""
 
     def __init__(self) -> None:
         self.waiting: deque[tuple[str, int, Record]] = deque()
@@ -315,7 +315,7 @@ class _Produced:
             self.waiting.append((topic, at_ns, record))
 
     def take(self, topic: str, at_ns: int) -> Record | None:
-        """The next record said under this topic and time."""
+        """Return the next replayed record of this topic and time."""
         for place, (its_topic, its_ns, record) in enumerate(self.waiting):  # nearly always the first
             if its_ns == at_ns and its_topic == topic:
                 del self.waiting[place]
@@ -323,7 +323,7 @@ class _Produced:
         return None
 
     def unsaid(self) -> list[tuple[str, int, Record]]:
-        """What the loop has said and the recording has not; it is forgotten."""
+        """Return and forget the replayed records that the recording does not have."""
         found = [*self.waiting]
         self.waiting.clear()
         return found
@@ -331,7 +331,7 @@ class _Produced:
 
 @dataclass
 class _Field:
-    """How one field's difference goes on."""
+    """Course of one field's difference."""
 
     first_s: float
     before: int  # records of its topic before it differed
@@ -350,7 +350,7 @@ class _Field:
 
 @dataclass
 class _Findings:
-    """What has been compared, and where it parts."""
+    """Comparison so far, and where the two part."""
 
     places: FieldNames
     tolerance: float
@@ -369,17 +369,17 @@ class _Findings:
     _records: dict[str, int] = field(default_factory=lambda: defaultdict(int))  # by topic, since the first difference
 
     def begin(self, inp: StepInput) -> None:
-        """A tick begins."""
+        """Begin a tick."""
         self._tick = inp
         self._begun_ns = inp.at_ns if self._begun_ns is None else self._begun_ns
 
     def same(self, topic: str) -> None:
-        """Take one record that is alike, while all were."""
+        """Count one record that is alike, while all so far were."""
         self.compared += 1
         self.decisions += topic == DECISION
 
     def compare(self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None) -> None:
-        """Take one record of the recording and what the loop says in its place; either may be missing."""
+        """Compare a recorded record with the replayed one; either may be missing."""
         parts: list[Leaf] = []
         if recorded is not None and replayed is not None and not alike(recorded, replayed):
             parts = [
@@ -433,7 +433,7 @@ class _Findings:
             known.add(those, at_s)
 
     def result(self, *, finished: bool) -> ReplayResult:
-        """All of it; of a recording with an end it is to be more than nothing."""
+        """Return the result; a recording that claims an end must hold more than nothing."""
         return ReplayResult(
             decisions=self.decisions,
             compared=self.compared,
@@ -468,7 +468,7 @@ def replay(
     finished: bool = True,
     ignored: Labels = frozenset(),
 ) -> ReplayResult:
-    """Drive a loop with the recorded inputs and compare all that it says, and that it says no more.
+    """Drive a loop with the recorded inputs, and compare its whole output with the recorded one.
 
     Args:
         messages: (topic, log time [ns], record or the bytes that it is recorded as) in the order of recording.
@@ -523,7 +523,7 @@ def _is_compared(topic: str) -> bool:
 
 @cache
 def _is_input(topic: str) -> bool:
-    """Whether the loop is driven by what is recorded here, or the result tells it."""
+    """Return whether a topic is not compared: its records drive the loop, or the result reports them."""
     link = raw_link(topic)
     try:
         return record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]

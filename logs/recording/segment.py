@@ -1,4 +1,4 @@
-"""One MCAP file of a recording, written a chunk at a time.
+"""Segment: one MCAP file of a recording, written chunk by chunk.
 
 Every chunk is one write of the operating system, so that a process killed between two of them
 leaves whole chunks only. Every chunk repeats the channels that it uses, so that it can be read when
@@ -58,7 +58,7 @@ class QueuedMessage(NamedTuple):
 
 
 class _Channel(NamedTuple):
-    """A topic's channel."""
+    """Channel of a topic."""
 
     number: int
     record: bytes
@@ -89,7 +89,7 @@ class Segment:
 
     @property
     def records(self) -> int:
-        """Messages on the disk that were not made for viewers."""
+        """Messages on the disk, without those for viewers."""
         counts = self._counts.copy()
         return sum(counts[one.number] for topic, one in [*self._channels.items()] if not is_view(topic))
 
@@ -169,7 +169,7 @@ class Segment:
         self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
 
     def _new_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
-        """Channel of a new topic, and what must be before its first message."""
+        """Return the channel of a new topic, and the records that must stand before its first message."""
         schema = self._schemas.get(definition.schema_name)
         head = b""
         if schema is None and definition.schema_encoding != "":
@@ -237,7 +237,7 @@ class Segment:
         self._begin_chunk()
 
     def _tail(self) -> bytes:
-        """End of the data, summary, footer."""
+        """Return the bytes that end a file: end of data, summary, footer."""
         prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
         data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
         start = self.bytes + len(data_end)
@@ -295,7 +295,7 @@ RETRY_S = 1.0  # between tries to begin a file after a failed write
 
 
 class _SegmentPart(NamedTuple):
-    """A file with what was written to it."""
+    """A closed file with the number of messages and bytes in it."""
 
     path: Path
     messages: int
@@ -304,7 +304,7 @@ class _SegmentPart(NamedTuple):
 
 
 class Rotation:
-    """Writer of a recording's files.
+    """Writer of a recording's files, one after another.
 
     Args:
         clock: wall time [s].
@@ -349,7 +349,7 @@ class Rotation:
 
     @property
     def name(self) -> str:
-        """Of the file that is open, or comes next."""
+        """Name of the file that is open, or comes next."""
         return segment_path(self._path, self.number).name
 
     @property
@@ -360,7 +360,7 @@ class Rotation:
 
     @property
     def is_full(self) -> bool:
-        """Whether the open file has its bytes beside what every file begins with."""
+        """Whether the open file has reached its size, not counting what every file begins with."""
         return self._segment is not None and self._segment.bytes >= self._log.segment_bytes + self._repeats_bytes
 
     @property
@@ -370,19 +370,19 @@ class Rotation:
 
     @property
     def open_messages(self) -> int:
-        """Messages that are in memory only."""
+        """Number of messages that are in memory only."""
         segment = self._segment
         return len(self.unwritten) + (0 if segment is None else len(segment.open_entries))
 
     def parts(self) -> list[tuple[Path, int, int]]:
-        """Files with at least one chunk: path, messages and bytes on the disk."""
+        """Return the files with at least one chunk: path, messages and bytes on the disk."""
         segment, done = self._segment, [*self._done]
         if segment is not None and segment.bytes:
             done.append(self._part(segment))
         return [(one.path, one.messages, one.bytes) for one in done]
 
     def look(self) -> None:
-        """See whether what was written is still where it was made.
+        """Check that the files written so far are still where they were made.
 
         Raises:
             OSError: the open file is not; closed ones are remembered as gone.
@@ -395,7 +395,7 @@ class Rotation:
             raise FileNotFoundError(errno.ENOENT, "the file was deleted, moved or replaced", self.name)
 
     def try_again(self) -> None:
-        """A file may be begun at once."""
+        """Allow that a file is begun at once."""
         self._retry_s = self._clock()
 
     def begin(self, tell: Callable[[str], object]) -> None:
@@ -437,7 +437,7 @@ class Rotation:
         self.write(topic, at_ns, data)
 
     def write_unwritten(self) -> None:
-        """Add what has to go first.
+        """Write the messages that must go first into the new file.
 
         Raises:
             OSError: as `write`.
@@ -472,7 +472,7 @@ class Rotation:
         self._retire(segment, there=self._is_there(segment))
 
     def fail(self, error: OSError) -> None:
-        """After a failed write: keep what the open chunk held, and close the file as well as possible."""
+        """Handle a failed write: keep the messages of the open chunk, and close the file as well as possible."""
         self.failures += 1
         self.reason = str(error)
         self.because = f"after a failed write: {self.reason}"

@@ -1,4 +1,4 @@
-"""Summary: figures of a flight; how it ended."""
+"""Summary: figures of a flight, and how it ended."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _IN_FLIGHT = {
 
 
 def ending_of(flight: FlightData) -> Ending:
-    """How a flight ended; older recordings, torn ones and parts of a flight do not say it themselves."""
+    """Return how a flight ended: as recorded, else by its records, as in older, torn and partial recordings."""
     if flight.endings:
         return flight.endings[-1]
     cause = _cause(flight)
@@ -67,7 +67,7 @@ def _sentence(flight: FlightData, cause: Cause) -> str:
 
 
 def _hand_over(flight: FlightData) -> str:
-    """What the controller did after the operator's stop."""
+    """Return in words what the controller did after the operator's stop."""
     modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
     if ControlMode.LAND in modes:
         return "the vehicle was handed over to its own landing"
@@ -84,7 +84,7 @@ def _seconds(flight: FlightData, at_ns: int) -> str:
 
 
 def limits_at(flight: FlightData, t_s: Floats) -> Floats:
-    """Right sides of the state set's rows (n, m_x) at times of the report (n,) [s]."""
+    """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
     limits = np.tile(np.array(design.b_x), (len(t_s), 1))
     for fence in _fences(flight):
@@ -98,7 +98,7 @@ def limits_at(flight: FlightData, t_s: Floats) -> Floats:
 
 
 def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
-    """Axis-parallel limits of the states, lower and upper (n, n_x); infinite where a side is open."""
+    """Return the axis-parallel limits of the states, lower and upper (n, n_x); infinite where a side is open."""
     design, limits = flight.design, limits_at(flight, t_s)
     sides = []
     box: Box = design.state_box
@@ -112,7 +112,7 @@ def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
 
 
 def _fences(flight: FlightData) -> Iterator[FenceConfig]:
-    """Fences of the configuration that the flight was made with; none if it cannot be read any more."""
+    """Return the fences of the flight's configuration; none if it cannot be read any more."""
     try:
         found = tomllib.loads(flight.header.config_toml).get("fence", [])
         yield from msgspec.convert(found, tuple[FenceConfig, ...])
@@ -193,7 +193,7 @@ def summarise(
     recorder_dropped: int = 0,
     ending: Ending | None = None,
 ) -> FlightSummary:
-    """Figures of a flight.
+    """Compute the figures of a flight.
 
     `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day, and so
     is `ending`, which the recording tells then.
@@ -251,7 +251,7 @@ def summarise(
 
 
 def _position_std_m(flight: FlightData) -> float | None:
-    """Largest standard deviation of the position at the last flown boundary, by the estimate itself [m]."""
+    """Return the largest standard deviation of the position at the last flown boundary, by the estimate [m]."""
     if flight.last_flown is None:
         return None
     index = list(flight.design.position_index)
@@ -260,7 +260,7 @@ def _position_std_m(flight: FlightData) -> float | None:
 
 
 def predicted_only(summary: FlightSummary) -> str:
-    """Why the last distance is a prediction, and how far it is trusted; empty where a position is behind it."""
+    """Return in words that the last distance is a prediction, and how uncertain; empty after a recent position."""
     s = summary
     if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
         return ""
@@ -269,7 +269,7 @@ def predicted_only(summary: FlightSummary) -> str:
 
 
 def _channel(flight: FlightData) -> tuple[int, int | None]:
-    """Positions that the simulated channel brought and lost, in this part of the flight; 0 and None without one."""
+    """Return the positions that the simulated channel delivered and lost in this recording; 0 and None without one."""
     if not flight.truths:
         return 0, None
     first, last = flight.truths[0], flight.truths[-1]
@@ -278,7 +278,7 @@ def _channel(flight: FlightData) -> tuple[int, int | None]:
 
 
 def _methods(s: FlightSummary) -> str:
-    """How plans were found, and how far from the optimum the worst is certified to be."""
+    """Return the number of plans by method, and the largest certified gap to the optimum."""
     if not s.methods:
         return "none"
     certified = "" if s.largest_gap is None else f"; certified gap at most {percent_above(s.largest_gap)} of the cost"
@@ -286,19 +286,19 @@ def _methods(s: FlightSummary) -> str:
 
 
 def position_error_m(flight: FlightData) -> Floats:
-    """Distance from the target of the moment at each flown boundary (n,) [m]."""
+    """Return the distance from the target of the moment at each flown boundary (n,) [m]."""
     index = list(flight.design.position_index)
     return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
 
 
 def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which flown boundaries have the state outside its set or beyond a fence (n,); no number is outside."""
+    """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside."""
     limits = limits_at(flight, flight.steps.t_s)
     return _outside(flight.steps.state, flight.design.c_x, limits, RELATIVE_TOLERANCE)
 
 
 def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which flown boundaries have the input, as decided or as applied, outside its set (n,)."""
+    """Return at which flown boundaries the input, as decided or as applied, violates its set (n,)."""
     design, steps = flight.design, flight.steps
     given = ~np.isnan(steps.decided).any(axis=1)
     outside = given & _outside(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
@@ -308,14 +308,14 @@ def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool
 
 
 def decision_times_us(flight: FlightData) -> Floats:
-    """Time in the core (n,) [µs] of the ticks that solved; of all ticks if none did."""
+    """Return the computing time (n,) [µs] of the ticks that solved; of all ticks if none did."""
     solved = {d.tick for d in flight.decisions if d.solve is not None}
     times = [timing.step_ns for timing in flight.timings if timing.tick in solved]
     return np.array(times or [timing.step_ns for timing in flight.timings]) * 1e-3
 
 
 def spread(values_us: Floats) -> Percentiles:
-    """Median, 99th percentile and maximum."""
+    """Return median, 99th percentile and maximum."""
     if not len(values_us):
         return Percentiles()
     p50, p99 = np.percentile(values_us, [50, 99])
@@ -324,7 +324,7 @@ def spread(values_us: Floats) -> Percentiles:
 
 
 def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
-    """The summary as a table for a terminal, followed by other (name, value)."""
+    """Return the summary as a table for a terminal, followed by further (name, value)."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
@@ -334,7 +334,7 @@ def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Tabl
 
 
 def rows(summary: FlightSummary) -> list[tuple[str, str]]:
-    """The summary as (name, value) for people."""
+    """Return the summary as (name, value)."""
     s = summary
     lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
     seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
@@ -394,7 +394,7 @@ def _times(times: Percentiles) -> str:
 
 
 def count(amount: int, noun: str) -> str:
-    """An amount with its noun, e.g. "1 step"."""
+    """Return an amount with its noun, e.g. "1 step"."""
     return f"{amount} {noun}{'' if amount == 1 else 's'}"
 
 
@@ -407,14 +407,14 @@ def _fallback_entries(flight: FlightData) -> int:
 def _outside(
     values: Floats, c: Matrix, b: Vector | Floats, tolerance: float
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Rows of `values` (n, m) outside {v | c v <= b}, b one for all or for each, by more than a relative tolerance."""
+    """Return which rows of `values` (n, m) violate {v | c v <= b} by more than a relative tolerance."""
     normals = np.array(c).reshape(-1, values.shape[1])
     limit = np.array(b)
     return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
 
 
 def _cost(flight: FlightData) -> float:
-    """Closed-loop cost (3), summed over the flown boundaries."""
+    """Return the closed-loop cost (3), summed over the flown boundaries."""
     design, steps = flight.design, flight.steps
     x = steps.state - steps.target
     u = steps.input

@@ -1,4 +1,4 @@
-""".tlog: read, written, replayed; clocks of other programs."""
+"""Files `.tlog` of MAVLink: read, written, replayed; clocks of other programs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TOLD_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
 
 
 class SteadyClock:
-    """Times that go on where the recorder's clock leaps.
+    """Clock that goes on steadily where the stamps of a recording leap.
 
     After a leap time goes on from the last one before it. When the stamps come back to what they were (a single one
     was wrong), so do the times. A stamp of zero among others is none: the time is that of the last.
@@ -48,11 +48,11 @@ class SteadyClock:
         self._farthest_ns = self._silence_ns = 0
 
     def expects(self, stamp_ns: int) -> bool:
-        """Whether a stamp may follow the others without a leap; not before the first."""
+        """Return whether a stamp may follow the others without a leap; not before the first."""
         return self._fitting(stamp_ns) is not None
 
     def steady(self, stamp_ns: int) -> int:
-        """The time of what was stamped so, in the order of the recording [ns]."""
+        """Return the steady time of a stamp [ns]; stamps come in the order of the recording."""
         self._stamps += 1
         self._zeros += stamp_ns == 0
         if self._last_ns is None:
@@ -74,7 +74,7 @@ class SteadyClock:
         return at_ns
 
     def check(self, name: str) -> None:
-        """Refuse stamps that say nothing.
+        """Refuse stamps that carry no time.
 
         Raises:
             RecordingError: There are several, and all are zero.
@@ -83,7 +83,7 @@ class SteadyClock:
             raise RecordingError(f"{name}: all {self._stamps} time stamps are zero, so nobody knows what came when")
 
     def notes(self, name: str) -> tuple[str, ...]:
-        """What was odd about the stamps, in sentences."""
+        """Return sentences on what was odd about the stamps."""
         found = []
         if self._leaps:
             found.append(
@@ -99,7 +99,7 @@ class SteadyClock:
         return tuple(found)
 
     def _fitting(self, stamp_ns: int) -> int | None:
-        """Which of the last two offsets a stamp goes with [ns]; None if neither."""
+        """Return which of the last two offsets a stamp fits [ns]; None if neither."""
         if self._last_ns is None:
             return None
         for offset_ns in (self._offset_ns, self._former_ns):
@@ -120,7 +120,7 @@ _LAST_STAMP_US = 2**63 // 1000  # later ones have no place in 64 bits of nanosec
 
 @dataclass(frozen=True)
 class TlogPacket:
-    """One packet; `outgoing` is guessed from its system id (a ground station's counts as ours)."""
+    """One packet; `outgoing` is guessed from its system id (one of a ground station counts as sent by us)."""
 
     at_ns: int  # since the epoch, up to a leap of the recorder's clock
     data: bytes
@@ -129,7 +129,7 @@ class TlogPacket:
 
 @dataclass(frozen=True)
 class Tlog:
-    """Packets of a `.tlog` in order of time, and what of the file they are not."""
+    """Packets of a `.tlog` in order of time, and what was left out of the file."""
 
     packets: tuple[TlogPacket, ...]
     torn_bytes: int  # of an unfinished packet at the end
@@ -141,7 +141,7 @@ class Tlog:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was left out, and what was odd about the clock, in sentences."""
+        """Sentences on what was left out, and what was odd about the clock."""
         found = list(self.clock_notes)
         if self.skipped_bytes:
             found.append(f"{count(self.skipped_bytes, 'byte')} between its packets left out: no packet with a stamp")
@@ -151,7 +151,7 @@ class Tlog:
 
 
 def read_tlog(path: Path) -> Tlog:
-    """All packets of a file; unknown message ids are kept, checksums are the parser's affair.
+    """Read all packets of a file; unknown message ids and bad checksums are left to the parser.
 
     Raises:
         RecordingError: The file cannot be read, holds no packet, or no time stamp but zero.
@@ -183,7 +183,7 @@ def read_tlog(path: Path) -> Tlog:
 
 
 def frame_length(data: bytes, at: int) -> int:
-    """Bytes of the frame that begins at `at`, by its head; 0 if none does."""
+    """Return the length of the frame that begins at `at` by its head [bytes]; 0 if none does."""
     if at + 3 > len(data):
         return 0
     if data[at] == _STX_V2:
@@ -194,18 +194,18 @@ def frame_length(data: bytes, at: int) -> int:
 
 
 def packet_of(at_ns: int, data: bytes) -> TlogPacket:
-    """A packet with its direction guessed; one that is too short to name a system is taken for incoming."""
+    """Return a packet with its direction guessed; one too short to name a system counts as incoming."""
     place = 5 if data[0] == _STX_V2 else 3
     return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > place and data[place] in GROUND_SYSTEMS)
 
 
 def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
-    """The packets in order of time; those of the same time as they were."""
+    """Return packets in order of time; those of the same time keep their order."""
     return tuple(sorted(packets, key=lambda packet: packet.at_ns))
 
 
 def is_frame(data: bytes) -> bool:
-    """Whether bytes are one frame of a known id with the right checksum."""
+    """Return whether bytes are one frame of a known id with the right checksum."""
     frames = scan(data, final=True).frames
     return len(frames) == 1 and len(frames[0].data) == len(data)
 
@@ -215,7 +215,7 @@ def _stamp_us(data: bytes, at: int) -> int:
 
 
 def _believed(data: bytes, at: int, end: int) -> bool:
-    """Whether a packet is one whose stamp does not go with the last: by its checksum, or by the packet after it."""
+    """Return whether a packet with an unexpected stamp is real: by its checksum, or by the packet after it."""
     if end > len(data) or _stamp_us(data, at) >= _LAST_STAMP_US:
         return False
     if is_frame(data[at + _STAMP.size : end]):
@@ -233,7 +233,7 @@ _OUT_OF_ORDER_NS = 1_000_000_000  # packets are put in order of time over such a
 
 
 class ExportedTlog(msgspec.Struct, frozen=True, kw_only=True):
-    """What was written of a recording."""
+    """Result of an export as `.tlog`."""
 
     file: str
     packets: dict[str, int]  # by connection and direction
@@ -271,7 +271,7 @@ def export_tlog(
 
 
 class _Raw:
-    """Cuts the raw bytes of connections into packets.
+    """Cutter of the raw bytes of connections into packets.
 
     Args:
         streams: connections that carry a stream of bytes, whose chunks end anywhere.
@@ -285,11 +285,11 @@ class _Raw:
 
     @property
     def left_out_bytes(self) -> int:
-        """Bytes so far that were no packet."""
+        """Return the number of bytes so far that were no packet."""
         return self._skipped_bytes + sum(map(len, self._rest.values()))
 
     def packets(self, messages: Iterable[RecordedMessage], wanted: str | None) -> Iterator[tuple[int, str, bytes]]:
-        """Time [ns], topic and bytes of each packet of the wanted connection, or of all."""
+        """Yield time [ns], topic and bytes of each packet of the wanted connection, or of all."""
         for message in messages:
             topic = message.definition.topic
             raw = raw_link(topic)
@@ -317,7 +317,7 @@ class _Raw:
 
 
 def _packet_end(data: bytes, at: int) -> int | None:
-    """Where the packet that begins at `at` ends; `at` if none does, None if it goes on beyond the data.
+    """Return where the packet that begins at `at` ends; `at` if none does, None if it goes on beyond the data.
 
     It is believed to be one if another follows, or nothing; else only by its checksum.
     """
@@ -333,7 +333,7 @@ def _packet_end(data: bytes, at: int) -> int | None:
 
 
 def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, bytes]]:
-    """The packets in order of time: what comes in and what goes out is recorded each by itself."""
+    """Yield the packets in order of time: incoming and outgoing bytes are recorded separately."""
     waiting: list[tuple[int, int, str, bytes]] = []
     for number, (at_ns, topic, packet) in enumerate(packets):
         heapq.heappush(waiting, (at_ns, number, topic, packet))
@@ -344,7 +344,7 @@ def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, 
 
 
 def _began_us(flight: Path, first: Header) -> int:
-    """When the recording began [µs since the epoch]."""
+    """Return when the recording began [µs since the epoch]."""
     try:
         began = datetime.fromisoformat(first.started_utc)
     except ValueError as error:
@@ -353,7 +353,7 @@ def _began_us(flight: Path, first: Header) -> int:
 
 
 def _streams(first: Header) -> frozenset[str]:
-    """Connections that carry a stream of bytes, by the configuration that was flown with."""
+    """Return the connections that carry a stream of bytes, by the configuration that was flown."""
     try:
         urls = tomllib.loads(first.config_toml).get("daemon", {})
     except tomllib.TOMLDecodeError:
@@ -365,7 +365,7 @@ def _streams(first: Header) -> frozenset[str]:
 
 
 class DelayQuantiles(msgspec.Struct, frozen=True, kw_only=True):
-    """Spread of a figure."""
+    """Quantiles of a delay."""
 
     min: float
     p05: float
@@ -375,7 +375,7 @@ class DelayQuantiles(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ForeignReplay(msgspec.Struct, frozen=True, kw_only=True):
-    """What the controller made of somebody else's recording."""
+    """Result of a replay of another program's recording."""
 
     datagrams: int
     positions: int
@@ -392,7 +392,7 @@ class ForeignReplay(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Collector:
-    """Sink that keeps the figures and forgets the records."""
+    """Sink that keeps the figures and drops the records."""
 
     def __init__(self) -> None:
         self.samples: list[PositionSample] = []

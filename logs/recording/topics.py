@@ -1,4 +1,4 @@
-"""The topics of a recording: one row each.
+"""Topics of a recording, one row each.
 
 Raw MAVLink bytes have one topic a connection and direction; everything else is one record type, written as JSON with
 its JSON Schema. Beside these stand the topics made for viewers, as protobuf (`logs.recording.derived_topics`);
@@ -70,7 +70,7 @@ class RecorderNote(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Definition:
-    """How a topic is written: message encoding, and a schema unless the bytes speak for themselves."""
+    """Encoding of a topic's messages, and their schema unless the bytes need none."""
 
     topic: str
     encoding: str
@@ -94,7 +94,7 @@ class Topic:
 
     @cached_property
     def definition(self) -> Definition:
-        """Encoding and JSON Schema; the schema's top level is the object itself, as viewers want it."""
+        """Return encoding and JSON Schema; the schema's top level is the object itself, as viewers want it."""
         return Definition(
             topic=self.name,
             encoding="json",
@@ -131,18 +131,18 @@ _RAW = re.compile(r"/raw/([^/]+)/(in|out)")
 
 @lru_cache(maxsize=256)
 def raw_link(topic: str) -> tuple[str, bool] | None:
-    """Connection name and whether outgoing, of a raw topic; None for any other topic."""
+    """Return connection name and whether outgoing, of a raw topic; None for any other topic."""
     match = _RAW.fullmatch(topic)
     return None if match is None else (match[1], match[2] == "out")
 
 
 def is_view(topic: str) -> bool:
-    """Whether a topic was made for viewers: it holds nothing that the records do not."""
+    """Return whether a topic was made for viewers: it holds nothing that the records do not."""
     return topic in _VIEW_BY_NAME
 
 
 def record_type(topic: str) -> type[Record]:
-    """Record type of a topic.
+    """Return the record type of a topic.
 
     Raises:
         KeyError: there is no such topic.
@@ -152,7 +152,7 @@ def record_type(topic: str) -> type[Record]:
 
 @lru_cache(maxsize=256)
 def definition(topic: str) -> Definition:
-    """How a topic is written.
+    """Return encoding and schema of a topic.
 
     Raises:
         KeyError: there is no such topic.
@@ -173,7 +173,7 @@ def _schema(record: type[Record]) -> dict[str, object]:
 
 
 def _anything(kind: type) -> dict[str, object]:
-    """Schema of a value of any type, which msgspec cannot make itself."""
+    """Return the schema of a value of any type, which msgspec cannot make itself."""
     if kind is object:
         return {"description": "any JSON value"}
     raise NotImplementedError(kind)
@@ -196,7 +196,7 @@ class EncodingError(RecordingError):
 
 
 def _plain(value: object) -> object:
-    """Plain numbers of a numpy value that slipped into a record."""
+    """Turn numpy values of a record into plain numbers."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise NotImplementedError
@@ -210,7 +210,7 @@ _NON_FINITE_BYTES = re.compile(rb"\xcb[\x7f\xff][\xf0-\xff]", re.DOTALL)
 
 
 def encode(record: Record) -> bytes:
-    """Bytes of a record: a datagram's own, JSON of any other.
+    """Encode a record: a datagram as its own bytes, any other as JSON.
 
     Raises:
         EncodingError: the record holds something that JSON cannot give back.
@@ -229,13 +229,13 @@ def encode(record: Record) -> bytes:
 
 
 def alike(one: Record, other: Record) -> bool:
-    """Whether two records of a type are surely the same in every bit; cheaper than to look where they differ."""
+    """Return whether two records of a type are surely the same in every bit; cheaper than to look for a difference."""
     binary = _exact(one)
     return binary is not None and binary == _exact(other)
 
 
 def says(record: Record, message: bytes) -> bool:
-    """Whether a message is surely this record, in every bit: its bytes are those that it would be recorded as."""
+    """Return whether a message is surely this record in every bit: its bytes are those that it would be recorded as."""
     try:
         return encode(record) == message
     except EncodingError:
@@ -243,7 +243,7 @@ def says(record: Record, message: bytes) -> bool:
 
 
 def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
-    """Bytes of a record that a reader will get back from under this topic and log time [ns].
+    """Encode a record so that a reader gets the same back under this topic and log time [ns].
 
     Raises:
         RecordingError: it would not, and why.
@@ -262,7 +262,7 @@ def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
 
 
 def decode(topic: str, data: bytes, at_ns: int) -> Record:
-    """Record of a message.
+    """Decode the record of a message.
 
     Args:
         at_ns: its log time, which is a datagram's time [ns].
@@ -290,7 +290,7 @@ def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
 
 
 def _exact(value: object) -> bytes | None:
-    """A value's bytes with those of its floats; None if an integer is too large for that."""
+    """Return a value's bytes and those of its floats; None if an integer is too large for that."""
     try:
         return _BINARY.encode(value)
     except OverflowError:
@@ -298,7 +298,7 @@ def _exact(value: object) -> bytes | None:
 
 
 def _is_seen_to_be_non_finite(record: Record) -> bool:
-    """Whether a field that is a float says so at once, as the gap of most plans does."""
+    """Return whether a field of type float is not finite, as the gap of most plans is."""
     values = [getattr(record, name) for name in _float_fields(type(record))]
     return any(type(value) is float and not math.isfinite(value) for value in values)
 
@@ -314,14 +314,14 @@ def _may_be_non_finite(value: object) -> bool:
 
 
 def _spelled(value: object) -> object:
-    """A record's field with non-finite floats spelled out; the numbers of a plan without any are not gone through."""
+    """Return a record's field with non-finite floats as text; the numbers of a plan without any are not searched."""
     if isinstance(value, tuple) and not _may_be_non_finite(value):
         return value
     return _spell(msgspec.to_builtins(value, enc_hook=_plain))
 
 
 def _spell(value: object) -> object:
-    """The same tree with non-finite floats spelled out."""
+    """Return a tree with non-finite floats as text."""
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if isinstance(value, dict):
@@ -332,7 +332,7 @@ def _spell(value: object) -> object:
 
 
 def _restore(value: object, kind: object) -> object:
-    """The tree with spelled floats put back, where the type has a float (text stays text)."""
+    """Return a tree with spelled floats turned back, where the type has a float; text stays text."""
     if isinstance(value, str):
         return _NON_FINITE.get(value, value) if float in _alternatives(kind) else value
     if isinstance(value, list):
@@ -344,7 +344,7 @@ def _restore(value: object, kind: object) -> object:
 
 @cache
 def _alternatives(kind: object) -> tuple[object, ...]:
-    """Members of a union; the type itself if it is none."""
+    """Return the members of a union; the type itself if it is none."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
         return typing.get_args(kind)
     return (kind,)

@@ -1,4 +1,4 @@
-"""3D scenes of a flight in Foxglove's messages. All of it is local NED; viewers turn it (topic /view/frames).
+"""3D scenes of a flight in Foxglove's messages, all in local NED; viewers turn it (topic /view/frames).
 
 The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each depth.
 Those of which there is one a stage are filled in (`Many`).
@@ -73,7 +73,7 @@ class Many:
         self._at = np.add.outer(starts, np.arange(8)).ravel()
 
     def of(self, numbers: Floats) -> bytes:
-        """The field with a part for each row of the numbers (n, k)."""
+        """Return the field with one part for each row of the numbers (n, k)."""
         rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
         rows[:] = self._one
         rows[:, self._at] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
@@ -108,45 +108,45 @@ _EDGES = [  # corners whose numbers differ in one bit
 
 
 def _made(kind: Callable[..., M], **fields: Any) -> M:
-    """A message of its fields; the types of constructors know only of messages in messages."""
+    """Make a message of its fields; the constructors are typed for nested messages, not for their fields."""
     return kind(**fields)
 
 
 def stamp(at_ns: int) -> Fields:
-    """A time of our clock."""
+    """Return a time of our clock as a Protobuf timestamp."""
     return {"seconds": at_ns // 1_000_000_000, "nanos": at_ns % 1_000_000_000}
 
 
 def vector(at_m: Sequence[float]) -> Fields:
-    """Three numbers, as a vector or a point."""
+    """Return three numbers as a vector or a point."""
     return {"x": at_m[0], "y": at_m[1], "z": at_m[2]}
 
 
 def pose(at_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
-    """A place [m] and a turn."""
+    """Return a place [m] and a rotation as a pose."""
     return {"position": vector(at_m), "orientation": turn}
 
 
 def quaternion(turn: Sequence[float]) -> Fields:
-    """A turn (w, x, y, z)."""
+    """Return a rotation (w, x, y, z) as a quaternion."""
     w, x, y, z = turn
     return {"x": x, "y": y, "z": z, "w": w}
 
 
 def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
-    """A place in local NED [m]."""
+    """Return a place in local NED [m] as a pose with its frame."""
     return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
 
 
 def poses_in_frame(at_ns: int, places_m: Floats) -> PosesInFrame:
-    """Places in local NED [m] (n, 3), in order."""
+    """Return places in local NED [m] (n, 3) as poses with their frame, in order."""
     message = _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED)
     message.MergeFromString(_POSES.of(places_m))
     return message
 
 
 def frames(at_ns: int) -> FrameTransforms:
-    """How local NED lies in the room's frame, whose z axis points up as viewers want it."""
+    """Return the transform from local NED to the room's frame, whose z axis points up as viewers want it."""
     turned: Fields = {
         "timestamp": stamp(at_ns),
         "parent_frame_id": ROOM,
@@ -158,7 +158,7 @@ def frames(at_ns: int) -> FrameTransforms:
 
 
 def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
-    """Where the vehicle is estimated to be; its attitude is not known, so the axes stay those of local NED."""
+    """Return the transform to the estimated position; the attitude is not known, so axes stay those of local NED."""
     return _made(
         FrameTransform,
         timestamp=stamp(at_ns),
@@ -170,7 +170,7 @@ def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
 
 
 def log_line(event: Event) -> Log:
-    """An event."""
+    """Return an event as a log message."""
     times = "" if event.count == 1 else f" ({event.count} times)"
     return _made(
         Log, timestamp=stamp(event.at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
@@ -178,7 +178,7 @@ def log_line(event: Event) -> Log:
 
 
 def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
-    """Limits of the position, as a box."""
+    """Draw the position limits as a box."""
     lower, upper = _sides(design, design.state_box.lower, design.state_box.upper)
     return _update(_entity(at_ns, "limits", lines=[_box(lower, upper, _LIMITS)]))
 
@@ -186,7 +186,7 @@ def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
 def plan_scene(
     at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Floats | None = None
 ) -> SceneUpdate:
-    """A plan's predicted path, its confidence ellipsoids, and what its back-offs leave of the limits.
+    """Draw a plan's predicted path, its confidence ellipsoids, and the tightened limits at its end.
 
     A stage's ellipsoid has the back-offs of the position limits as semi-axes: what the plan keeps
     from them so that they hold with the promised probability. The estimate's is from its covariance.
@@ -209,7 +209,7 @@ def plan_scene(
 
 
 def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
-    """What was flown and measured lately."""
+    """Draw the recently flown path and the recent positions."""
     return _update(
         _entity(at_ns, "flown path", lines=[_line(flown_m, _FLOWN, 3.0)]),
         _entity(at_ns, "measured path", lines=[_line(measured_m, _MEASURED, 1.5)]),
@@ -217,7 +217,7 @@ def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) 
 
 
 def link_scene(design: DesignView, decision: Decision) -> SceneUpdate:
-    """The link's state at the vehicle: green with news, amber in silence, red in the fallback; and in words."""
+    """Draw the link's state at the vehicle, with words: green with news, amber in silence, red in the fallback."""
     colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
     age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
     label: Fields = {
@@ -273,7 +273,7 @@ def _box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
 
 
 def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3]:
-    """Sides of the room in local NED; open ones near the target, and flat in axes that the plant has not."""
+    """Return the sides of the room in local NED [m]; open ones lie near the target, axes without motion are flat."""
     centre = np.array(design.target)
     return (
         design.position_of(np.where(np.isfinite(lower), lower, centre - OPEN_M).tolist()),
@@ -282,7 +282,7 @@ def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3
 
 
 def _reach(design: DesignView, backoff: Matrix) -> Floats:
-    """Semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
+    """Return the semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
     rows = np.array(backoff)
     reach = np.zeros((len(rows), len(design.target)))
     for state, row, size in design.position_rows:
@@ -291,7 +291,7 @@ def _reach(design: DesignView, backoff: Matrix) -> Floats:
 
 
 def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
-    """Ellipsoid that holds the position with 95 %, from the covariance."""
+    """Draw the ellipsoid that holds the position with 95 %, by the covariance."""
     cov = [[0.0] * 3 for _ in range(3)]
     places = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
     for row, i in places:
@@ -324,7 +324,7 @@ _Item = tuple[str, Message]
 
 
 class Views:
-    """Makes messages for viewers; one for each recording, since paths and the newest estimate are remembered."""
+    """Maker of messages for viewers, one for each recording: it remembers paths and the newest estimate."""
 
     def __init__(self) -> None:
         self._design: DesignView | None = None
@@ -335,7 +335,7 @@ class Views:
         self._still_ns = self._trail_ns = 0
 
     def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-        """Topic and message of what a record gives rise to, in order; nothing before a header.
+        """Yield topic and message of all that is derived from a record, in order; nothing before a header.
 
         Args:
             at_ns: log time of the record, and of what is made of it [ns].
@@ -411,7 +411,7 @@ class Views:
                 yield topics.LOG, log_line(told)
 
     def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
-        """What does not move, when it is due."""
+        """Yield the scenes that do not move, when they are due."""
         if at_ns >= self._still_ns:
             self._still_ns = at_ns + STILL_NS
             yield topics.FRAMES, frames(at_ns)
@@ -433,16 +433,16 @@ class Views:
 
 
 class _Trail:
-    """Places of the last while."""
+    """Recent places."""
 
     def __init__(self) -> None:
         self._places: deque[tuple[int, Vec3]] = deque(maxlen=_TRAIL_POINTS)
 
     def add(self, at_ns: int, at_m: Vec3) -> None:
-        """Take a place, unless the last one was there only just before."""
+        """Add a place, unless the last one was added only just before."""
         if not self._places or at_ns - self._places[-1][0] >= TRAIL_S * 1e9 / _TRAIL_POINTS:
             self._places.append((at_ns, at_m))
 
     def since(self, at_ns: int) -> list[Vec3]:
-        """Places since a time."""
+        """Return the places since a time."""
         return [at_m for told_ns, at_m in self._places if told_ns >= at_ns]
