@@ -1,1 +1,1 @@
-"""The other side of the wire: vehicle, autopilot, cameras, radio channel."""
+"""Simulator: vehicle, autopilot, cameras and radio channel, on the other side of the connections."""

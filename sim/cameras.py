@@ -1,4 +1,4 @@
-"""Simulated motion capture: what the cameras see, when, and as which MAVLink message.
+"""Simulated motion capture: samples of the vehicle's pose, their times, and the MAVLink messages that carry them.
 
 Bytes are made with pymavlink's dialect directly. The cameras stamp with their own clock and answer no TIMESYNC, as
 the bridges of motion-capture systems do.
@@ -45,7 +45,7 @@ AXES: dict[str, tuple[Vec3, Vec3, Vec3]] = {
 
 
 class _Pose(NamedTuple):
-    """Where a body is, how fast it moves and how it is turned, in local NED."""
+    """Pose of a body, and its velocity, in local NED."""
 
     position_m: Vec3
     velocity_mps: Vec3
@@ -103,15 +103,15 @@ class Cameras:
         return self._hidden
 
     def mistake(self, axes: str) -> None:
-        """Take other axes for local NED from now on, by their name in `AXES`."""
+        """Permute the axes of positions from now on, by a name in `AXES`, as of a wrong setup."""
         self._axes = AXES[axes]
 
     def shake(self, noise_std_m: float) -> None:
-        """Have another noise of the positions from now on [m]."""
+        """Set the noise of positions from now on [m]."""
         self._noise_std_m = noise_std_m
 
     def creep(self, velocity_mps: Vec3) -> None:
-        """Let the origin of what they say move from the next sample on [m/s], as of cameras that have been knocked."""
+        """Let the cameras' origin drift from the next sample on [m/s], as of cameras that were knocked."""
         self._crept_m = self._creep_m(self.next_ns)
         self._creeps, self._crept_ns = velocity_mps, self.next_ns
 
@@ -188,7 +188,7 @@ def _in_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:
 
 
 def turn(frame: FrameConfig) -> Quaternion:
-    """What turns NED into the camera frame (w, x, y, z)."""
+    """Return the rotation from NED to the camera frame (w, x, y, z)."""
     cos, sin = math.cos(math.radians(frame.yaw_deg) / 2), math.sin(math.radians(frame.yaw_deg) / 2)
     if frame.convention == "ned":
         return cos, 0.0, 0.0, -sin
@@ -197,7 +197,7 @@ def turn(frame: FrameConfig) -> Quaternion:
 
 
 def euler(attitude: Quaternion) -> Vec3:
-    """Roll, pitch and yaw of an attitude [rad], turned about z, y, x in this order."""
+    """Return roll, pitch and yaw of an attitude [rad], turned about z, y, x in this order."""
     w, x, y, z = attitude
     pitch = math.asin(min(max(2.0 * (w * y - x * z), -1.0), 1.0))
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))

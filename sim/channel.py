@@ -21,12 +21,12 @@ from uavctl.config.link import LinkConfig
 
 
 def within(spans: Spans, since_ns: int) -> bool:
-    """Whether a time since the start [ns] lies in one of the spans [s], their ends included."""
+    """Return whether a time since the start [ns] lies in one of the spans [s], their ends included."""
     return any(begin * 1e9 <= since_ns <= end * 1e9 for begin, end in spans)
 
 
 def earliest(times_ns: Iterable[int | None]) -> int | None:
-    """The first of some times [ns], None for none."""
+    """Return the first of some times [ns]; None for none."""
     first_ns = None
     for at_ns in times_ns:
         if at_ns is not None and (first_ns is None or at_ns < first_ns):
@@ -40,7 +40,7 @@ _TO_DRAW = -1  # no run of losses is under way: the next packet begins one (of 0
 
 @dataclass
 class Counters:
-    """What happened to the packets so far."""
+    """Counts of the packets so far, by their fate."""
 
     sent: int = 0
     lost: int = 0
@@ -51,7 +51,7 @@ class Counters:
 
 
 class _Fate(NamedTuple):
-    """What becomes of a packet."""
+    """Fate of a packet: lost, delayed, doubled, damaged."""
 
     lost: bool
     delays_s: tuple[float, ...]  # of it, and of its duplicate
@@ -119,11 +119,11 @@ class Channel:
             heapq.heappush(self._pending, (self._released(arrival_ns), arrival_ns, self._order, fate.data))
 
     def pass_over(self, at_ns: int) -> None:
-        """Nothing is sent at `at_ns` where a packet was due; what comes after goes as if it had been."""
+        """Skip a packet that was due at `at_ns`; later ones fare as if it had been sent."""
         self._draw(at_ns, b"")
 
     def pop_due(self, to_ns: int) -> list[tuple[int, bytes]]:
-        """Take what arrives up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
+        """Take the packets that arrive up to and including `to_ns`, as (arrival_ns, data) in order of arrival."""
         due = []
         while self._pending and self._pending[0][0] <= to_ns:
             arrival_ns, *_, data = heapq.heappop(self._pending)
@@ -132,7 +132,7 @@ class Channel:
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next arrival [ns], None if nothing is under way."""
+        """Time of the next arrival [ns]; None if nothing is under way."""
         return self._pending[0][0] if self._pending else None
 
     def _draw(self, at_ns: int, data: bytes) -> _Fate:
@@ -151,7 +151,7 @@ class Channel:
         return _Fate(lost, tuple(delays[: 1 + doubled]), data, corrupted, truncated, oversized)
 
     def _released(self, arrival_ns: int) -> int:
-        """When a packet that comes at `arrival_ns` is let through."""
+        """Return when a packet that comes at `arrival_ns` is let through [ns]."""
         for begin, end in sorted(self._link.held):
             if begin * 1e9 <= arrival_ns - self._start_ns < end * 1e9:
                 arrival_ns = self._start_ns + round(end * 1e9)
@@ -164,7 +164,7 @@ class Channel:
         return bool(draw < self._probability(since_ns, step)) or within(link.blackout, since_ns)
 
     def _probability(self, since_ns: int, step: float) -> float:
-        """Probability that the next packet is lost; the channel's own state moves on by the draw `step`."""
+        """Return the probability that the next packet is lost; the channel's own state moves on by the draw `step`."""
         link = self._link
         if link.model == "gilbert-elliott":
             self._bad = bool(step >= link.burst_leave if self._bad else step < link.burst_enter)

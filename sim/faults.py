@@ -1,4 +1,4 @@
-"""What happens in the course of a simulated flight, by the configuration's `[[sim.fault]]`."""
+"""Faults in the course of a simulated flight, by the configuration's `[[sim.fault]]`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MODE_S = 1.0  # how long a change of mode is told; afterwards the mode itself te
 
 
 def with_spans(config: Config) -> Config:
-    """The configuration with the faults that are spans of the link and of the cameras among these."""
+    """Return the configuration with those faults merged in that are spans of the link or of the cameras."""
     replace = msgspec.structs.replace
     link, camera = config.link, config.sim.camera
     for fault in config.sim.fault:
@@ -42,7 +42,7 @@ def with_spans(config: Config) -> Config:
 def problems(
     autopilot: Literal["px4", "ardupilot"], faults: Sequence[FaultConfig], key: str
 ) -> Iterator[ConfigProblem]:
-    """What an autopilot of this kind cannot do of a list of faults: parameters, values and modes that it has not."""
+    """Return which parameters, values and modes of a list of faults an autopilot of this kind lacks."""
     parameters, modes = Parameters(autopilot), tuple(mode.name for mode in SIMULATED[autopilot].modes)
     for i, fault in enumerate(faults):
         if fault.kind == "frame":
@@ -69,7 +69,7 @@ def _unknown(key: str, what: str, name: str, names: Sequence[str]) -> Iterator[C
 
 
 def active(config: Config, since_ns: int) -> tuple[str, ...]:
-    """What is amiss at a time since the start [ns]: the spans that it lies in, and the changes made by then."""
+    """Return the faults at a time since the start [ns]: spans that it lies in, and changes made by then."""
     sections = ((config.link, OF_LINK), (config.sim.camera, OF_CAMERA))
     spans = [name for section, names in sections for name in names if within(getattr(section, name), since_ns)]
     made = [one for one in config.sim.fault if one.at_s * 1e9 <= since_ns]
@@ -82,7 +82,7 @@ def active(config: Config, since_ns: int) -> tuple[str, ...]:
 
 
 class Faults:
-    """The faults that are no spans, each done once at its time.
+    """Faults that are no spans, each done once at its time.
 
     Raises:
         ConfigError: a parameter, a value or a mode that the autopilot has not.
@@ -107,11 +107,11 @@ class Faults:
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next one [ns]."""
+        """Time of the next fault [ns]."""
         return self._ahead[0][0] if self._ahead else None
 
     def run(self, at_ns: int) -> None:
-        """Do what is due at `at_ns`, the vehicle being there."""
+        """Do the faults due at `at_ns`, with the vehicle moved there."""
         while self._ahead and self._ahead[0][0] <= at_ns:
             self._do(self._ahead.pop(0)[2], at_ns)
 

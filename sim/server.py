@@ -1,4 +1,4 @@
-"""The simulation on real sockets; fleets."""
+"""Simulation server: simulated vehicles on real sockets, alone or as a fleet."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ GONE = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
 
 
 class Port(Protocol):
-    """One end of a connection."""
+    """Interface of one end of a connection."""
 
     @property
     def url(self) -> str:
@@ -48,11 +48,11 @@ class Port(Protocol):
         ...
 
     def sockets(self) -> tuple[socket.socket, ...]:
-        """What to wait for."""
+        """Return the sockets to wait for."""
         ...
 
     def read(self) -> list[bytes]:
-        """Everything that has come, one MAVLink datagram or frame each."""
+        """Return everything that has come, one MAVLink datagram or frame each."""
         ...
 
     def write(self, data: bytes) -> None:
@@ -87,11 +87,11 @@ class UdpPort:
         return f"{self._scheme}://{self._address[0]}:{self._address[1]}"
 
     def sockets(self) -> tuple[socket.socket, ...]:
-        """What to wait for."""
+        """Return the sockets to wait for."""
         return (self._socket,)
 
     def read(self) -> list[bytes]:
-        """Everything that has come."""
+        """Return everything that has come."""
         taken = []
         with suppress(BlockingIOError):
             while True:
@@ -115,7 +115,7 @@ class UdpPort:
 
 @dataclass
 class _TcpClient:
-    """One connection to a `TcpPort`."""
+    """One client of a `TcpPort`."""
 
     socket: socket.socket
     greeting: list[bytes]  # what of it is still to come
@@ -123,7 +123,7 @@ class _TcpClient:
     backlog: bytearray = field(default_factory=bytearray)  # to go
 
     def read(self) -> bool:
-        """Take all that has come; False when the client is gone."""
+        """Take everything that has come; return False when the client is gone."""
         try:
             while data := self.socket.recv(LARGEST_DATAGRAM):
                 self.stream += data
@@ -134,7 +134,7 @@ class _TcpClient:
         return False
 
     def write(self, data: bytes) -> bool:
-        """Send in order what the socket takes now; False when the client is gone or leaves too much unread."""
+        """Send in order what the socket takes now; return False if the client is gone or leaves too much unread."""
         if self.greeting:
             self.backlog += self.greeting.pop(0)
         self.backlog += data
@@ -167,11 +167,11 @@ class TcpPort:
         return f"tcpin://{host}:{port}"
 
     def sockets(self) -> tuple[socket.socket, ...]:
-        """What to wait for."""
+        """Return the sockets to wait for."""
         return self._listener, *(client.socket for client in self._clients)
 
     def read(self) -> list[bytes]:
-        """Accept who is there; then every whole frame that has come."""
+        """Accept new clients, then return every whole frame that has come."""
         with suppress(BlockingIOError):
             while True:
                 self._accept()
@@ -210,22 +210,22 @@ class TcpPort:
 
 
 class Ports:
-    """Several ports as one: what is sent goes out at all of them."""
+    """Several ports as one: every datagram is sent at all of them."""
 
     def __init__(self, ports: list[Port]) -> None:
         self._ports = ports
 
     @property
     def url(self) -> str:
-        """The URLs, separated by commas."""
+        """URLs of the ports, separated by commas."""
         return ",".join(port.url for port in self._ports)
 
     def sockets(self) -> tuple[socket.socket, ...]:
-        """What to wait for."""
+        """Return the sockets to wait for."""
         return tuple(one for port in self._ports for one in port.sockets())
 
     def read(self) -> list[bytes]:
-        """Everything that has come, at any port."""
+        """Return everything that has come, at any port."""
         return [data for port in self._ports for data in port.read()]
 
     def write(self, data: bytes) -> None:
@@ -240,7 +240,7 @@ class Ports:
 
 
 def cut_frames(stream: bytearray) -> list[bytes]:
-    """Take the whole MAVLink frames off a stream's front; bytes before a start mark are passed over."""
+    """Take the whole MAVLink frames off a stream's front; bytes before a start mark are skipped."""
     frames = []
     while stream:
         if stream[0] not in (V1, V2):
@@ -321,13 +321,13 @@ class Ready:
 
 
 def grid_start(now_ns: int, dt_ns: int) -> int:
-    """The next multiple of Δt on CLOCK_MONOTONIC: a grid that two processes share without a word."""
+    """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: a grid that two processes share without a word."""
     return -(-now_ns // dt_ns) * dt_ns
 
 
 @dataclass(frozen=True)
 class Seat:
-    """One simulated vehicle: its configuration, its URLs (equal ones are one connection), and who hears the truth."""
+    """One simulated vehicle: configuration, URLs (equal ones are one connection), and the receiver of its truth."""
 
     config: Config
     vehicle: str
@@ -406,7 +406,7 @@ def serve_all(
 
 @dataclass(frozen=True)
 class _Clock:
-    """Simulated time, `speed` times as quick as real time from `start_ns` on."""
+    """Simulated time, which runs `speed` times as fast as real time from `start_ns` on."""
 
     start_ns: int
     speed: float
@@ -415,7 +415,7 @@ class _Clock:
         return self.start_ns + round((time.monotonic_ns() - self.start_ns) * self.speed)
 
     def left_s(self, until_ns: int) -> float:
-        """Real time until a simulated time."""
+        """Return the real time until a simulated time [s]."""
         return max(0, until_ns - self.now_ns()) * 1e-9 / self.speed
 
 
@@ -470,7 +470,7 @@ def _run(
 
 
 def _wait(ports: Sequence[Port], longest_s: float) -> None:
-    """Sleep for a time or until the first incoming bytes; select(2), since epoll's sleep is in milliseconds."""
+    """Sleep for a time or until bytes come; by select(2), as epoll's sleep is in whole milliseconds."""
     sockets: list[socket.socket] = [one for port in ports for one in port.sockets()]
     with SelectSelector() as selector:
         for one in sockets:
@@ -488,7 +488,7 @@ def serve_in_child(
     airborne: bool,
     door: Door | None = None,
 ) -> None:
-    """`serve` as the target of a child process: `Ready` and every `Truth` go into the pipe.
+    """Run `serve` in a child process: `Ready` and every `Truth` go into the pipe.
 
     Ctrl-C is left to the parent, which sets `stop`; the child also ends when its parent is gone.
     """
@@ -521,7 +521,7 @@ TCP_PORTS = 10  # from one vehicle to the next, as ArduPilot's simulator counts 
 
 
 def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]) -> tuple[Seat, ...]:
-    """Seats of `count` vehicles, the first as configured.
+    """Return the seats of `count` vehicles, the first as configured.
 
     Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
     (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
@@ -553,7 +553,7 @@ def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callab
 
 
 def _places(config: Config, count: int) -> list[Vec3]:
-    """Where they start."""
+    """Return the start positions [m]."""
 
     def fits(place: Vec3) -> bool:
         return not any(outside(config.plant, config.sets, place, "", ""))
@@ -582,7 +582,7 @@ def _shifted(urls: str, number: int) -> str:
 
 
 def _higher(url: str, number: int) -> str:
-    """The URL with a higher port; one that is none stays as it is, for `open_port` to refuse."""
+    """Return the URL with a higher port; one without a port stays as it is, for `open_port` to refuse."""
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -595,7 +595,7 @@ def _higher(url: str, number: int) -> str:
 
 
 def _fixed(seat: Seat) -> Iterator[str]:
-    """The URLs of a seat, but for those that stand for any free port."""
+    """Return the URLs of a seat, without those that stand for any free port."""
     for url in {*seat.vehicle.split(","), *seat.mocap.split(",")}:
         if not url.endswith(":0"):
             yield url

@@ -1,4 +1,4 @@
-"""Everything beyond the wire in lockstep."""
+"""Simulation in lockstep: vehicle, autopilot, cameras and channel in virtual time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from uavctl.records import Flyer, Received, Truth, Vec3
 
 @dataclass(frozen=True)
 class VehicleSnapshot:
-    """What can be seen of one vehicle; positions and velocities are the true ones, local NED."""
+    """State of one vehicle at a moment, for display; positions and velocities are the true ones, local NED."""
 
     system_id: int  # MAVLink system id
     time_s: float  # since the start
@@ -90,12 +90,12 @@ class Peers:
 
     @property
     def now_ns(self) -> int:
-        """How far time has come [ns]."""
+        """Present time [ns]."""
         return self.vehicle.now_ns
 
     @property
     def next_ns(self) -> int:
-        """Time of the next event [ns]: something to send, a sample, or the vehicle's own doing."""
+        """Time of the next event [ns]: a datagram to send, a sample, or an act of the vehicle."""
         times = [self._own_ns, self._truth_ns + 1, self.channel.next_ns]
         if self._wire:
             times.append(self._wire[0][0])
@@ -103,7 +103,7 @@ class Peers:
 
     @property
     def _own_ns(self) -> int:
-        """When cameras, autopilot or a fault do something next [ns]."""
+        """Time at which cameras, autopilot or a fault act next [ns]."""
         return self._earliest_ns(self.autopilot.next_ns, self._faults.next_ns)
 
     def _earliest_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
@@ -111,7 +111,7 @@ class Peers:
         return self._cameras.next_ns if found_ns is None else min(self._cameras.next_ns, found_ns)
 
     def advance(self, to_ns: int) -> list[Due]:
-        """Move time on; returns the datagrams due up to and including `to_ns`, in order of time."""
+        """Move time on; return the datagrams due up to and including `to_ns`, in order of time."""
         self._run(to_ns)
         due = [*self._wire, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
         self._wire.clear()
@@ -119,7 +119,7 @@ class Peers:
         return due
 
     def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Received]) -> None:
-        """Move time on and have every datagram heard in order of time; its answers are taken where time then is.
+        """Move time on and pass on every datagram in order of time; answers are taken at the time reached.
 
         Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
         in another way.
@@ -133,13 +133,13 @@ class Peers:
                 return
 
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
-        """Take one datagram of the controller's at `at_ns`; the cameras listen to nothing."""
+        """Take one datagram of the controller at `at_ns`; the cameras take none."""
         self._run(at_ns)
         if link == VEHICLE and not within(self._config.link.uplink_blackout, at_ns - self._start_ns):
             self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
     def truth(self) -> Truth:
-        """The true state now, and the input acting from now on."""
+        """Return the true state now, and the input that acts from now on."""
         return Truth(
             at_ns=self.now_ns,
             position_m=self.vehicle.position_m,
@@ -154,12 +154,12 @@ class Peers:
 
     @property
     def _amiss(self) -> tuple[str, ...]:
-        """What is amiss now, as kinds of faults; a random occlusion is one too."""
+        """Kinds of the faults that act now; a random occlusion is one too."""
         found = active(self._config, self.now_ns - self._start_ns)
         return (*found, "occluded") if self._cameras.hidden and "occluded" not in found else found
 
     def look(self) -> VehicleSnapshot:
-        """What can be seen of the vehicle now."""
+        """Return a snapshot of the vehicle."""
         pilot, counters = self.autopilot.pilot, self.channel.counters
         setpoint_ns = pilot.setpoint_ns
         return VehicleSnapshot(
@@ -180,7 +180,7 @@ class Peers:
         )
 
     def flush(self) -> None:
-        """Tell the truth of a boundary that time has reached but not passed; for the end of a run."""
+        """Report the truth of a boundary that time has reached but not passed; for the end of a run."""
         if self._truth_ns == self.now_ns:
             self._tell()
 
@@ -221,7 +221,7 @@ class Peers:
 
 
 def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
-    """The quadrotor of a configuration, in its wind; the seed is that of the gusts."""
+    """Make the quadrotor of a configuration with its wind; the seed is that of the gusts."""
     sim = config.sim
     return Quadrotor(
         linear_model(config.plant),
@@ -238,7 +238,7 @@ def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Qu
 
 
 class World:
-    """A flight of `flyer` against the simulated peers; bit-identical for a seed.
+    """Flight of `flyer` against the simulated peers; bit-identical for a seed.
 
     In each tick of the grid start_ns + n tick_s the flyer first gets every datagram that has arrived by
     then, then decides, and what it sends reaches the peers at the same instant. So a sample taken at a boundary
@@ -273,7 +273,7 @@ class World:
         self.peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth)
 
     def run(self, duration_s: float, over: Callable[[], bool] = lambda: False) -> None:
-        """Fly on, all the ticks that begin within `duration_s` from the start, or until it is over."""
+        """Fly all the ticks that begin within `duration_s` from the start, or until the flyer is done."""
         for tick in range(self._ticks, round(duration_s * 1e9) // self._tick_ns):
             if over():
                 break

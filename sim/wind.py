@@ -1,4 +1,4 @@
-"""Wind: steady, with gusts after Dryden's model of low altitudes.
+"""Wind: steady, with gusts by Dryden's model for low altitudes.
 
 MIL-F-8785C, section 3.7.3.4 (scales and intensities below 1000 ft, in feet there) with its spectra; MIL-HDBK-1797
 writes the same ones with half the scales across and vertically. The turbulence is frozen and carried past the vehicle
@@ -25,7 +25,7 @@ CALM: Vec3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Dryden:
-    """Intensities and time scales of the gusts along, across and up and down."""
+    """Intensities and time scales of the gusts: along, across, and vertical."""
 
     sigma_mps: float  # standard deviation along and across the wind
     sigma_down_mps: float  # standard deviation up and down
@@ -34,7 +34,7 @@ class Dryden:
 
 
 def dryden(gust_wind_mps: float, height_m: float, speed_mps: float) -> Dryden:
-    """The model's figures.
+    """Return intensities and time scales of Dryden's model.
 
     Args:
         gust_wind_mps: wind speed at 20 ft that sets the intensity (light 7.7, moderate 15.4, severe 23.2 m/s).
@@ -53,7 +53,7 @@ def dryden(gust_wind_mps: float, height_m: float, speed_mps: float) -> Dryden:
 
 
 class _Along:
-    """σ √(2T/π) / (1 + T s), driven by white noise: a first-order process, stepped exactly."""
+    """Gusts along the wind: σ √(2T/π) / (1 + T s), driven by white noise; a first-order process, stepped exactly."""
 
     def __init__(self, sigma: float, time_s: float, step_s: float, start: float) -> None:
         self._keep = math.exp(-step_s / time_s)
@@ -65,7 +65,7 @@ class _Along:
 
 
 class _Across:
-    """σ √(T/π) (1 + √3 T s) / (1 + T s)², driven by white noise, stepped exactly.
+    """Gusts across the wind: σ √(T/π) (1 + √3 T s) / (1 + T s)², driven by white noise, stepped exactly.
 
     Two lags T in series with states x, y, noise such that var x = 1; then cov(x, y) = var y = ½, and the output
     σ/√2 (√3 x + (1 - √3) y) has variance σ². Over a step a = h/T: x' = e^-a x + n, y' = e^-a (y + a x) + m, and

@@ -1,1 +1,1 @@
-"""The simulated autopilots: modes, estimator, telemetry, as PX4 and ArduCopter have them."""
+"""Simulated autopilots with modes, estimator and telemetry as PX4 and ArduCopter have them."""

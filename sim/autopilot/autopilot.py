@@ -1,4 +1,4 @@
-"""The simulated MAVLink vehicle: bytes in, bytes out.
+"""Simulated autopilot: MAVLink bytes in, MAVLink bytes out.
 
 Its bytes are made and read with pymavlink's dialect directly, not with the controller's codec. It shows what was
 observed of the real autopilots: the table of `profile.py`, the rules for setpoints in `setpoints.py`, the state
@@ -35,7 +35,7 @@ CHECKS_EVERY_NS = 100_000_000
 
 
 class Checks:
-    """Draws when pre-flight checks change, and knows when the position is not valid.
+    """Pre-flight checks that change at random times, and spans in which the position is not valid.
 
     Args:
         seed: of the times at which checks change.
@@ -55,11 +55,11 @@ class Checks:
 
     @property
     def next_ns(self) -> int | None:
-        """When it looks next [ns]; None if there is nothing to doubt."""
+        """Time of the next look [ns]; None if no check ever changes."""
         return self._look_ns if self._config.flicker_s or self._config.invalid else None
 
     def run(self, at_ns: int, *, armed: bool) -> None:
-        """Look, if it is time."""
+        """Change the checks, if it is time."""
         if self.next_ns is None or at_ns < self._look_ns:
             return
         self._look_ns = at_ns + CHECKS_EVERY_NS
@@ -83,7 +83,7 @@ EKF_CHECK_NS = SECOND_NS
 
 
 class Failsafes:
-    """Looks ten times a second while armed."""
+    """Failsafes of the autopilot, looked at ten times a second while armed."""
 
     def __init__(
         self,
@@ -111,11 +111,11 @@ class Failsafes:
 
     @property
     def next_ns(self) -> int | None:
-        """When it looks next [ns]; None while disarmed."""
+        """Time of the next look [ns]; None while disarmed."""
         return self._look_ns if self._pilot.armed else None
 
     def run(self, at_ns: int) -> None:
-        """Look, if it is time."""
+        """Look for the cause of a failsafe, if it is time."""
         if not self._pilot.armed:
             self._lost_ns = self._low_ns = self._meant = None
             self._warned = False
@@ -136,7 +136,7 @@ class Failsafes:
             self._pilot.fail(self._mode(Role.LAND), at_ns)
 
     def _look_at_its_end(self, at_ns: int) -> None:
-        """As recorded: a failsafe for want of a position ends with its cause, if nobody has changed the mode since."""
+        """End a failsafe for want of a position with its cause, as recorded, if nobody has changed the mode since."""
         if not self._pilot.failsafe:
             self._meant = None
         elif self._estimator.position_ok and self._meant is not None:
@@ -211,7 +211,7 @@ FIRST_GAIN, LAST_GAIN = 0.05, 0.003
 
 
 class PeerClock:
-    """One peer's clock."""
+    """Clock of one peer, estimated by TIMESYNC."""
 
     def __init__(self) -> None:
         self._restart()
@@ -222,11 +222,11 @@ class PeerClock:
 
     @property
     def converged(self) -> bool:
-        """Whether stamps are moved."""
+        """Whether the offset is known, so that the peer's stamps are converted."""
         return self._count >= WINDOW
 
     def take(self, asked_ns: int, theirs_ns: int, now_ns: int) -> None:
-        """Take an answer.
+        """Take an answer to TIMESYNC.
 
         Args:
             asked_ns: own time of the request, as the answer gives it back.
@@ -254,14 +254,14 @@ class PeerClock:
 
     @property
     def _gain(self) -> float:
-        """The same for offset and skew."""
+        """Present filter gain, the same for offset and skew."""
         if self.converged:
             return LAST_GAIN
         last = 1.0 - math.exp(0.5 * (1.0 - 1.0 / (1.0 - self._count / WINDOW)))
         return last * LAST_GAIN + (1.0 - last) * FIRST_GAIN
 
     def moved_ns(self, stamp_ns: int, now_ns: int) -> int:
-        """A stamp of the peer's in own time: now, until the peer's clock is known."""
+        """Convert a stamp of the peer to own time [ns]; it counts as now until the peer's clock is known."""
         return stamp_ns + round(self._offset_ns) if self.converged else now_ns
 
 
@@ -275,7 +275,7 @@ DATA_STREAMS = {1: (27, 116), 2: (1, 24), 3: (65,), 6: (32, 33), 10: (30,), 11: 
 
 
 class Autopilot:
-    """A vehicle with the profile named by `config.sim.autopilot`; see `Pilot` for `airborne`.
+    """Simulated vehicle with the profile named by `config.sim.autopilot`; see `Pilot` for `airborne`.
 
     Args:
         vehicle: what flies: the linear plant, or a vehicle with loops of its own.
@@ -343,19 +343,19 @@ class Autopilot:
 
     @property
     def mode_name(self) -> str:
-        """The autopilot's own name of its mode, or CRASHED."""
+        """Name of its mode, in the autopilot's own words, or CRASHED."""
         return CRASHED if self.pilot.crashed else self.pilot.mode.name
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next thing to do of itself [ns]; None after a crash."""
+        """Time at which it next acts by itself [ns]; None after a crash."""
         if self.pilot.crashed:
             return None
         parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial, self._checks
         return earliest([part.next_ns for part in parts])
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
-        """Do what is due at `at_ns`, the vehicle being there; returns the datagrams sent."""
+        """Act on everything due at `at_ns`, with the vehicle moved there; return the datagrams sent."""
         if self.pilot.crashed:
             return ()
         self._checks.run(at_ns, armed=self.pilot.armed)
@@ -369,7 +369,7 @@ class Autopilot:
         return self._flush(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> tuple[bytes, ...]:
-        """Take one datagram, the vehicle being at `at_ns`; returns the answers. Bad bytes never raise."""
+        """Take one datagram, with the vehicle moved to `at_ns`; return the answers. Bad bytes never raise."""
         parser = mavlink.MAVLink(None)  # a fresh one: a cut datagram must not swallow the next
         parser.robust_parsing = True
         for msg in parser.parse_buffer(data) or ():
@@ -416,7 +416,7 @@ class Autopilot:
             self._sync.take(msg.ts1, msg.tc1, at_ns - self._boot_ns)
 
     def _age_ns(self, stamp_ns: int, at_ns: int) -> int:
-        """How old PX4 takes an external position to be."""
+        """Return the age that PX4 takes an external position to have [ns]."""
         now_ns = at_ns - self._boot_ns
         return now_ns - self._sync.moved_ns(stamp_ns, now_ns)
 
@@ -444,7 +444,7 @@ class Autopilot:
             self.pilot.setpoint(setpoint, at_ns)
 
     def _on_origin(self, msg: Any, at_ns: int) -> None:
-        """The origin of the estimate: a place on the globe for what GPS would have given; it stays local zero."""
+        """Take the geographic position of local zero, for what GPS would have given."""
         valid = abs(msg.latitude) <= 900_000_000 and abs(msg.longitude) <= 1_800_000_000
         if self._for_me(msg) and valid and not self.estimator.uses_gps:
             self.estimator.origin = True
@@ -458,7 +458,7 @@ class Autopilot:
             self._send(mavlink.MAVLink_mission_count_message(*to, 0, msg.mission_type))
 
     def _on_data_stream(self, msg: Any, at_ns: int) -> None:
-        """ArduPilot only: streams by groups, at a rate [Hz]."""
+        """Set the rate of a group of streams [Hz]; ArduPilot only."""
         if not self._for_me(msg) or self._kind.name == "px4" or msg.start_stop not in (0, 1):
             return
         wanted = DATA_STREAMS.values() if msg.req_stream_id == 0 else [DATA_STREAMS.get(msg.req_stream_id, ())]
@@ -488,7 +488,7 @@ class Autopilot:
             self._send_digest()
 
     def _on_parameter_set(self, msg: Any, _at_ns: int) -> None:
-        """Answered with the value that holds now, whatever was asked; PX4 wants the right type."""
+        """Change a parameter and answer with the value that holds then; PX4 wants the right type."""
         name = msg.param_id
         if not self._for_me(msg) or name not in self.parameters:
             return
@@ -500,7 +500,7 @@ class Autopilot:
         self._send_parameter(name, by_name=True)
 
     def _send_parameter(self, name: str, *, by_name: bool = False) -> None:
-        """Tell a parameter; ArduPilot leaves out the index where it was asked by name."""
+        """Send a parameter; ArduPilot leaves out the index where it was asked by name."""
         p = self.parameters
         nameless = by_name and self._kind.name == "ardupilot"
         place = len(p.names), NO_INDEX if nameless else p.names.index(name)

@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT: one table, each command giving an honest MAV_RESULT."""
+"""COMMAND_LONG and COMMAND_INT: one table of commands, each answered with its MAV_RESULT."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RELATIVE_FRAMES = (3, 6)  # MAV_FRAME_GLOBAL_RELATIVE_ALT and its INT twin
 
 @dataclass(frozen=True)
 class CommandRequest:
-    """A command, however it came."""
+    """A command, from either message."""
 
     command: int  # MAV_CMD
     # the seven parameters; 5 and 6 of a COMMAND_INT are left in its integer units
@@ -44,7 +44,7 @@ class CommandRequest:
 
 
 class Commands:
-    """The commands of one vehicle."""
+    """Commands of one vehicle."""
 
     def __init__(self, vehicle: TelemetrySources, telemetry: Telemetry, send: Callable[[Message], None]) -> None:
         self._v = vehicle
@@ -65,7 +65,7 @@ class Commands:
         }
 
     def do(self, request: CommandRequest, at_ns: int) -> int:
-        """Carry out a command; gives its MAV_RESULT."""
+        """Carry out a command; return its MAV_RESULT."""
         command = self._table.get(request.command)
         return UNSUPPORTED if command is None else command(request, at_ns)
 
@@ -95,7 +95,7 @@ class Commands:
         return self._v.pilot.change(self._v.kind.by_role(Role.LAND), at_ns)
 
     def _take_off(self, request: CommandRequest, at_ns: int) -> int:
-        """PX4 takes an altitude above the sea, and its own height without; ArduPilot a height above home."""
+        """Take off: to an altitude above the sea, else its own height (PX4), or a height above home (ArduPilot)."""
         up = request.params[6]
         v = self._v
         if v.kind.name == "px4":
@@ -138,7 +138,7 @@ class Commands:
         return self._tell(HOME_POSITION, at_ns)
 
     def _set_home(self, request: CommandRequest, at_ns: int) -> int:
-        """Home is where the vehicle is now, or the place given."""
+        """Set home to where the vehicle is now, or to the place given."""
         v, p = self._v, request.params
         if not v.estimator.geographic:
             return FAILED

@@ -1,4 +1,4 @@
-"""The vehicle's own estimate of where it is: from GPS, or from external positions by each autopilot's own rules.
+"""Estimator of the simulated autopilot: position from GPS, or from external positions by each autopilot's rules.
 
 With GPS the estimate is the truth. With external positions it carries an error: accelerometers with a constant bias
 drift, samples pull the estimate back, and when they stop the error grows unseen. Bias, silence and flags are those of
@@ -36,7 +36,7 @@ LOST, ATTITUDE_ONLY = 0x25, 0x1
 
 
 class Estimator:
-    """Position and velocity as the vehicle believes them.
+    """Position and velocity as the vehicle estimates them.
 
     Args:
         kind: PX4 or ArduCopter.
@@ -105,7 +105,7 @@ class Estimator:
         return source == 1 or (source == 3 and p["GPS1_TYPE"] != 0) or (source == 6 and self._fusing)
 
     def begin_in_flight(self) -> None:
-        """Count as begun on the ground, with good external positions, an origin and no error."""
+        """Start as if begun on the ground, with good external positions, an origin and no error."""
         self.origin = True
         self._last_ns = self._updated_ns = self._craft.now_ns
         self._first_ns = self._last_ns - START_NS
@@ -123,7 +123,7 @@ class Estimator:
 
     @property
     def begun(self) -> bool:
-        """Whether there is an estimate at all, be it a bad one."""
+        """Whether there is an estimate at all, however bad."""
         return self.uses_gps or (self._last_ns is not None and self._has_origin)
 
     @property
@@ -142,7 +142,7 @@ class Estimator:
 
     @property
     def flags(self) -> int:
-        """EKF_STATUS_FLAGS, which are ESTIMATOR_STATUS_FLAGS."""
+        """Flags of EKF_STATUS_REPORT, the same as those of ESTIMATOR_STATUS."""
         if self.position_ok:
             good = self._kind.good_flags
             return good if self.geographic else good & ~0x210  # no absolute position without an origin
@@ -150,23 +150,23 @@ class Estimator:
 
     @property
     def position_m(self) -> Vec3:
-        """Where the vehicle believes to be, local NED."""
+        """Estimated position, local NED [m]."""
         return _sum(self._craft.position_m, self._position_error)
 
     @property
     def velocity_mps(self) -> Vec3:
-        """How it believes to move, local NED."""
+        """Estimated velocity, local NED [m/s]."""
         return _sum(self._craft.velocity_mps, self._velocity_error)
 
     # Its motion in time
 
     @property
     def next_ns(self) -> int | None:
-        """When the error is moved on next [ns]; None while there is none."""
+        """Time at which the error next moves on [ns]; None while there is none."""
         return self._step_ns if self.uses_external and not self.uses_gps and self._last_ns is not None else None
 
     def run(self, at_ns: int) -> None:
-        """Let the error grow, and tell the loops that fly."""
+        """Let the error grow, and pass it to the loops that fly."""
         if self.uses_gps:
             if self._position_error != ZERO or self._velocity_error != ZERO:
                 self._believe(ZERO, ZERO)
@@ -192,7 +192,7 @@ class Estimator:
     # External positions
 
     def take(self, msg: Any, at_ns: int) -> None:
-        """Take an external position, if it is of a kind that this autopilot takes and fuses."""
+        """Take an external position, if this autopilot takes and fuses messages of its kind."""
         if msg.get_type() not in TAKEN[self._kind.name] or not self.uses_external or self.uses_gps:
             return
         if msg.get_type() == "ODOMETRY" and not self._takes_frames(msg):
@@ -219,7 +219,7 @@ class Estimator:
         return rotated(self._craft.attitude, body) if wanted and good else None
 
     def _age_s(self, stamp_us: int, at_ns: int) -> float | None:
-        """Age of a sample with the configured delay; None if it is of no use.
+        """Return the age of a sample with the configured delay [s]; None if it cannot be used.
 
         To PX4 its stamp is moved by what TIMESYNC found; to ArduPilot it is what it took more than the quickest one.
         """
@@ -251,7 +251,7 @@ class Estimator:
         self._last_ns = at_ns
 
     def _correct(self, off: Vec3, speed: Vec3 | None, gap_s: float) -> None:
-        """Pull position and velocity, critically damped with time constant `FUSE_S` whatever the rate."""
+        """Pull position and velocity to a sample, critically damped with time constant `FUSE_S` at any rate."""
         keep = math.exp(-gap_s / FUSE_S)
         of_position, of_velocity = 1.0 - keep * keep, (1.0 - keep) ** 2 / max(gap_s, 1e-3)
         v = self._velocity_error

@@ -26,7 +26,7 @@ DRAWS = 1000  # normal numbers drawn at once
 
 @dataclass(frozen=True)
 class InertialErrors:
-    """Standard deviations of the errors of inertial and attitude data, each axis."""
+    """Standard deviations of the errors of inertial and attitude data, for each axis."""
 
     tilting_mps2: float  # constant bias of the accelerometer along front and right, by which the estimate tilts
     drift_mps2: float  # drift of that bias, by which it tilts too
@@ -42,7 +42,7 @@ class InertialErrors:
     gyro_vibration_rps: float  # white noise that flying adds to it
 
     def scaled(self, factor: float) -> InertialErrors:
-        """Multiply all of them by a factor."""
+        """Return the errors times a factor."""
         return InertialErrors(*(factor * size for size in astuple(self)))
 
 
@@ -104,7 +104,7 @@ class GaussMarkov:
 
 
 class Imu:
-    """One inertial measurement unit: its biases, and the noise of what it measures."""
+    """One inertial measurement unit: biases and noise of its measurements."""
 
     def __init__(self, errors: InertialErrors, seed: np.random.SeedSequence) -> None:
         e, draw = errors, normals(seed)
@@ -116,17 +116,17 @@ class Imu:
 
     @property
     def tilting_mps2(self) -> tuple[float, float]:
-        """Bias along front and right by which an estimate tilts."""
+        """Bias along front and right by which an estimate tilts [m/s²]."""
         (front, right), (one, other) = self._tilting, self._drift
         return front + one.value, right + other.value
 
     def move(self, elapsed_s: float) -> None:
-        """Let the bias drift on."""
+        """Let the biases drift on."""
         for drift in self._drift:
             drift.move(elapsed_s, self._errors.drift_mps2, next(self._draw))
 
     def force(self, true_mps2: Vec3, *, flies: bool) -> Vec3:
-        """Measure a specific force."""
+        """Measure a specific force [m/s²]."""
         e, draw, (tf, tr), (bf, br, bd) = self._errors, self._draw, self.tilting_mps2, self._bias
         noise = math.hypot(e.noise_mps2, e.vibration_mps2) if flies else e.noise_mps2
         front, right, down = true_mps2
@@ -137,7 +137,7 @@ class Imu:
         )
 
     def rates(self, true_rps: Vec3, *, flies: bool) -> Vec3:
-        """Measure body rates."""
+        """Measure body rates [rad/s]."""
         e, draw, (bp, bq, br) = self._errors, self._draw, self._gyro_bias
         noise = math.hypot(e.gyro_noise_rps, e.gyro_vibration_rps) if flies else e.gyro_noise_rps
         p, q, r = true_rps
@@ -153,7 +153,7 @@ class InertialMeasurement(NamedTuple):
 
 
 class InertialSensors:
-    """Two inertial units of a vehicle, and the attitude that its estimate makes of the first.
+    """Two inertial units of a vehicle, and the attitude estimated from the first.
 
     Until the first measurement the attitude is the true one, so who uses no inertial data is not disturbed by their
     errors. With `flown` the errors are there from the start, and the vehicle's own loops take the wrong attitude for
@@ -191,22 +191,22 @@ class InertialSensors:
         )
 
     def attitude(self) -> Quaternion:
-        """Estimate the attitude: what turns body axes FRD into NED."""
+        """Estimate the attitude: the rotation from body axes FRD to NED."""
         return turned(self._craft.attitude, self._error_rad()) if self._errs else self._craft.attitude
 
     def rates(self) -> Vec3:
-        """Measure the body rates that go with the attitude."""
+        """Measure the body rates that go with the attitude [rad/s]."""
         craft = self._craft
         return self._units[0].rates(craft.rates_rps, flies=not craft.landed) if self._errs else craft.rates_rps
 
     def run(self, at_ns: int) -> None:
-        """Mislead the loops that fly, when that is due."""
+        """Pass the attitude error to the loops that fly, when that is due."""
         if self.next_ns is not None and self.next_ns <= at_ns:
             self.next_ns = at_ns + STEP_NS
             self._craft.mislead_attitude(self._error_rad())
 
     def _error_rad(self) -> Vec3:
-        """Tell what the estimated attitude is turned by against the true one, about body axes."""
+        """Return the rotation from the true to the estimated attitude, about body axes [rad]."""
         self._move()
         front, right = self._units[0].tilting_mps2
         (roll, pitch), (one, other) = self._tilt, self._wander
@@ -218,7 +218,7 @@ class InertialSensors:
         )
 
     def _move(self) -> None:
-        """Move everything slow on to the present."""
+        """Move all slow errors on to the present."""
         now_ns = self._craft.now_ns
         if now_ns == self._moved_ns:
             return

@@ -1,4 +1,4 @@
-"""What the simulated autopilot decides: modes, arming, phases of flight, and whose setpoint is flown.
+"""Pilot of the simulated autopilot: modes, arming, phases of flight, and whose setpoint is flown.
 
 No bytes here: `autopilot.py` translates. There is no free fall, so disarming in the air is refused,
 forced or not.
@@ -26,7 +26,7 @@ READY_NS = 24_000_000_000
 def reasons(
     kind: SimulatedProfile, mode: Mode, parameters: Parameters, estimator: Estimator, battery: Supply, boot_age_ns: int
 ) -> tuple[str, ...]:
-    """What speaks against arming, as the texts of STATUSTEXT; nothing if it may arm."""
+    """Return the reasons against arming as texts of STATUSTEXT; none if it may arm."""
     found = list(preflight(kind, parameters, estimator, battery, boot_age_ns))
     if mode.role is Role.LAND:
         found.append(
@@ -38,7 +38,7 @@ def reasons(
 def preflight(
     kind: SimulatedProfile, parameters: Parameters, estimator: Estimator, battery: Supply, boot_age_ns: int
 ) -> tuple[str, ...]:
-    """What speaks against arming in any mode: the pre-arm bit of SYS_STATUS is its absence."""
+    """Return the reasons against arming in any mode; without any, SYS_STATUS has its pre-arm bit set."""
     return (
         _px4(parameters, estimator, battery)
         if kind.name == "px4"
@@ -77,7 +77,7 @@ NOSE_MPS = 0.5  # ArduPilot: the nose follows travel from this speed on
 
 
 class SetpointDispatch:
-    """Hands setpoints to the craft.
+    """Passes setpoints on to the craft.
 
     Attributes:
         obeyed: the setpoint that is flown, None if the vehicle flies by itself.
@@ -114,7 +114,7 @@ class SetpointDispatch:
         self._point_nose(setpoint)
 
     def _point_nose(self, setpoint: ParsedSetpoint) -> None:
-        """To the heading asked for; without one ArduPilot looks along its way, and PX4 stays as it is."""
+        """Turn to the heading asked for; without one ArduPilot looks along its way, and PX4 stays as it is."""
         north, east, _ = self._estimator.velocity_mps
         if setpoint.yaw_rad is not None:
             self._craft.face(setpoint.yaw_rad)
@@ -137,7 +137,7 @@ FORCED = 21196.0  # param2 of arming that skips the checks
 
 
 class Phase(Enum):
-    """Where the vehicle is; the value is EXTENDED_SYS_STATE's MAV_LANDED_STATE."""
+    """Phase of flight; the value is EXTENDED_SYS_STATE's MAV_LANDED_STATE."""
 
     GROUND = 1
     AIR = 2
@@ -146,7 +146,7 @@ class Phase(Enum):
 
 
 class Pilot:
-    """State machine of one vehicle, of the kind given.
+    """State machine of one vehicle's modes and phases of flight.
 
     With `airborne` it starts armed, flying and in its external mode; the setpoint timeout then counts
     from the first setpoint. Else it stands on the floor, disarmed.
@@ -207,7 +207,7 @@ class Pilot:
 
     @property
     def _deadline_ns(self) -> int | None:
-        """When silence has lasted too long; None when it does not matter."""
+        """Time at which silence has lasted too long [ns]; None when it does not matter."""
         last_ns = self.setpoint_ns
         if last_ns is None or not self.external:
             return None
@@ -220,19 +220,19 @@ class Pilot:
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next thing to do of itself [ns]."""
+        """Time at which it next acts by itself [ns]."""
         watch_ns = self._watch_ns if self._watches else None
         steered_ns = None if self._steered is None else self._steered.next_ns
         return earliest((self._phase_end_ns, self._deadline_ns, watch_ns, steered_ns, self._lift_ns))
 
     @property
     def _watches(self) -> bool:
-        """Whether the floor or a height is looked for; the linear plant flies through the floor where it likes."""
+        """Whether floor or height are watched; the linear plant may fly through the floor."""
         looks = (Phase.CLIMB, Phase.DESCENT) if self._steered is not None else (Phase.CLIMB, Phase.DESCENT, Phase.AIR)
         return self.phase in looks and self._craft.has_down
 
     def run(self, at_ns: int) -> None:
-        """Do what is due at `at_ns`, the vehicle being there."""
+        """Act on everything due at `at_ns`, with the vehicle moved there."""
         if self._deadline_ns is not None and self._deadline_ns <= at_ns:
             self._on_silence(at_ns)
         if self._lift_ns is not None and self._lift_ns <= at_ns:
@@ -258,14 +258,14 @@ class Pilot:
             self.helm.obey(setpoint)
 
     def crash(self, why: str) -> None:
-        """The autopilot's program dies; nothing is decided, said or answered from now on."""
+        """Stop the autopilot's program: nothing is decided, said or answered from now on."""
         self.crashed = why
         self._craft.accelerate((0.0, 0.0, 0.0))
 
     # Commands, each giving a MAV_RESULT
 
     def arm(self, at_ns: int, *, forced: bool = False) -> int:
-        """Arm, on the floor or (without effect) when armed already; forced skips the checks."""
+        """Arm on the floor, or (without effect) when armed already; `forced` skips the checks."""
         if self.armed:
             return ACCEPTED
         why = reasons(
@@ -305,7 +305,7 @@ class Pilot:
 
     @property
     def _height_m(self) -> float:
-        """Of a take-off, above the floor."""
+        """Height of a take-off above the floor [m]."""
         return self._parameters["MIS_TAKEOFF_ALT"] if self._takeoff_m is None else self._takeoff_m
 
     def take_off(self, height_m: float | None, at_ns: int) -> int:
@@ -335,20 +335,20 @@ class Pilot:
         return ACCEPTED
 
     def fail(self, mode: Mode, at_ns: int, *, returns: bool = False) -> None:
-        """A failsafe changes the mode; with `returns`, setpoints that come again end it."""
+        """Change the mode by a failsafe; with `returns`, setpoints that come again end it."""
         meant = self._meant
         self._enter(mode, at_ns)
         self._meant = meant  # nobody chose this one
         self.failsafe, self._returns = True, returns
 
     def recover(self, mode: Mode, at_ns: int) -> None:
-        """A failsafe ends, and the mode of before is back; a take-off goes on."""
+        """End a failsafe and return to the mode of before; a take-off goes on."""
         self._enter(mode, at_ns)
         if mode.role is Role.TAKEOFF and self.phase is not Phase.CLIMB:
             self._climb(at_ns)
 
     def lacks_stream(self, at_ns: int) -> bool:
-        """Whether it would not arm, as its mode is PX4's OFFBOARD and nobody sends setpoints."""
+        """Return whether arming is refused because the mode is PX4's OFFBOARD and nobody sends setpoints."""
         return self.mode.role is Role.EXTERNAL and self._kind.needs_stream and not self._streaming(at_ns)
 
     def _streaming(self, at_ns: int) -> bool:
@@ -434,7 +434,7 @@ class Pilot:
         self.phase = Phase.AIR  # and goes on to the height that it climbs to
 
     def _settle(self, at_ns: int) -> None:
-        """Know some time after that it has landed, as the autopilot of a quadrotor does."""
+        """Report the landing some time after touchdown, as the autopilot of a quadrotor does."""
         if self._stood_ns is None:
             self._stood_ns = at_ns
             if self._steered is None and self._kind.touch_text:
@@ -469,7 +469,7 @@ class Pilot:
             self._fly_itself(at_ns)
 
     def _fly_itself(self, at_ns: int) -> None:
-        """Fly what the phase asks for."""
+        """Fly as the phase asks for."""
         self.helm.obeyed = None
         if self.phase is Phase.CLIMB:
             self._craft.take_off(self._height_m)

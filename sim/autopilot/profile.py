@@ -1,4 +1,4 @@
-"""Parameters of the simulated autopilots: the ones that change what they do, and some that only tell.
+"""Profiles and parameters of the simulated autopilots: those that change their behaviour, and some that only inform.
 
 The rest of the real ones' thousand parameters are not there: a vehicle that took a parameter and did not heed it would
 tell a client something untrue. For the same reason a value that is not simulated is refused.
@@ -32,7 +32,7 @@ LIMITS = {ParameterType.INT8: 2**7, ParameterType.INT16: 2**15, ParameterType.IN
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter."""
+    """A parameter of an autopilot."""
 
     value: float  # at the start
     kind: ParameterType  # its type
@@ -52,7 +52,7 @@ def _real(value: float, *allowed: float) -> Parameter:
 
 
 def _told(value: float, kind: ParameterType = ParameterType.REAL32) -> Parameter:
-    """One that tells what the vehicle is, and cannot be changed."""
+    """Make a parameter that describes the vehicle and cannot be changed."""
     return Parameter(value, kind, (value,))
 
 
@@ -124,7 +124,7 @@ OWN_ID = {"px4": "MAV_SYS_ID", "ardupilot": "SYSID_THISMAV"}
 
 
 class Parameters:
-    """The values of one vehicle, in order of name as they are numbered on the wire.
+    """Parameter values of one vehicle, in order of name as they are numbered on the wire.
 
     Args:
         system_id: MAVLink system id of the vehicle.
@@ -150,43 +150,43 @@ class Parameters:
         return name in self._values
 
     def kind(self, name: str) -> ParameterType:
-        """Type of a parameter."""
+        """Return the type of a parameter."""
         return self._table[name].kind
 
     def allowed(self, name: str) -> tuple[float, ...]:
-        """The values of a parameter that are simulated; empty is all."""
+        """Return the values of a parameter that are simulated; empty means all."""
         return self._table[name].allowed
 
     def takes(self, name: str, value: float) -> bool:
-        """Whether a parameter can be changed to a value; not if it is none, or is not simulated."""
+        """Return whether a parameter can take a value: a finite one, and one that is simulated."""
         one = self._table[name]
         if not math.isfinite(value) or abs(value) > 1e9:
             return False
         return not one.allowed or _stored(value, one.kind) in {_stored(allowed, one.kind) for allowed in one.allowed}
 
     def set(self, name: str, value: float) -> bool:
-        """Change a parameter; False if it stays as it is, since it does not take the value."""
+        """Change a parameter; return False if it does not take the value and stays as it is."""
         takes = self.takes(name, value)
         if takes:
             self._values[name] = _stored(value, self._table[name].kind)
         return takes
 
     def encoded(self, name: str) -> float:
-        """A value as it travels in PARAM_VALUE: PX4 puts the bytes of an integer into the float, ArduPilot casts."""
+        """Encode a value for PARAM_VALUE: PX4 puts the bytes of an integer into the float, ArduPilot casts."""
         value = self._values[name]
         if self._bytewise and self.kind(name) is not ParameterType.REAL32:
             return float(struct.unpack("<f", struct.pack("<i", int(value)))[0])
         return value
 
     def decoded(self, name: str, wire: float) -> float:
-        """The inverse of `encoded` for what PARAM_SET carries."""
+        """Decode the value of PARAM_SET, the inverse of `encoded`."""
         if self._bytewise and self.kind(name) is not ParameterType.REAL32:
             return float(struct.unpack("<i", struct.pack("<f", wire))[0])
         return wire
 
     @property
     def digest(self) -> float:
-        """PX4's `_HASH_CHECK`: CRC-32 of all names and values in order, its bytes as a float."""
+        """PX4's `_HASH_CHECK`: CRC-32 of all names and values in order, its bytes read as a float."""
         crc = 0
         for name in self.names:
             form = "<f" if self.kind(name) is ParameterType.REAL32 else "<i"
@@ -196,7 +196,7 @@ class Parameters:
 
 
 def _stored(value: float, kind: ParameterType) -> float:
-    """A value as the autopilot keeps it: a float, or the nearest integer within the type."""
+    """Return a value as the autopilot keeps it: a float, or the nearest integer within the type."""
     if kind is ParameterType.REAL32:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])
     return float(min(max(math.floor(value + 0.5), -LIMITS[kind]), LIMITS[kind] - 1))
@@ -212,7 +212,7 @@ ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 
 
 class Role(Enum):
-    """What a mode means here."""
+    """Role of a mode in the simulation."""
 
     EXTERNAL = auto()  # takes our setpoints
     HOLD = auto()  # brakes and waits
@@ -233,7 +233,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class SimulatedProfile:
-    """One kind of autopilot."""
+    """Profile of one kind of autopilot: modes, parameters, timing."""
 
     name: Literal["px4", "ardupilot"]
     autopilot: int  # MAV_AUTOPILOT
@@ -266,20 +266,20 @@ class SimulatedProfile:
     greeting: tuple[bytes, ...]  # text on a TCP link, before its first packet and between that and the second
 
     def mode(self, name: str) -> Mode:
-        """The mode of this name."""
+        """Return the mode of this name."""
         return next(mode for mode in self.modes if mode.name == name)
 
     def by_role(self, role: Role) -> Mode:
-        """The first mode of a role."""
+        """Return the first mode of a role."""
         return next(mode for mode in self.modes if mode.role is role)
 
     def by_number(self, custom: int) -> Mode | None:
-        """The mode with this custom_mode, None if there is none."""
+        """Return the mode with this custom_mode; None if there is none."""
         return next((mode for mode in self.modes if mode.custom == custom), None)
 
 
 def px4_custom(main: int, sub: int) -> int:
-    """PX4's custom_mode: main mode in bits 16-23, sub mode in bits 24-31."""
+    """Return PX4's custom_mode: main mode in bits 16-23, sub mode in bits 24-31."""
     return main << 16 | sub << 24
 
 

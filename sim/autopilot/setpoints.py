@@ -1,4 +1,4 @@
-"""What SET_POSITION_TARGET_LOCAL_NED asks for, by the rules of each autopilot (as observed of the real ones)."""
+"""Setpoints of SET_POSITION_TARGET_LOCAL_NED, by the rules of each autopilot (as observed of the real ones)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BODY_FRAMES = (BODY_NED, BODY_OFFSET_NED)
 
 
 class SetpointKind(Enum):
-    """What a setpoint is about."""
+    """Kind of a setpoint."""
 
     ACCELERATION = auto()
     VELOCITY = auto()
@@ -34,7 +34,7 @@ class SetpointKind(Enum):
 
 @dataclass(frozen=True)
 class ParsedSetpoint:
-    """What is asked of the vehicle."""
+    """Motion that a setpoint asks for."""
 
     ask: SetpointKind  # what about
     vector: Vec3 = ZERO  # acceleration, velocity or position in local NED
@@ -67,7 +67,7 @@ def _fields(msg: Any) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def _limited(number: float) -> float:
-    """A finite number within the limits; what is not finite stays what it is."""
+    """Limit a number; one that is not finite stays as it is."""
     return min(max(number, -LARGEST), LARGEST) if math.isfinite(number) else number
 
 
@@ -82,7 +82,7 @@ def _yaw(msg: Any, add_rad: float) -> float | None:
 
 
 def _px4(kind: SimulatedProfile, msg: Any, attitude: Quaternion) -> ParsedSetpoint:
-    """PX4: a field that is ignored or not a number is unset; all three of a kind are needed to fly it.
+    """Read a setpoint as PX4: a field that is ignored or NaN is unset; all three of a kind are needed to fly it.
 
     A message in which nothing is set does not count for the stream. Source: PX4's handling of the message in its
     MAVLink receiver.
@@ -108,7 +108,7 @@ def _px4(kind: SimulatedProfile, msg: Any, attitude: Quaternion) -> ParsedSetpoi
 
 
 def _moving(position: Vec3, velocity: Vec3 | None, accel: Vec3 | None, yaw: float | None) -> ParsedSetpoint:
-    """A position, with what of its motion is told in full."""
+    """Return a position setpoint, with velocity and acceleration if they are given in full."""
     ahead = velocity if velocity and _finite(velocity) else None
     change = accel if accel and _finite(accel) else None
     if ahead is None and change is None:
@@ -117,7 +117,7 @@ def _moving(position: Vec3, velocity: Vec3 | None, accel: Vec3 | None, yaw: floa
 
 
 def _set(vector: Vec3, ignored: int, *, whole: bool) -> Vec3 | None:
-    """A vector whose ignored axes are no numbers, None if all are; with `whole`, one ignored axis ignores all."""
+    """Return a vector with NaN on ignored axes, None if all are; with `whole`, one ignored axis ignores all."""
     if whole and ignored:
         return None
     north, east, down = (math.nan if ignored >> i & 1 else number for i, number in enumerate(vector))
@@ -125,14 +125,14 @@ def _set(vector: Vec3, ignored: int, *, whole: bool) -> Vec3 | None:
 
 
 def _turned(vector: Vec3, heading: float) -> Vec3:
-    """A vector turned about the vertical."""
+    """Return a vector turned about the vertical."""
     north, east, down = vector
     cos, sin = math.cos(heading), math.sin(heading)
     return (cos * north - sin * east, sin * north + cos * east, down) if heading != 0.0 else vector
 
 
 def _ardupilot(kind: SimulatedProfile, msg: Any, place_m: Vec3, attitude: Quaternion) -> ParsedSetpoint:
-    """ArduPilot: one ignored axis ignores all three; numbers are not checked; the force bit is dropped."""
+    """Read a setpoint as ArduPilot: one ignored axis ignores all three; NaN passes; the force bit is dropped."""
     if msg.coordinate_frame not in kind.frames:
         return STOP
     heading = heading_rad(attitude) if msg.coordinate_frame in BODY_FRAMES else 0.0

@@ -1,4 +1,4 @@
-"""Telemetry: messages, rates, geodesy."""
+"""Telemetry of the simulated autopilot: messages, rates, geodesy."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ LARGEST_E7 = 2**31 - 1
 
 @dataclass(frozen=True)
 class GeodeticOrigin:
-    """Where local NED has its zero."""
+    """Geographic position of local NED's zero."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
 
     def degrees_e7(self, place_m: Vec3) -> tuple[int, int]:
-        """Latitude and longitude of a place, as MAVLink has them [1e-7 degrees]."""
+        """Return latitude and longitude of a place, in MAVLink's unit [1e-7 degrees]."""
         lat = self.latitude_deg + math.degrees(place_m[0] / EARTH_M)
         lon = self.longitude_deg + math.degrees(place_m[1] / (EARTH_M * self._shrink))
         return _clipped(1e7 * lat), _clipped(1e7 * lon)
 
     def altitude_mm(self, place_m: Vec3) -> int:
-        """Height of a place above the sea [mm]."""
+        """Return the height of a place above the sea [mm]."""
         return _clipped(1000.0 * (self.altitude_m - place_m[2]))
 
     def local_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Local NED of a place on the globe."""
+        """Return a place on the globe in local NED [m]."""
         return (
             math.radians(latitude_deg - self.latitude_deg) * EARTH_M,
             math.radians(longitude_deg - self.longitude_deg) * EARTH_M * self._shrink,
@@ -70,7 +70,7 @@ Told = tuple[int, Vec3, Vec3, Vec3]  # type mask, position, velocity, accelerati
 
 
 def target(kind: SimulatedProfile, pilot: Pilot, estimator: Estimator, attitude: Quaternion, boot_ms: int) -> Any:
-    """The message (pymavlink's classes have no types); None where there is nothing to tell.
+    """Return POSITION_TARGET_LOCAL_NED (pymavlink's classes have no types); None where there is nothing to tell.
 
     Args:
         estimator: where the vehicle believes to be.
@@ -88,7 +88,7 @@ def target(kind: SimulatedProfile, pilot: Pilot, estimator: Estimator, attitude:
 
 
 def _px4(pilot: Pilot, estimator: Estimator) -> Told:
-    """Told always; what it flies by itself it plans as position, velocity and acceleration."""
+    """Return PX4's target, sent always: in modes of its own it plans position, velocity and acceleration."""
     obeyed = pilot.helm.obeyed
     if obeyed is not None and obeyed.ask is SetpointKind.ACCELERATION:
         return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, obeyed.vector
@@ -102,7 +102,7 @@ def _px4(pilot: Pilot, estimator: Estimator) -> Told:
 
 
 def _ardupilot(pilot: Pilot) -> Told | None:
-    """Told when guided only; it rests and brakes by a velocity, and climbs to a position."""
+    """Return ArduPilot's target, sent in GUIDED only: rest and braking by a velocity, a climb to a position."""
     if pilot.mode.role is not Role.EXTERNAL:
         return None
     no_yaw = IGNORE_YAW | IGNORE_YAW_RATE
@@ -186,7 +186,7 @@ ONBOARD_MS = {
 
 @dataclass(frozen=True)
 class TelemetrySources:
-    """Everything that telemetry tells of."""
+    """Objects whose state telemetry reports."""
 
     kind: SimulatedProfile
     craft: Vehicle
@@ -201,7 +201,7 @@ class TelemetrySources:
 
 
 class Telemetry:
-    """Streams of one vehicle.
+    """Telemetry streams of one vehicle.
 
     Attributes:
         streams: message id to what makes it; None from it is nothing to tell yet.
@@ -247,7 +247,7 @@ class Telemetry:
         return min((due for kind, due in self._due_ns.items() if self._period_ns[kind] > 0), default=None)
 
     def due(self, at_ns: int) -> list[Message]:
-        """The messages that are due."""
+        """Return the messages that are due."""
         if self.next_ns is None or self.next_ns > at_ns:
             return []
         made = []
@@ -259,17 +259,17 @@ class Telemetry:
         return [msg for msg in made if msg is not None]
 
     def make(self, kind: int, at_ns: int) -> Message | None:
-        """One message now; None if there is nothing to tell, or no such message."""
+        """Make one message now; None if there is nothing to tell, or no such message."""
         return self.streams[kind](at_ns) if kind in self.streams else None
 
     def interval_us(self, kind: int) -> int:
-        """Interval of a message as MESSAGE_INTERVAL tells it: -1 not sent, 0 not known."""
+        """Return the interval of a message as MESSAGE_INTERVAL has it [µs]: -1 not sent, 0 not known."""
         if kind not in self.streams:
             return 0
         return self._period_ns[kind] // 1000 or -1
 
     def set_interval(self, kind: float, interval_us: float, at_ns: int) -> bool:
-        """Change an interval: 0 is the usual one, -1 none; False if that is not possible."""
+        """Set an interval [µs]: 0 is the default one, -1 none; return False if that is not possible."""
         if kind not in self.streams or not (interval_us == -1.0 or 0.0 <= interval_us <= 1e9):
             return False
         number = int(kind)
@@ -346,14 +346,14 @@ class Telemetry:
         return mavlink.MAVLink_attitude_quaternion_message(self._boot_ms(at_ns), *turn, *inertial.rates())
 
     def _highres_imu(self, _at_ns: int) -> Message:
-        """HIGHRES_IMU of PX4: SI units; of its fields those of accelerometer and gyroscope alone."""
+        """Return PX4's HIGHRES_IMU in SI units, with the fields of accelerometer and gyroscope only."""
         measured_ns, force, rates = self._v.inertial.measure(0)
         nothing = [0.0] * 7  # magnetometer, barometer and their temperature
         boot_us = self._boot_us(measured_ns)
         return mavlink.MAVLink_highres_imu_message(boot_us, *force, *rates, *nothing, FORCE_AND_RATES)
 
     def _raw_imu(self, _at_ns: int) -> Message:
-        """RAW_IMU of ArduPilot: scaled like SCALED_IMU, despite its name."""
+        """Return ArduPilot's RAW_IMU, scaled like SCALED_IMU despite its name."""
         measured_ns, force, rates = self._v.inertial.measure(0)
         return mavlink.MAVLink_raw_imu_message(self._boot_us(measured_ns), *in_thousandths(force, rates), 0, 0, 0)
 
@@ -369,7 +369,7 @@ class Telemetry:
         return mavlink.MAVLink_local_position_ned_message(boot_ms, *estimator.position_m, *estimator.velocity_mps)
 
     def _odometry(self, at_ns: int) -> Message | None:
-        """ODOMETRY of its own estimate: as recorded, all of it in local NED."""
+        """Return ODOMETRY of the vehicle's own estimate; as recorded, all of it in local NED."""
         estimator, inertial = self._v.estimator, self._v.inertial
         if not estimator.begun:
             return None
@@ -410,7 +410,7 @@ class Telemetry:
         return mavlink.MAVLink_home_position_message(*place, *home, level, 0.0, 0.0, 0.0, self._boot_us(at_ns))
 
     def _radio(self, at_ns: int) -> Message | None:
-        """The stick at rest: nothing while there is none."""
+        """Return RC_CHANNELS with the stick at rest; nothing without a remote control."""
         if not self._v.radio:
             return None
         channels = *STICK_US, *([NO_CHANNEL] * (18 - len(STICK_US)))
@@ -436,7 +436,7 @@ class Telemetry:
         return target(v.kind, v.pilot, v.estimator, v.craft.attitude, self._boot_ms(at_ns))
 
     def _timesync(self, at_ns: int) -> Message:
-        """A request of the autopilot's own."""
+        """Return a TIMESYNC request of the autopilot's own."""
         return mavlink.MAVLink_timesync_message(0, at_ns - self._v.boot_ns)
 
     def _battery(self, _at_ns: int) -> Message:
@@ -461,7 +461,7 @@ class Telemetry:
         return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
 
     def _estimator(self, at_ns: int) -> Message:
-        """PX4's; it tells of every vehicle at rest that it assumes a constant position."""
+        """Return PX4's ESTIMATOR_STATUS; of a vehicle at rest it says that it assumes a constant position."""
         estimator = self._v.estimator
         flags = estimator.flags | (CONSTANT if self._v.pilot.phase is Phase.GROUND else 0)
         ratio, accuracy = (0.1, 0.05) if estimator.position_ok else (2.0, 10.0)
@@ -471,7 +471,7 @@ class Telemetry:
 
     @property
     def _stands(self) -> bool:
-        """Whether it is on the floor, its rotors perhaps spinning up."""
+        """Whether the vehicle is on the floor, its rotors perhaps spinning up."""
         return self._v.pilot.phase is Phase.GROUND or (self._v.pilot.phase is Phase.CLIMB and self._v.craft.grounded)
 
     def _landed(self, _at_ns: int) -> Message:
@@ -481,7 +481,7 @@ class Telemetry:
 
 
 def clipped_mm(metres: float) -> int:
-    """Millimetres that fit 32 bits."""
+    """Return a length in millimetres that fits 32 bits [mm]."""
     return min(max(round(1000.0 * metres), -(2**31)), 2**31 - 1)
 
 

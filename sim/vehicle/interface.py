@@ -1,4 +1,4 @@
-"""What the simulated autopilot asks of whatever flies, and the linear plant made to do it."""
+"""Interface of a simulated vehicle to its autopilot, and the linear plant that implements it."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class Supply(Protocol):
-    """A battery as telemetry sees it."""
+    """Battery as telemetry sees it."""
 
     @property
     def voltage_v(self) -> float:
-        """At the terminals."""
+        """Voltage at the terminals [V]."""
         ...
 
     @property
     def current_a(self) -> float:
-        """Of the load."""
+        """Current of the load [A]."""
         ...
 
     @property
@@ -44,7 +44,7 @@ class Vehicle(Protocol):
 
     @property
     def now_ns(self) -> int:
-        """How far its time has come."""
+        """Present time [ns]."""
         ...
 
     @property
@@ -54,32 +54,32 @@ class Vehicle(Protocol):
 
     @property
     def position_m(self) -> Vec3:
-        """True position."""
+        """True position [m]."""
         ...
 
     @property
     def velocity_mps(self) -> Vec3:
-        """True velocity."""
+        """True velocity [m/s]."""
         ...
 
     @property
     def attitude(self) -> Quaternion:
-        """Attitude: turns body axes FRD into NED."""
+        """True attitude (w, x, y, z): turns body axes FRD into NED."""
         ...
 
     @property
     def rates_rps(self) -> Vec3:
-        """Body rates about front, right, down."""
+        """Body rates about front, right, down [rad/s]."""
         ...
 
     @property
     def acceleration_mps2(self) -> Vec3:
-        """True acceleration at `measured_ns`; zero on the floor."""
+        """True acceleration at `measured_ns` [m/s²]; zero on the floor."""
         ...
 
     @property
     def measured_ns(self) -> int:
-        """Time of attitude, rates and acceleration: now, or the last step of its physics."""
+        """Time of attitude, rates and acceleration [ns]: now, or the last step of the vehicle's physics."""
         ...
 
     @property
@@ -93,37 +93,37 @@ class Vehicle(Protocol):
         ...
 
     def accelerate(self, accel_mps2: Vec3) -> None:
-        """Hold this acceleration setpoint from now on."""
+        """Hold this acceleration setpoint from now on [m/s²]."""
 
     def brake(self) -> None:
         """Stop, and stay where that ends."""
 
     def fly(self, velocity_mps: Vec3) -> None:
-        """Fly this velocity."""
+        """Fly this velocity [m/s]."""
 
     def go_to(self, position_m: Vec3) -> None:
-        """Fly to this position and stay."""
+        """Fly to this position and stay [m]."""
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
-        """Be at this position, which moves with this velocity and acceleration."""
+        """Hold a position [m] that moves with this velocity [m/s] and acceleration [m/s²]."""
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the floor, over the present place."""
+        """Climb to this height above the floor [m], over the present place."""
 
     def land(self) -> None:
         """Sink at the landing speed."""
 
     def face(self, yaw_rad: float) -> None:
-        """Turn the nose to this heading, clockwise from north."""
+        """Turn the nose to this heading, clockwise from north [rad]."""
 
     def rest(self) -> None:
         """Stand on the floor, rotors off, until `grounded` is cleared."""
 
     def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """What its own loops take for position and velocity is wrong by so much from now on."""
+        """Add an error to position and velocity as the vehicle's own loops see them, from now on."""
 
     def mislead_attitude(self, error_rad: Vec3) -> None:
-        """Turn what its own loops take for its attitude by so much about body axes, from now on."""
+        """Turn the attitude that the vehicle's own loops see by so much about body axes [rad], from now on."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class FullBattery:
 
 
 class _Goal(Enum):
-    """What the linear plant does by itself."""
+    """Goal that the linear plant flies to by itself."""
 
     NOTHING = auto()  # an acceleration setpoint acts
     VELOCITY = auto()
@@ -146,7 +146,7 @@ class _Goal(Enum):
 
 
 class SteeredPlant:
-    """The linear plant with simple laws (`steering.py`) in place of loops; always level, its nose north.
+    """Linear plant with simple laws (`steering.py`) in place of loops; always level, its nose north.
 
     Its laws are evaluated at `next_ns`, every 20 ms, and when something new is asked.
     """
@@ -165,12 +165,12 @@ class SteeredPlant:
 
     @property
     def next_ns(self) -> int | None:
-        """When its laws are evaluated next [ns]; None while an acceleration setpoint acts or on the floor."""
+        """Time of the next evaluation of its laws [ns]; None under an acceleration setpoint, or on the floor."""
         return None if self._goal is _Goal.NOTHING or self.grounded else self._steer_ns
 
     @property
     def now_ns(self) -> int:
-        """How far its time has come."""
+        """Present time [ns]."""
         return self._plant.now_ns
 
     @property
@@ -180,22 +180,22 @@ class SteeredPlant:
 
     @property
     def position_m(self) -> Vec3:
-        """True position."""
+        """True position [m]."""
         return self._plant.position_m
 
     @property
     def velocity_mps(self) -> Vec3:
-        """True velocity."""
+        """True velocity [m/s]."""
         return self._plant.velocity_mps
 
     @property
     def acceleration_mps2(self) -> Vec3:
-        """True acceleration; zero on the floor."""
+        """True acceleration [m/s²]; zero on the floor."""
         return self._plant.acceleration_mps2
 
     @property
     def measured_ns(self) -> int:
-        """Time of the acceleration: now."""
+        """Time of the acceleration [ns]: now."""
         return self._plant.now_ns
 
     @property
@@ -213,7 +213,7 @@ class SteeredPlant:
         self._plant.grounded = grounded
 
     def accelerate(self, accel_mps2: Vec3) -> None:
-        """Hold this acceleration setpoint from now on."""
+        """Hold this acceleration setpoint from now on [m/s²]."""
         self._goal = _Goal.NOTHING
         self._plant.accelerate(accel_mps2)
 
@@ -222,20 +222,20 @@ class SteeredPlant:
         self._ask(_Goal.VELOCITY, ZERO)
 
     def fly(self, velocity_mps: Vec3) -> None:
-        """Fly this velocity."""
+        """Fly this velocity [m/s]."""
         self._ask(_Goal.VELOCITY, velocity_mps)
 
     def go_to(self, position_m: Vec3) -> None:
-        """Fly to this position."""
+        """Fly to this position [m]."""
         self._ask(_Goal.POSITION, position_m)
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
-        """Be at this position, which moves with this velocity; its acceleration is not used."""
+        """Hold a position [m] that moves with this velocity [m/s]; the acceleration is not used."""
         del accel_mps2
         self._ask(_Goal.POSITION, position_m, velocity_mps)
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the floor."""
+        """Climb to this height above the floor [m]."""
         self._ask(_Goal.CLIMB, (0.0, 0.0, -height_m))
 
     def land(self) -> None:
@@ -243,7 +243,7 @@ class SteeredPlant:
         self._ask(_Goal.LAND, ZERO)
 
     def face(self, yaw_rad: float) -> None:
-        """Nothing: the nose stays north."""
+        """Do nothing: the nose stays north."""
 
     def rest(self) -> None:
         """Stand on the floor until `grounded` is cleared."""
@@ -251,14 +251,14 @@ class SteeredPlant:
         self._plant.rest()
 
     def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """What its laws take for position and velocity is wrong by so much from now on."""
+        """Add an error to position and velocity as its laws see them, from now on."""
         self._errors = (position_error_m, velocity_error_mps)
 
     def mislead_attitude(self, error_rad: Vec3) -> None:
         """Do nothing: its laws know no attitude."""
 
     def steer(self) -> None:
-        """Evaluate the law of what is asked, and hold its acceleration."""
+        """Evaluate the law of the present goal, and hold its acceleration."""
         self._steer_ns = self.now_ns + STEER_NS
         where, speed = self._plant.position_m, self._plant.velocity_mps
         off_m, off_mps = self._errors
@@ -287,18 +287,18 @@ class SteeredPlant:
 
 
 def tuple_minus(a: Vec3, b: Vec3) -> Vec3:
-    """Difference of two vectors."""
+    """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def heading_rad(attitude: Quaternion) -> float:
-    """Heading of an attitude, clockwise from north."""
+    """Return the heading of an attitude, clockwise from north [rad]."""
     w, x, y, z = attitude
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
-    """A vector in body axes, in NED."""
+    """Return a vector in body axes, turned into NED."""
     w, x, y, z = attitude
     bx, by, bz = body
     return (
@@ -309,6 +309,6 @@ def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
 
 
 def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:
-    """A vector in NED, in body axes."""
+    """Return a vector in NED, turned into body axes."""
     w, x, y, z = attitude
     return rotated((w, -x, -y, -z), ned)

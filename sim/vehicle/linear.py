@@ -1,4 +1,4 @@
-"""The simulated vehicle's motion: the linear plant, advanced exactly in continuous time.
+"""Linear plant of the simulator, advanced exactly in continuous time.
 
 Built from the configuration by the simulator's own code, not by the controller's plant, so that
 a mistake in one of them shows as a disagreement.
@@ -31,7 +31,7 @@ CACHED_TRANSITIONS = 256
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """x(k+1) = A x + B u + E w, w ~ N(0, W), with the generator of its continuous-time flow."""
+    """Linear model x(k+1) = A x + B u + E w, w ~ N(0, W), with the generator of its continuous-time flow."""
 
     a: Array  # A (n_x, n_x)
     b: Array  # B (n_x, n_u)
@@ -45,7 +45,7 @@ class LinearModel:
     accel_per_input: Array  # (n_u,) acceleration setpoint per unit of input
 
     def transition(self, duration_ns: int) -> tuple[Array, Array, Array]:
-        """A, B, E of a step of `duration_ns` with u and w held; those of the plant for Δt itself."""
+        """Return A, B, E of a step of `duration_ns` with u and w held; those of the plant for Δt itself."""
         if duration_ns == self.dt_ns:
             return self.a, self.b, self.e
         return _split(expm(self.flow * (duration_ns * 1e-9)), *self.b.shape)
@@ -56,7 +56,7 @@ def _split(m: Array, n_x: int, n_u: int) -> tuple[Array, Array, Array]:
 
 
 def linear_model(plant: PlantConfig) -> LinearModel:
-    """Build the model of either kind from its configuration.
+    """Build the linear model of a configuration, of either kind.
 
     Raises:
         DesignError: the matrices have no real logarithm, so there is no motion between the steps.
@@ -94,7 +94,7 @@ def linear_model(plant: PlantConfig) -> LinearModel:
 
 
 def _drag_lag_flow(plant: PlantConfig) -> Array:
-    """Continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a, each axis."""
+    """Return the continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a for each axis."""
     n = len(plant.axes)
     axis = [
         np.array([[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]])
@@ -109,7 +109,7 @@ def _drag_lag_flow(plant: PlantConfig) -> Array:
 
 
 def _velocity_reference_flow(plant: PlantConfig) -> Array:
-    """Continuous-time generator of the vehicle's own loops on a reference that the input accelerates, each axis.
+    """Return the generator of the vehicle's own loops on a reference that the input accelerates, for each axis.
 
     In the coordinates of the loops: reference P, V with P' = V, V' = u; the acceleration b that they make; their
     integral j; the force f. The states are linear in these.
@@ -148,7 +148,7 @@ def _velocity_reference_flow(plant: PlantConfig) -> Array:
 
 
 def _generator(a: Array, b: Array, e: Array, dt_s: float) -> Array:
-    """Matrix logarithm of [[A, B, E], [0, I]] over Δt."""
+    """Return the matrix logarithm of [[A, B, E], [0, I]] over Δt."""
     n_x, held = a.shape[0], b.shape[1] + e.shape[1]
     m = np.block([[a, b, e], [np.zeros((held, n_x)), np.eye(held)]])
     if np.linalg.matrix_rank(a) == n_x:
@@ -204,7 +204,7 @@ class LinearVehicle:
 
     @property
     def state(self) -> Array:
-        """State x (n_x,) now."""
+        """Present state x (n_x,)."""
         if self._x is None:
             a, b, e = self._transition(self.now_ns - self._anchor_ns)
             self._x = a @ self._anchor_x + b @ self._u + e @ self._w
@@ -222,12 +222,12 @@ class LinearVehicle:
 
     @property
     def velocity_mps(self) -> Vec3:
-        """Velocity in local NED [m/s]; zero along axes that the plant has not."""
+        """Velocity in local NED [m/s]; zero along axes that the plant does not have."""
         return self._vec3(self.model.velocity_index, (0.0, 0.0, 0.0))
 
     @property
     def acceleration_mps2(self) -> Vec3:
-        """Acceleration in local NED [m/s²]; zero along axes that the plant has not, and on the floor."""
+        """Acceleration in local NED [m/s²]; zero on the floor, and along axes that the plant does not have."""
         values = [0.0, 0.0, 0.0]
         if not self.grounded:
             changes = self._speeding @ np.concatenate((self.state, self._u, self._w))
@@ -267,7 +267,7 @@ class LinearVehicle:
         self._anchor_ns = self.now_ns
 
     def accelerate(self, accel_mps2: Vec3) -> None:
-        """Hold this acceleration setpoint from now on; axes that the plant has not ignore it."""
+        """Hold this acceleration setpoint [m/s²] from now on, in the axes that the plant has."""
         wanted = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
         u = np.array(wanted) / self.model.accel_per_input
         if not np.array_equal(u, self._u):

@@ -1,4 +1,4 @@
-"""Outer loops of the cascade: what is asked of the vehicle, the reference that it follows, the acceleration it wants.
+"""Outer loops of the cascade: setpoint, reference that follows it, and the acceleration that holds the vehicle on it.
 
 A reference (position, velocity, acceleration) moves within limits towards what is asked; a proportional position loop
 and a proportional-integral velocity loop hold the vehicle on it. What distinguishes the autopilots is what an
@@ -34,7 +34,7 @@ LEAST_UP_MPS2 = 1.0  # thrust asked for is never less than this much upward: the
 
 @dataclass(frozen=True)
 class Lean:
-    """A wanted thrust per mass and the attitude that points it."""
+    """Thrust per mass, and the attitude that points it."""
 
     force_mps2: Vec3  # specific force wanted of the rotors, NED
     attitude: Quaternion  # that points the rotors along it with the wanted heading
@@ -43,7 +43,7 @@ class Lean:
 
 
 def lean(accel_mps2: Vec3, yaw_rad: float, tilt_limit_rad: float) -> Lean:
-    """The lean that gives an acceleration in still air; height comes before way where the tilt is limited."""
+    """Return the lean that gives an acceleration in still air; where the tilt is limited, height has priority."""
     north, east = accel_mps2[0], accel_mps2[1]
     wanted_up = GRAVITY_MPS2 - accel_mps2[2]
     up = max(wanted_up, LEAST_UP_MPS2)
@@ -63,7 +63,7 @@ def lean(accel_mps2: Vec3, yaw_rad: float, tilt_limit_rad: float) -> Lean:
 
 
 class AttitudeLoop:
-    """Attitude error to rates, proportional; rates to torque with proportional, integral and derivative parts.
+    """Attitude controller: proportional from attitude error to rates, PID from rates to torque.
 
     Args:
         airframe: its inertia turns angular accelerations into torques.
@@ -78,13 +78,13 @@ class AttitudeLoop:
         self.reset((0.0, 0.0, 0.0))
 
     def reset(self, rates_rps: Vec3) -> None:
-        """Forget the past; the body turns at these rates."""
+        """Forget the past; the body turns at these rates [rad/s]."""
         self._last = rates_rps
         self._slope: Vec3 = (0.0, 0.0, 0.0)
         self._integral: Vec3 = (0.0, 0.0, 0.0)
 
     def torque(self, motion: BodyState, attitude: Quaternion, *, integrate: bool) -> Vec3:
-        """Torque [N m] that turns the body towards an attitude; `integrate` is false at the rotors' limits."""
+        """Return the torque that turns the body towards an attitude [N m]; do not `integrate` at the rotors' limits."""
         w, x, y, z = motion.attitude
         a, b, c, d = attitude
         ew, ex = w * a + x * b + y * c + z * d, w * b - x * a - y * d + z * c
@@ -134,7 +134,7 @@ CRUISE_MPS = 5.0
 
 
 def brake(velocity_mps: Vec3, limit_mps2: float) -> Vec3:
-    """Acceleration against the velocity: proportional to it, its norm at most the limit."""
+    """Return the acceleration against the velocity [m/s²]: proportional to it, its norm at most the limit."""
     speed = math.hypot(*velocity_mps)
     gain = min(BRAKE_GAIN, limit_mps2 / speed) if speed > 0.0 else 0.0
     north, east, down = velocity_mps
@@ -142,18 +142,18 @@ def brake(velocity_mps: Vec3, limit_mps2: float) -> Vec3:
 
 
 def descend(down_mps: float) -> float:
-    """Downward acceleration that settles at the landing speed."""
+    """Return the downward acceleration that settles at the landing speed [m/s²]."""
     return BRAKE_GAIN * (LAND_MPS - down_mps)
 
 
 def climb(down_m: float, down_mps: float, to_m: float) -> float:
-    """Downward acceleration towards the height `to_m` (NED down), at the climbing speed at most."""
+    """Return the downward acceleration towards the height `to_m` (NED down) [m/s²], at most at the climbing speed."""
     wanted = min(max(CLIMB_GAIN * (to_m - down_m), -CLIMB_MPS), CLIMB_MPS)
     return BRAKE_GAIN * (wanted - down_mps)
 
 
 def approach(place_m: Vec3, to_m: Vec3) -> Vec3:
-    """Velocity towards a position: proportional to the way, at most the cruising and the climbing speed."""
+    """Return the velocity towards a position [m/s]: proportional to the distance, at most cruise and climb speed."""
     north, east, down = (CLIMB_GAIN * (to - at) for at, to in zip(place_m, to_m, strict=True))
     level = math.hypot(north, east)
     slow = CRUISE_MPS / level if level > CRUISE_MPS else 1.0
@@ -171,7 +171,7 @@ CARRIED_S = 3.0  # ArduPilot moves a position on with its velocity for so long (
 
 @dataclass(frozen=True)
 class Tuning:
-    """How an autopilot flies."""
+    """Gains and limits by which an autopilot flies."""
 
     open_loop: bool  # whether an acceleration setpoint is flown as it comes
     dead_time_s: float  # from taking an acceleration setpoint, or one of a position that moves, to acting on it
@@ -242,7 +242,7 @@ TUNINGS = {
 
 
 class LoopDemand(Enum):
-    """What is asked of the vehicle."""
+    """Motion that the loops are asked for."""
 
     ACCELERATION = auto()
     VELOCITY = auto()
@@ -253,7 +253,7 @@ class LoopDemand(Enum):
 
 
 class _Asked(NamedTuple):
-    """A setpoint that waits out the dead time; a motion has a position, a velocity and an acceleration."""
+    """A setpoint that waits for the dead time to pass; a motion has position, velocity and acceleration."""
 
     due: int  # step in which it acts
     demand: LoopDemand
@@ -263,7 +263,7 @@ class _Asked(NamedTuple):
 
 
 class Cascade:
-    """From what is asked to a lean, once per step.
+    """Outer loops from a setpoint to a lean, once per step.
 
     Attributes:
         yaw_rad: heading to hold.
@@ -286,7 +286,7 @@ class Cascade:
         self._thrust_mps2 = 0.0  # integral of the loop on the vertical acceleration
 
     def begin(self, motion: BodyState) -> None:
-        """Begin anew from this motion, with zero acceleration."""
+        """Start anew from this motion, with zero acceleration."""
         self._coming.clear()
         self._demand, self._wanted = LoopDemand.ACCELERATION, ZERO
         self._accel = self._integral = ZERO
@@ -294,11 +294,11 @@ class Cascade:
         self._carry(motion)
 
     def accelerate(self, accel_mps2: Vec3) -> None:
-        """Fly this acceleration (NED), after the autopilot's dead time."""
+        """Fly this acceleration (NED) [m/s²], after the autopilot's dead time."""
         self._take(_Asked(self._steps + self._dead_steps, LoopDemand.ACCELERATION, accel_mps2))
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
-        """Be at this position (NED), which moves with this velocity and acceleration, after the dead time.
+        """Hold a position (NED) [m] that moves with this velocity and acceleration, after the dead time.
 
         PX4 takes each for what it is, until the next comes; ArduPilot moves it on in between.
         """
@@ -311,17 +311,17 @@ class Cascade:
         self._coming.append(asked)
 
     def fly(self, velocity_mps: Vec3) -> None:
-        """Fly this velocity (NED); zero stops, and stays where that ends."""
+        """Fly this velocity (NED) [m/s]; zero stops, and stays where that ends."""
         self._coming.clear()
         self._demand, self._wanted = LoopDemand.VELOCITY, velocity_mps
 
     def go_to(self, position_m: Vec3) -> None:
-        """Fly to this position (NED) and stay."""
+        """Fly to this position (NED) [m] and stay."""
         self._coming.clear()
         self._demand, self._wanted = LoopDemand.POSITION, position_m
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the origin, over the present place."""
+        """Climb to this height above the origin [m], over the present place."""
         self._coming.clear()
         self._demand, self._wanted = LoopDemand.CLIMB, (self._position[0], self._position[1], -height_m)
 
@@ -331,7 +331,7 @@ class Cascade:
         self._demand, self._wanted = LoopDemand.LANDING, (0.0, 0.0, self.tuning.land_mps)
 
     def listen(self) -> None:
-        """Begin a step: what has waited out the dead time is asked from now on."""
+        """Begin a step: a setpoint whose dead time has passed acts from now on."""
         if self._coming and self._coming[0].due <= self._steps:
             _, self._demand, self._wanted, velocity, accel = self._coming.popleft()
             if self._demand is LoopDemand.MOTION:
@@ -341,17 +341,17 @@ class Cascade:
 
     @property
     def climbs(self) -> bool:
-        """Whether what is asked leads up from the floor."""
+        """Whether the setpoint leads up from the floor."""
         return self._wanted[2] < 0.0
 
     def stand(self, motion: BodyState) -> None:
-        """A step on the floor: the reference stays with the vehicle, and nothing is left of the flight before."""
+        """Take a step on the floor: the reference stays with the vehicle, and the flight before is forgotten."""
         self._accel = self._integral = ZERO
         self._thrust_mps2 = 0.0
         self._carry(motion)
 
     def step(self, motion: BodyState, *, thrust_limited: bool, fall_mps2: float = 0.0) -> Lean:
-        """A step in the air: the lean to take now.
+        """Take a step in the air; return the lean to take now.
 
         Args:
             motion: of the vehicle, as its loops see it.
@@ -388,7 +388,7 @@ class Cascade:
         self._position, self._velocity = motion.position_m, motion.velocity_mps
 
     def _follow_acceleration(self) -> None:
-        """Change the reference acceleration within the jerk limit; no more than the tilt limit can give."""
+        """Change the reference acceleration within the jerk limit, and within what the tilt limit can give."""
         north, east, down = self._wanted
         most = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
         level = math.sqrt(north * north + east * east)
@@ -419,7 +419,7 @@ class Cascade:
         self._follow_velocity((speed * dn, speed * de, down))
 
     def _carry_on(self) -> None:
-        """Move a position on with its velocity, where the autopilot does so."""
+        """Move a position setpoint on with its velocity, where the autopilot does so."""
         if self.tuning.open_loop:
             return
         if self._carried_steps * self._step_s >= CARRIED_S:
@@ -463,7 +463,7 @@ class Cascade:
 
 
 def _approach(distance_m: float, limit_mps: float, gain_1ps: float) -> float:
-    """Speed at a distance from which a stop takes half of the limit: proportional when near, a parabola when far."""
+    """Return the approach speed [m/s]: proportional when near, else such that a stop takes half of the limit."""
     near = REFERENCE_ACCEL_MPS2 / (2.0 * gain_1ps**2)
     if distance_m <= near:
         return min(gain_1ps * distance_m, limit_mps)

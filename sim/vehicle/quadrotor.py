@@ -1,4 +1,4 @@
-"""The simulated quadrotor: rigid body, rotors, battery, air and floor, and the loops that fly it, at 400 Hz."""
+"""Simulated quadrotor at 400 Hz: rigid body, rotors, battery, air and floor, and the loops that fly it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Quadrotor:
-    """A quadrotor in the air or on the floor z = 0, with the place of `LinearVehicle`.
+    """Quadrotor in the air or on the floor z = 0; takes the place of `LinearVehicle`.
 
     The physics moves on the grid start_ns + k 2.5 ms; what is asked takes effect at the next point of it, and
     positions between two points are read from the last one and its velocity and acceleration. So stops on the
@@ -85,7 +85,7 @@ class Quadrotor:
 
     @property
     def has_down(self) -> bool:
-        """It can climb and descend, whatever the controller's plant has."""
+        """Whether it can climb and descend: always, whatever the controller's plant has."""
         return True
 
     @property
@@ -165,7 +165,7 @@ class Quadrotor:
         return np.array([self._accel[axis] for axis in self.model.axes]) / self.model.accel_per_input
 
     def _pull(self) -> Vec3:
-        """Acceleration by thrust and gravity alone: what the controller's plant calls its input's effect."""
+        """Return the acceleration by thrust and gravity alone [m/s²]: what the input does in the plant."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
         w, x, y, z = self._motion.attitude
@@ -179,7 +179,7 @@ class Quadrotor:
     # What it is asked
 
     def accelerate(self, accel_mps2: Vec3) -> None:
-        """Hold this acceleration setpoint (NED) from now on."""
+        """Hold this acceleration setpoint (NED) [m/s²] from now on."""
         north, east, down = (min(max(a, -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for a in accel_mps2)
         self._accel = (north, east, down)
         self.cascade.accelerate(self._accel)
@@ -189,22 +189,22 @@ class Quadrotor:
         self.fly(ZERO)
 
     def fly(self, velocity_mps: Vec3) -> None:
-        """Fly this velocity (NED)."""
+        """Fly this velocity (NED) [m/s]."""
         self._accel = ZERO
         self.cascade.fly(velocity_mps)
 
     def go_to(self, position_m: Vec3) -> None:
-        """Fly to this position (NED) and stay."""
+        """Fly to this position (NED) [m] and stay."""
         self._accel = ZERO
         self.cascade.go_to(position_m)
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
-        """Be at this position (NED), which moves with this velocity and acceleration."""
+        """Hold a position (NED) [m] that moves with this velocity and acceleration."""
         self._accel = ZERO
         self.cascade.follow(position_m, velocity_mps, accel_mps2)
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the floor, over the present place."""
+        """Climb to this height above the floor [m], over the present place."""
         self._accel = ZERO
         self.cascade.take_off(height_m)
 
@@ -214,16 +214,16 @@ class Quadrotor:
         self.cascade.land()
 
     def face(self, yaw_rad: float) -> None:
-        """Turn the nose to this heading, clockwise from north."""
+        """Turn the nose to this heading, clockwise from north [rad]."""
         self.cascade.yaw_rad = yaw_rad
 
     def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """What its own loops take for position and velocity is wrong by so much from now on."""
+        """Add an error to position and velocity as its own loops see them, from now on."""
         right = position_error_m == velocity_error_mps == ZERO
         self._errors = None if right else (position_error_m, velocity_error_mps)
 
     def mislead_attitude(self, error_rad: Vec3) -> None:
-        """Turn what its own loops take for its attitude by so much about body axes, from now on."""
+        """Turn the attitude that its own loops see by so much about body axes [rad], from now on."""
         self._turn = None if error_rad == ZERO else error_rad
 
     def rest(self) -> None:
@@ -278,7 +278,7 @@ class Quadrotor:
         self._meet_the_floor(motion)
 
     def _control(self, motion: BodyState) -> None:
-        """Command the rotors; on the floor they idle until something that leads off it is asked."""
+        """Command the rotors; on the floor they idle until a setpoint leads off it."""
         self.cascade.listen()
         idles = self._touched_ns is not None and not self.cascade.climbs
         if idles or self.battery.empty:
@@ -298,7 +298,7 @@ class Quadrotor:
         self._rotors.command(thrust, torque, self.battery.largest_rps)
 
     def _meet_the_floor(self, before: BodyState) -> None:
-        """Stop at the floor: an impact without bounce, Coulomb friction from its impulse, legs that right the body."""
+        """Stop at the floor: impact without bounce, Coulomb friction from its impulse, legs that right the body."""
         (north, east, down), (vn, ve, vd), attitude, _ = self._motion
         if down < 0.0:
             self._touched_ns = None

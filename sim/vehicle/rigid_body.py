@@ -1,4 +1,4 @@
-"""Motion of a rigid body with thrust, rotor drag and body drag: quaternions, north-east-down, front-right-down.
+"""Motion of a rigid body with thrust, rotor drag and body drag; attitude as quaternion, axes NED and FRD.
 
 Plain floats: at this size they are several times faster than small arrays, and the same bits everywhere.
 """
@@ -29,7 +29,7 @@ AIR_DENSITY_KGPM3 = 1.225
 
 @dataclass(frozen=True)
 class Airframe:
-    """One quadrotor with rotors at 45 degrees to its axes; body axes FRD (front, right, down)."""
+    """A quadrotor with rotors at 45 degrees to its axes; body axes FRD (front, right, down)."""
 
     mass_kg: float  # mass
     inertia_kgm2: tuple[float, float, float]  # principal moments of inertia about front, right, down
@@ -52,7 +52,7 @@ class Airframe:
 
     @property
     def weight_n(self) -> float:
-        """Weight."""
+        """Weight [N]."""
         return self.mass_kg * GRAVITY_MPS2
 
     @property
@@ -86,7 +86,7 @@ CRAZYFLIE_2 = Airframe(
 
 
 class BatteryModel:
-    """A voltage source that sinks with the charge used, behind a resistance, feeding a load of given power.
+    """Battery: a voltage that sinks with the charge used, behind a resistance, feeding a load of given power.
 
     Attributes:
         voltage_v: at the terminals, under the last load.
@@ -101,7 +101,7 @@ class BatteryModel:
         self.voltage_v = self.open_circuit_v
 
     def charge(self, share: float) -> None:
-        """Have this charge, 0 to 1."""
+        """Set the charge, 0 to 1."""
         self.used_c = (1.0 - share) * self._airframe.capacity_c
 
     @property
@@ -111,12 +111,12 @@ class BatteryModel:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is left: its protection has switched off."""
+        """Whether no charge is left: the battery's protection has switched off."""
         return self.used_c >= self._airframe.capacity_c
 
     @property
     def open_circuit_v(self) -> float:
-        """Voltage without load, linear between the tenths of the table."""
+        """Voltage without load [V], linear between the tenths of the table."""
         table = self._airframe.open_circuit_v
         place = self.remaining * (len(table) - 1)
         low = min(int(place), len(table) - 2)
@@ -124,11 +124,11 @@ class BatteryModel:
 
     @property
     def largest_rps(self) -> float:
-        """Largest rotor speed at the present voltage."""
+        """Largest rotor speed at the present voltage [rad/s]."""
         return self._airframe.speed_at_0v_rps + self._airframe.speed_per_v_rps * self.voltage_v
 
     def drain(self, thrust_n: float, duration_s: float) -> None:
-        """Feed the electronics and this thrust for a time.
+        """Feed the electronics and the rotors' thrust for a time.
 
         U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more, and nothing
         once it is empty.
@@ -150,7 +150,7 @@ LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class Wrench(NamedTuple):
-    """What the rotors do to the body at one moment."""
+    """Force and torque of the rotors on the body."""
 
     thrust_n: float  # along -down of the body
     torque_nm: Vec3  # about front, right, down
@@ -168,7 +168,7 @@ class BodyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Body:
-    """The constants that the motion needs, in the form in which it needs them."""
+    """Constants of a body in the form that the equations of motion need."""
 
     mass_kg: float
     inertia_kgm2: Vec3
@@ -177,13 +177,13 @@ class Body:
 
     @classmethod
     def of(cls, airframe: Airframe) -> Body:
-        """The body of an airframe."""
+        """Return the body of an airframe."""
         front, right, down = (0.5 * AIR_DENSITY_KGPM3 * area for area in airframe.drag_area_m2)
         return cls(airframe.mass_kg, airframe.inertia_kgm2, airframe.rotor_drag_kg, (front, right, down))
 
 
 def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
-    """The attitude turned further by a rotation vector [rad] in body axes; of unit norm."""
+    """Return the attitude turned further by a rotation vector [rad] in body axes; of unit norm."""
     w, x, y, z = attitude
     p, q, r = angle
     square = p * p + q * q + r * r
@@ -202,7 +202,7 @@ def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
 
 
 def uprighted(attitude: Quaternion, keep: float) -> Quaternion:
-    """The attitude with its tilt shrunk to the share `keep` of its half-angle's tangent; the heading stays."""
+    """Return the attitude with the tangent of half its tilt shrunk to the share `keep`; the heading stays."""
     w, x, y, z = attitude
     heading = math.sqrt(w * w + z * z)
     c, s = (w / heading, z / heading) if heading > 0.0 else (1.0, 0.0)
@@ -214,7 +214,7 @@ def uprighted(attitude: Quaternion, keep: float) -> Quaternion:
 
 
 def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
-    """Acceleration of the centre of mass in NED [m/s²], gravity in it.
+    """Return the acceleration of the centre of mass in NED [m/s²], with gravity.
 
     Drag in body axes, of the velocity v relative to the air: -(d ΣΩ + ½ ρ C_d A |v|) v, each axis with its own
     coefficients.
@@ -241,7 +241,7 @@ def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrenc
 
 
 def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
-    """Euler's equations: J ω' = τ - ω x J ω."""
+    """Return angular accelerations by Euler's equations: J ω' = τ - ω x J ω."""
     jx, jy, jz = body.inertia_kgm2
     p, q, r = rates
     return (
@@ -252,7 +252,7 @@ def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
 
 
 def _turning(angle: Vec3, rates: Vec3) -> Vec3:
-    """Rate of the rotation vector: θ' = ω + ½ θ x ω + 1/12 θ x (θ x ω), enough for fourth order."""
+    """Return the rate of the rotation vector: θ' = ω + ½ θ x ω + 1/12 θ x (θ x ω), enough for fourth order."""
     a, b, c = angle
     p, q, r = rates
     x, y, z = b * r - c * q, c * p - a * r, a * q - b * p
@@ -268,7 +268,7 @@ def _along(start: Vec3, slope: Vec3, h: float) -> Vec3:
 
 
 def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
-    """Simpson's weights of the classical Runge-Kutta method."""
+    """Return the mean slope by the weights of the classical Runge-Kutta method (Simpson's rule)."""
     return (
         (a[0] + 2.0 * (b[0] + c[0]) + d[0]) / 6.0,
         (a[1] + 2.0 * (b[1] + c[1]) + d[1]) / 6.0,
@@ -277,7 +277,7 @@ def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
 
 
 def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float) -> BodyState:
-    """One step of Runge and Kutta's fourth-order method, after Munthe-Kaas on the rotations.
+    """Return the state after one step of Runge and Kutta's fourth-order method, after Munthe-Kaas on the rotations.
 
     The attitude moves by the exponential of a rotation vector that is integrated like any other variable, so it
     stays a rotation by construction and the order is kept; a method on the four numbers of the quaternion would
@@ -359,7 +359,7 @@ class Rotors:
         self.thrust_limited = self.torque_limited = False
 
     def wrench(self, speeds_rps: Four) -> Wrench:
-        """What rotors at these speeds do to the body."""
+        """Return force and torque of rotors at these speeds."""
         k = self._thrust_n_s2
         a, b, c, d = speeds_rps
         f1, f2, f3, f4 = k * a * a, k * b * b, k * c * c, k * d * d
@@ -374,7 +374,7 @@ class Rotors:
         )
 
     def step(self) -> tuple[Wrench, Wrench, Wrench]:
-        """Move on by one step, exactly; returns the wrenches at its start, middle and end."""
+        """Move on by one step, exactly; return the wrenches at its start, middle and end."""
         start = self.speeds_rps
         middle = self._lagged(self._half_decay)
         self.speeds_rps = self._lagged(self._decay)
