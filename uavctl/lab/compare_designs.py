@@ -1,4 +1,4 @@
-"""Two designs beside one another: what another terminal gain is worth.
+"""Comparison of two designs: what another terminal gain is worth.
 
 Optimal costs are compared from the same states. One set is seeded and uniform in the box of the state limits: it tells
 from what share of the box the target can be reached with all constraints kept. The other is the same states, each drawn
@@ -27,7 +27,7 @@ _DIGITS = 6  # of a gain as it is printed: the figures are those of the printed 
 
 
 class Costs(msgspec.Struct, frozen=True, kw_only=True):
-    """Optimal costs of one design; None where there is none."""
+    """Optimal costs of one design; None without one."""
 
     start: float | None  # from the simulator's start
     mean: float | None  # over the states that all designs compared can leave feasibly
@@ -35,7 +35,7 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GainReport(msgspec.Struct, frozen=True, kw_only=True):
-    """A complete design with one terminal gain, or why there is none."""
+    """A complete design with one terminal gain, or the reason why there is none."""
 
     k_tau: list[list[float]]
     refused: str | None
@@ -49,7 +49,7 @@ class GainReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GainComparison(msgspec.Struct, frozen=True, kw_only=True):
-    """The configured terminal gain beside the synthesised one."""
+    """Configured terminal gain beside the synthesised one."""
 
     toml: str
     before: GainReport
@@ -62,7 +62,7 @@ class GainComparison(msgspec.Struct, frozen=True, kw_only=True):
 def compare_gains(
     spec: DesignSpec, start: Array, states: int, seed: int, advance: Callable[[str], None]
 ) -> GainComparison:
-    """Synthesise the terminal gain, make the design with it, and lay it beside the configured one.
+    """Synthesise the terminal gain, make a design with it, and compare it with the configured one.
 
     Args:
         spec: What is asked for; its own gain may be one that no design can be made with.
@@ -112,13 +112,13 @@ def compare_gains(
 
 
 def gain_toml(k: Array) -> str:
-    """A gain as it stands in a configuration."""
+    """Return a gain as it stands in a configuration."""
     rows = "".join(f"  [{', '.join(repr(float(entry)) for entry in row)}],\n" for row in k)
     return f"[smpc]\nk_tau = [\n{rows}]\n"
 
 
 def seeded_states(limits: Polytope, target: Array, count: int, seed: int) -> tuple[Array, Array]:
-    """Seeded states (count, n_x), uniform in the box of the limits on single states; and the same nearer to the target.
+    """Return seeded states (count, n_x), uniform in the box of state limits, and the same nearer to the target.
 
     A state that is not limited on both sides stays at the target's.
     """
@@ -131,7 +131,7 @@ def seeded_states(limits: Polytope, target: Array, count: int, seed: int) -> tup
 
 
 def _complete(spec: DesignSpec) -> Design | str:
-    """The design, or why there is none."""
+    """Return the design, or why there is none."""
     try:
         design = make_design(spec, optimal_cost)
         check_schedule(design)
@@ -143,7 +143,7 @@ def _complete(spec: DesignSpec) -> Design | str:
 def _costs(
     designs: Sequence[Design], start: Array, points: Array, nearer: Array, advance: Callable[[str], None]
 ) -> tuple[list[Costs], int]:
-    """Costs of each design, and the number of states that the means are over."""
+    """Return the costs of each design, and the number of states that the means are over."""
     if not designs:
         return [], 0
     starts, shares, table = [], [], np.zeros((len(designs), len(nearer)))
@@ -158,7 +158,7 @@ def _costs(
 
 
 def _costs_from(design: Design, points: Array, advance: Callable[[str], None]) -> Array:
-    """Optimal cost from each state, infinite where it is infeasible."""
+    """Return the optimal cost from each state, infinite where it is infeasible."""
     found = np.full(len(points), np.inf)
     for i, point in enumerate(points):
         advance("optimal costs")

@@ -1,4 +1,4 @@
-"""The opponent: the vehicle's own position loop, fed the positions that a controller of ours gets on the same flight.
+"""Opponent of the controller: the vehicle's own position loop, fed the same positions.
 
 The cameras' datagrams go through the project's own intake (frames, clocks) and relay, and on to the vehicle as
 VISION_POSITION_ESTIMATE; its estimator uses nothing else. It is sent SET_POSITION_TARGET_LOCAL_NED at every tick, in
@@ -59,7 +59,7 @@ Path = Callable[[float], Moment]
 
 @dataclass(frozen=True)
 class OwnTuning:
-    """How the vehicle's own loop is set up; the defaults are the vehicle and the daemon as delivered."""
+    """Setup of the vehicle's own loop; the defaults are the vehicle and the daemon as delivered."""
 
     at_once: bool = False  # whether positions are passed on when they arrive; else in the next tick, as the daemon does
     delay_s: float | None = None  # age of positions that the vehicle is told to count on; None leaves its default
@@ -90,7 +90,7 @@ TUNED: dict[str, OwnTuning] = {
 
 @dataclass
 class OwnLoop:
-    """Has a vehicle fly by its own position loop; implements `uavctl.records.Flyer`.
+    """Lets a vehicle fly by its own position loop; implements `uavctl.records.Flyer`.
 
     Attributes:
         relay: What of them was passed on, and why others were not.
@@ -109,7 +109,7 @@ class OwnLoop:
         self._mav = mavlink.MAVLink(None, self.config.daemon.system_id, self.config.daemon.component_id)
 
     def board(self, autopilot: Autopilot) -> None:
-        """Set a vehicle that flies already up for external positions and this tuning.
+        """Set up a vehicle in flight for external positions and this tuning.
 
         Raises:
             ValueError: It does not take a parameter.
@@ -128,7 +128,7 @@ class OwnLoop:
             cascade.tuning = replace(cascade.tuning, **dict(self.tuning.gains))  # type: ignore[arg-type]
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        """Take a datagram; its positions go on to the vehicle, at once or with the next tick."""
+        """Take a datagram; its positions are relayed to the vehicle, at once or with the next tick."""
         source = self._links[link]
         for item in source.receive(data, at_ns):
             if isinstance(item, PositionSample):
@@ -138,7 +138,7 @@ class OwnLoop:
         return Received((*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers, True, True)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        """Send what is due at a tick: heartbeats, positions, and where to be."""
+        """Send everything due at a tick: heartbeats, positions, and the setpoint."""
         del tick
         for name, link in self._links.items():
             for data in link.due(at_ns):

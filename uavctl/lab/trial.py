@@ -1,4 +1,4 @@
-"""Trials of the true vehicle: case, flight, metrics."""
+"""Trials with the simulated quadrotor: case, flight, figures."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _SAMPLE_S = 0.05
 
 @lru_cache(maxsize=1)
 def eight() -> TrajectoryConfig:
-    """The figure of eight, sampled, with its velocities."""
+    """Return the figure of eight as a sampled trajectory with velocities."""
     times, positions, velocities = motion(_SAMPLE_S)
     return TrajectoryConfig(
         times_s=tuple(times.tolist()),
@@ -57,7 +57,7 @@ def eight() -> TrajectoryConfig:
 
 
 def motion(step_s: float) -> tuple[Array, Array, Array]:
-    """Times (n,), positions (n, 3) and velocities (n, 3) of the whole motion, the last one its end."""
+    """Return times (n,) [s], positions (n, 3) [m] and velocities (n, 3) [m/s] of the figure of eight, its end last."""
     angle, rate, over_s = _schedule()
     times = np.append(np.arange(0.0, over_s, step_s), over_s)
     done = np.interp(times, *angle)
@@ -69,19 +69,19 @@ def motion(step_s: float) -> tuple[Array, Array, Array]:
 
 
 def _speed(angle: Array, rate: tuple[float, float]) -> Array:
-    """θ' at full speed [1/s]: the mean rate and how much faster the crossing is flown."""
+    """Return θ' at full speed [1/s]: a mean rate, faster where the figure crosses itself."""
     base, faster = rate
     return np.asarray(base * (1.0 + faster * np.cos(2.0 * angle)))
 
 
 def _eased(times: Array, over_s: float) -> Array:
-    """Share of the full speed: smooth from 0 to 1 and back."""
+    """Return the share of full speed (n,): smooth from 0 to 1 and back."""
     near = np.clip(np.minimum(times, over_s - times) / RAMP_S, 0.0, 1.0)
     return np.asarray(near * near * near * (10.0 - 15.0 * near + 6.0 * near * near))
 
 
 def _schedule() -> tuple[tuple[Array, Array], tuple[float, float], float]:
-    """θ over time, the rate, and the length of the motion [s]."""
+    """Return θ over time, the rate, and the length of the motion [s]."""
     fastest = math.hypot(HALF_M, WIDTH_M)
 
     def made(faster: float) -> tuple[tuple[Array, Array], tuple[float, float], float]:
@@ -103,7 +103,7 @@ def _schedule() -> tuple[tuple[Array, Array], tuple[float, float], float]:
 
 
 def _length() -> float:
-    """Length of one round [m]."""
+    """Return the length of one round [m]."""
     angle = np.linspace(0.0, 2.0 * math.pi, _FINE + 1)
     points = np.column_stack([HALF_M * np.sin(angle), 0.5 * WIDTH_M * np.sin(2.0 * angle)])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
@@ -134,7 +134,7 @@ EIGHT_MORE_S = 2.0  # after the end of the figure of eight
 
 @dataclass(frozen=True)
 class TrialPilot:
-    """Who flies: a controller of ours, or the vehicle by itself."""
+    """Pilot of a trial: a controller of ours, or the vehicle's own loop."""
 
     name: str  # what it is called
     config: str = "room"  # preset or file that it is made from; what messages call it, where there is a text
@@ -144,7 +144,7 @@ class TrialPilot:
     text: str = ""  # TOML text that it is made from instead, for who has not the file; empty for none
 
     def load(self, overrides: Sequence[str]) -> Config:
-        """Its configuration with its own and further overrides.
+        """Load the pilot's configuration with its own and further overrides.
 
         Raises:
             ConfigError: An override is none.
@@ -155,7 +155,7 @@ class TrialPilot:
 
 @dataclass(frozen=True)
 class TrialCell:
-    """Flights that differ in their seed alone."""
+    """Cell of trials: flights that differ in their seed alone."""
 
     pilot: TrialPilot  # who flies
     scenario: Scenario  # what
@@ -167,7 +167,7 @@ class TrialCell:
 
 
 def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
-    """The configuration that a flight meets: simulator, link and mission.
+    """Return the configuration that a flight meets: simulator, link and mission.
 
     Raises:
         ConfigError: An override is none.
@@ -190,7 +190,7 @@ def flown(cell: TrialCell, seed: int, seconds: float) -> Config:
 
 
 def believed(cell: TrialCell) -> Config:
-    """The configuration that a controller of ours is made from.
+    """Return the configuration that a controller of ours is made from.
 
     Raises:
         ConfigError: An override is none.
@@ -200,18 +200,18 @@ def believed(cell: TrialCell) -> Config:
 
 
 def blackout_s(seed: int) -> float:
-    """When a flight's blackout begins [s]: a random moment under way, the same for all who fly."""
+    """Return when a flight's blackout begins [s]: a random moment on the way, the same for all pilots."""
     rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(_MOMENT + 1)[_MOMENT])
     return round(float(rng.uniform(*BLACKOUT_BEGINS_S)), 3)
 
 
 def length_s(scenario: Scenario, seconds: float) -> float:
-    """How long a flight lasts [s]: a figure of eight is flown to its end."""
+    """Return how long a flight lasts [s]: a figure of eight is flown to its end."""
     return eight().times_s[-1] + EIGHT_MORE_S if scenario == "eight" else seconds
 
 
 def _with_mission(config: Config, scenario: Scenario) -> Config:
-    """The configuration with the figure of eight from its centre, if that is flown."""
+    """Return the configuration with the figure of eight as mission from its centre, if that is flown."""
     if scenario != "eight":
         return config
     replace = msgspec.structs.replace
@@ -228,7 +228,7 @@ def _with_mission(config: Config, scenario: Scenario) -> Config:
 
 @dataclass(frozen=True)
 class Shown:
-    """How a figure is shown."""
+    """Display of a figure in a table."""
 
     key: str  # its name in `TrialFlight`
     heading: str  # over its column
@@ -236,7 +236,7 @@ class Shown:
     digits: int  # after the point
 
     def told(self, values: Sequence[float]) -> str:
-        """Median and worst of some flights; a dash where the figure says nothing of one."""
+        """Return median and worst of some flights; a dash where the figure does not apply to one."""
         if not values or any(map(math.isnan, values)):
             return "-"
         mid, worst = self.factor * median(values), self.factor * max(values)
@@ -282,27 +282,27 @@ MEANING = (
 
 
 def distances_m(positions: Array, wanted: Array) -> Array:
-    """Distance (n,) of positions (n, 3) from where they were wanted, (3,) or (n, 3)."""
+    """Return the distance (n,) [m] of positions (n, 3) from where they were wanted, (3,) or (n, 3)."""
     return np.asarray(np.linalg.norm(positions - wanted, axis=1))
 
 
 def rms_m(distances: Array) -> float:
-    """Root mean square; NaN of nothing."""
+    """Return the root mean square [m]; NaN of no values."""
     return float(np.sqrt(np.mean(distances**2))) if distances.size else math.nan
 
 
 def largest(values: Array) -> float:
-    """The largest; NaN of nothing."""
+    """Return the largest value; NaN of no values."""
     return float(values.max()) if values.size else math.nan
 
 
 def mean(values: Array) -> float:
-    """The mean; NaN of nothing."""
+    """Return the mean; NaN of no values."""
     return float(values.mean()) if values.size else math.nan
 
 
 def settled_s(times: Array, distances: Array, radius_m: float) -> float:
-    """Time from which on the vehicle stays within a radius to the end; infinite if it is outside at the end.
+    """Return the time from which the vehicle stays within a radius to the end [s]; infinite if it ends outside.
 
     Args:
         times: (n,), increasing.
@@ -316,7 +316,7 @@ def settled_s(times: Array, distances: Array, radius_m: float) -> float:
 
 
 def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
-    """How far positions (n, 3) are through the nearest wall (n,); negative is the room that is left to it.
+    """Return how far positions (n, 3) are beyond the nearest wall (n,) [m]; negative is the room left.
 
     Args:
         positions: (n, 3).
@@ -332,7 +332,7 @@ _AXES = ("north", "east", "down")
 
 
 def room_of(config: Config) -> tuple[Array, Array]:
-    """Least and largest position in the room (3,); infinite where there is no wall."""
+    """Return the least and the largest position in the room (3,) [m]; infinite where there is no wall."""
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
     index = config.plant.position_index or tuple(
         config.plant.states_per_axis * i for i in range(len(config.plant.axes))
@@ -344,7 +344,7 @@ def room_of(config: Config) -> tuple[Array, Array]:
 
 
 def usable_room(config: Config, design: AnyDesign) -> float:
-    """Share of the room in which a plan may rest, with what the estimator does not see; NaN where a wall is open.
+    """Return the share of the room in which a plan may rest, with estimation error; NaN where a wall is open.
 
     Raises:
         DesignError: There is no such scheme.
@@ -353,7 +353,7 @@ def usable_room(config: Config, design: AnyDesign) -> float:
 
 
 def usable_seen(config: Config, design: Design | None) -> float:
-    """The same for a controller that is told the exact state, as in the linear world.
+    """Return the share of the room in which a plan may rest if the state is known, as in the linear world.
 
     Raises:
         DesignError: There is no such scheme.
@@ -382,7 +382,7 @@ _CONTROLLERS = 8  # kept at hand: their solvers take a second each to make
 
 @dataclass(frozen=True)
 class TrialFlight:
-    """What one flight came to; NaN where a figure says nothing of its scenario."""
+    """Figures of one flight; NaN where a figure does not apply to its scenario."""
 
     seed: int  # of the flight
     # Distance of the true position from the target once it is to hold it, root mean square
@@ -404,7 +404,7 @@ class TrialFlight:
 
 @dataclass
 class WatchedFlyer:
-    """The true motion, tick by tick, under whoever flies; implements `uavctl.records.Flyer`."""
+    """Flyer that records the true motion tick by tick; implements `uavctl.records.Flyer`."""
 
     flyer: Flyer  # who flies
     where: Callable[[], Vec3] = lambda: (math.nan, math.nan, math.nan)  # gives the true position
@@ -416,7 +416,7 @@ class WatchedFlyer:
         return self.flyer.receive(link, data, at_ns)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        """Look where the vehicle is, and run the tick."""
+        """Record where the vehicle is, and run the tick."""
         self.times_s.append(at_ns * 1e-9)
         self.positions_m.append(self.where())
         yield from self.flyer.tick(tick, at_ns)
@@ -424,7 +424,7 @@ class WatchedFlyer:
 
 @dataclass
 class FlightTally:
-    """A sink that counts what tells how a controller of ours fared."""
+    """Sink that counts how a controller of ours fares: limited setpoints, plans that gave way, fallback."""
 
     begun_ns: int | None = None  # time of the first decision with somewhere to go to; None before
     setpoints: int = 0  # that were sent
@@ -453,7 +453,7 @@ class FlightTally:
 
 
 def fly(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFlight:
-    """Fly once and judge it by the truth.
+    """Fly once; return the figures by the true motion.
 
     Args:
         seconds: Length of the flight; a figure of eight has its own.
@@ -504,7 +504,7 @@ def _fly_own(cell: TrialCell, config: Config, from_s: float) -> TrialFlight:
 
 
 def own_loop(cell: TrialCell, config: Config) -> OwnLoop:
-    """The vehicle's own loop, as a cell asks for it."""
+    """Return the vehicle's own loop, as a cell asks for it."""
     assert cell.pilot.own is not None
     path = path_of(config.mission.trajectory) if cell.scenario == "eight" else None
     return OwnLoop(config, cell.pilot.own, config.target.position_m, path)
@@ -522,7 +522,7 @@ def _flown(config: Config, watched: WatchedFlyer, own: OwnLoop | None = None) ->
 
 @lru_cache(maxsize=_CONTROLLERS)
 def controller_of(config: Config) -> Controller:
-    """A controller of ours.
+    """Return a controller of ours.
 
     Raises:
         DesignError: There is none.
@@ -533,7 +533,7 @@ def controller_of(config: Config) -> Controller:
 
 
 def path_of(motion: TrajectoryConfig) -> Path:
-    """A sampled motion as a function of time, at rest before its begin and after its end."""
+    """Return a sampled motion as a function of time, at rest before its begin and after its end."""
     times = np.array(motion.times_s)
     spline = CubicHermiteSpline(times, np.array(motion.positions_m), np.array(motion.velocities_mps))
     speed, change = spline.derivative(), spline.derivative(2)

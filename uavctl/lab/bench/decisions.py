@@ -1,4 +1,4 @@
-"""Decisions anywhere, and those a flight asks for."""
+"""Benchmark of decisions: from states drawn anywhere within the limits, and from those of a flight."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROUNDS = 5
 
 
 class FlightBench(msgspec.Struct, frozen=True, kw_only=True):
-    """Decisions for all axes, each question of a flight asked in several rounds; a question's time is its best."""
+    """Times of the decisions of a flight for all axes; a decision's time is the best of several rounds."""
 
     questions: int
     us: Quantiles
@@ -39,7 +39,7 @@ class FlightBench(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class QuestionRecorder:
-    """A solver that keeps its questions."""
+    """Solver that records the questions it is asked."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
@@ -57,14 +57,14 @@ class QuestionRecorder:
 
 
 class _Nowhere:
-    """Takes records, and keeps none."""
+    """Sink that drops records."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """See `Sink`."""
 
 
 def fly_and_ask(config: Config) -> tuple[Solver, QuestionRecorder]:
-    """Fly a configuration in virtual time; the solver, and what it was asked.
+    """Fly a configuration in virtual time; return its solver, and the questions that the solver was asked.
 
     Raises:
         DesignError: There is no design.
@@ -77,10 +77,10 @@ def fly_and_ask(config: Config) -> tuple[Solver, QuestionRecorder]:
 
 
 def time_flight(config: Config, told: Callable[[int, int], None] = lambda *_: None) -> FlightBench | None:
-    """Time the decisions of a flight; None where it asked for none.
+    """Time the decisions of a flight; None if it asked for none.
 
     Args:
-        told: Told the number of rounds done, and of how many.
+        told: Called with the number of rounds done, and of how many.
     """
     solver, asked = fly_and_ask(config)
     if not asked.questions:
@@ -116,7 +116,7 @@ _SPREAD = 0.5  # standard deviation of a state without limits, in its unit
 
 
 class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
-    """Decisions for all axes, each state asked once."""
+    """Times of decisions for all axes, each state asked once."""
 
     states: int
     us: Quantiles
@@ -129,7 +129,7 @@ class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tuple[Array, Array, Preview]]:
-    """State (n_x,), target (n_x,) and outlook: state and target anywhere within the limits, so is what was sent.
+    """Yield state (n_x,), target (n_x,) and outlook, drawn within the limits of position and input.
 
     Args:
         solver: Who is asked; all its axes have limits of position and input.
@@ -151,10 +151,10 @@ def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tupl
 def time_decisions(
     solver: ConditionedSolver, count: int, seed: int, told: Callable[[int], None] = lambda _: None
 ) -> DecisionBench:
-    """Ask from so many states.
+    """Time decisions from `count` states.
 
     Args:
-        told: Told the number of decisions done.
+        told: Called with the number of decisions done.
     """
     for x, target, outlook in questions(solver, _WARM, seed + 1):
         solver.solve(0, x, target, outlook)

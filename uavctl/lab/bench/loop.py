@@ -1,4 +1,4 @@
-"""The control loop measured from outside: `uavctl fly` as a process, an empty loop beside it, a vehicle on real UDP.
+"""Benchmark of the control loop: `uavctl fly` as a process with a vehicle on real UDP, an empty loop beside it.
 
 Both loops run at the same time, half a tick apart, so that what else the machine does meets both alike.
 """
@@ -47,7 +47,7 @@ _TIMESPEC = struct.Struct("qq")
 
 @dataclass
 class LoopReplies:
-    """What came back."""
+    """Replies of the daemon to a vehicle's positions."""
 
     # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
     in_to_out_ns: list[int] = field(default_factory=list)
@@ -55,7 +55,7 @@ class LoopReplies:
 
 
 class Peer:
-    """Speaks to the daemon on one UDP connection; the grid of ticks is that of CLOCK_MONOTONIC."""
+    """Vehicle of the benchmark on one UDP connection; the grid of ticks is that of CLOCK_MONOTONIC."""
 
     def __init__(self, port: int, tick_ns: int) -> None:
         self.seen = LoopReplies()
@@ -74,7 +74,7 @@ class Peer:
         self._socket.close()
 
     def tick(self) -> None:
-        """Send a position in time for the next tick, and take what comes until the next one is due."""
+        """Send a position in time for the next tick, and take what arrives until the next one is due."""
         now_ns = time.monotonic_ns()
         deadline_ns = (now_ns + LEAD_NS) // self._tick_ns * self._tick_ns + self._tick_ns
         self._listen(deadline_ns - LEAD_NS)
@@ -87,7 +87,7 @@ class Peer:
         self._move()
 
     def finish(self) -> None:
-        """Take the answer to the last position, and be disarmed: there is nothing to hand over."""
+        """Take the answer to the last position, and send that the vehicle is disarmed: so there is no hand-over."""
         self._listen(time.monotonic_ns() + self._tick_ns)
         self._beat(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
 
@@ -150,13 +150,13 @@ class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def of(times_ns: NDArray[np.int64]) -> TimeQuantiles:
-        """Of one run's times [ns] (n,)."""
+        """Return the quantiles of one run's times [ns] (n,)."""
         p50, p99, p999, worst = (np.quantile(times_ns, [0.5, 0.99, 0.999, 1.0]) * 1e-3).tolist()
         return TimeQuantiles(p50=p50, p99=p99, p999=p999, max=worst)
 
     @staticmethod
     def middle(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
-        """The median run, quantile by quantile."""
+        """Return the median over runs, quantile by quantile."""
         return TimeQuantiles(
             p50=median(run.p50 for run in runs),
             p99=median(run.p99 for run in runs),
@@ -185,7 +185,7 @@ class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def middle(runs: Sequence[LoopRun]) -> LoopRun:
-        """The medians over runs."""
+        """Return the median over runs, figure by figure."""
         spreads = ("in_to_out_us", "lateness_us", "empty_lateness_us", "step_us")
         fields: dict[str, TimeQuantiles | float] = {}
         for name in LoopRun.__struct_fields__:
@@ -214,7 +214,7 @@ _SAMPLE_NS = 1_000_000_000
 def run_loop_bench(
     config: Config, options: Sequence[str], seconds: float, runs: int, told: Callable[[str, int, int], None]
 ) -> LoopBench:
-    """Measure, with and without `--realtime` in turns.
+    """Measure the loop with and without `--realtime`, in turns.
 
     Args:
         options: the command line that gives this configuration: --config and --set.
@@ -242,7 +242,7 @@ def run_loop_bench(
 
 
 def _run(config: Config, options: Sequence[str], seconds: float, real: bool) -> tuple[LoopRun, bool]:
-    """One run, and whether real time was permitted where it was asked for."""
+    """Measure one run; return also whether real time was permitted where it was asked for."""
     tick_ns = round(config.daemon.tick_s * 1e9)
     with tempfile.TemporaryDirectory(prefix="uavctl-bench-") as name, socket.socket(type=socket.SOCK_DGRAM) as free:
         folder = Path(name)
@@ -293,7 +293,7 @@ def _measured(path: Path, peer: Peer, memory_kib: Sequence[int], idle_ns: list[i
 
 @contextmanager
 def _daemon(port: int, options: Sequence[str], folder: Path, real: bool) -> Iterator[subprocess.Popen[str]]:
-    """`uavctl fly`, ready."""
+    """Start `uavctl fly`, and wait until it is ready."""
     url = f"udpin://127.0.0.1:{port}"
     command = [sys.executable, "-m", "uavctl", "fly", *options, "--vehicle", url, "--mocap", url, "--json"]
     places = ["--out", str(folder), "--control", str(folder / "control")]
@@ -317,7 +317,7 @@ def _daemon(port: int, options: Sequence[str], folder: Path, real: bool) -> Iter
 
 @contextmanager
 def _empty_loop(tick_ns: int, seconds: float, real: bool) -> Iterator[Pipe]:
-    """The empty loop in a process of its own; its result comes through the pipe."""
+    """Start the empty loop in a process of its own; its result comes through the pipe."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     child = context.Process(target=empty_loop, args=(theirs, tick_ns, seconds, real), name="empty loop")
@@ -333,7 +333,7 @@ def _empty_loop(tick_ns: int, seconds: float, real: bool) -> Iterator[Pipe]:
 
 
 def empty_loop(pipe: Pipe, tick_ns: int, seconds: float, real: bool) -> None:
-    """Wait for ticks as the daemon does, and for nothing else; sends how late they were [ns] and what was permitted."""
+    """Wait for ticks as the daemon does, and do nothing; send how late they were [ns] and what was permitted."""
     if real:
         with realtime() as outcomes:
             pipe.send((_lateness(tick_ns, seconds), all(outcome.ok for outcome in outcomes)))
@@ -355,7 +355,7 @@ def _lateness(tick_ns: int, seconds: float) -> list[int]:
 
 
 def _fly(peer: Peer, process: subprocess.Popen[str], positions: int) -> list[int]:
-    """Be the vehicle for as many ticks as the empty loop has; gives the daemon's resident memory by the second [KiB].
+    """Be the vehicle for as many ticks as the empty loop has; return the daemon's resident memory by the second [KiB].
 
     Ticks and not a time: one that the machine slept through has no position, and takes none from the others.
     """

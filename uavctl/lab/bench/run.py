@@ -1,4 +1,4 @@
-"""One benchmark: its states and its run."""
+"""A benchmark run: its states, and the times of all solvers on them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _COVARIANCES = 7  # in turns: a filter's is hardly ever the last one's
 
 
 class InFlight:
-    """A solver whose every question has a covariance other than the last one's, and a setpoint sent before it.
+    """Solver for the benchmark: every question has another covariance than the last, and a setpoint sent before.
 
     What was sent is the target's own input, so a state in transit has all of its way to slew.
     """
@@ -78,7 +78,7 @@ _MOST_LOOPS = 5
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """The states of one benchmark."""
+    """States of one benchmark."""
 
     points: tuple[Array, ...]  # states (n_x,): box, loop, box, loop …
     feasible_share: float  # share of the box from which the paper's problem is feasible
@@ -87,11 +87,11 @@ class States:
 def draw_states(
     design: Design, solver: Solver, count: int, loss: float, seed: int, told: Callable[[int], None]
 ) -> States:
-    """Seeded states; the same arguments give the same ones.
+    """Draw seeded states; the same arguments give the same ones.
 
     Args:
         loss: Probability that a step of a closed loop brings no news.
-        told: Told how many states there are, now and then.
+        told: Called with how many states there are, now and then.
 
     Raises:
         UavctlError: No state of the box is feasible.
@@ -106,7 +106,7 @@ def draw_states(
 def _box_states(
     design: Design, count: int, rng: np.random.Generator, told: Callable[[int], None]
 ) -> tuple[list[Array], float]:
-    """Uniform over the feasible part of the box.
+    """Draw states uniformly from the feasible part of the box.
 
     Components are independent, so each is drawn until it is feasible. Feasible: the exact program keeps all limits and
     reaches the target (slack, offset and terminal miss below 1e-6).
@@ -148,7 +148,7 @@ def closed_loops(
     rng: np.random.Generator,
     told: Callable[[int], None],
 ) -> list[Array]:
-    """States that a closed loop asks from: each step brings news or does not; the plan is played out in between.
+    """Yield the states that a closed loop asks from: a step brings news, or the plan is played out.
 
     The starts themselves are left out. Fewer than `count` states come back only where loops find no plan.
     """
@@ -185,7 +185,7 @@ _MEGABYTE = 1e6
 
 @dataclass(frozen=True)
 class BenchSizes:
-    """How much is measured."""
+    """Numbers of states and runs of a benchmark."""
 
     states: int = 1000  # asked of the library; the others are asked the first of them
     printed: int = 3  # asked of the joint problem as printed; it ends badly, and a few say so
@@ -205,7 +205,7 @@ def run_bench(
     sizes: BenchSizes = DEFAULT_SIZES,
     conditioned: ConditionedSolver | None = None,
 ) -> BenchResult:
-    """Measure everything on the same states.
+    """Measure all solvers on the same states.
 
     Args:
         loss: Probability that a step of a closed loop brings no news.
@@ -296,7 +296,7 @@ def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
 
 
 def _library(design: Design, seed: int, advance: Advance) -> tuple[Library, float]:
-    """The library, made anew, and the time that it took [s]."""
+    """Make the library anew; return it with the time that took [s]."""
     advance("making the library", 0, None)
     start = time.perf_counter()
     library = make_library(
@@ -317,7 +317,7 @@ def _shares(found: Timed) -> Shares:
 
 
 def _excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:
-    """How far exact optima are outside the certified bounds, relative; an optimum is known up to its own gap."""
+    """Return how far exact optima lie outside the certified bounds, relative, beyond their own gap."""
     most = 0.0
     for ours, theirs in zip(certified, exact, strict=False):  # the exact program is asked fewer
         beyond = max(ours.cost_lower - theirs.cost, theirs.cost_lower - ours.cost)
@@ -326,6 +326,6 @@ def _excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:
 
 
 def _cost_difference(printed: Sequence[Answer], exact: Sequence[Answer]) -> float | None:
-    """Of the states that the printed problem can be solved from; None without any."""
+    """Return the largest relative cost difference of printed problem and exact program; None without any."""
     pairs = [(one.cost, other.cost) for one, other in zip(printed, exact, strict=False) if np.isfinite(one.cost)]
     return max((abs(one / other - 1.0) for one, other in pairs), default=None)

@@ -1,4 +1,4 @@
-"""Times of decisions, and the document of a benchmark."""
+"""Timing of decisions, and the result document of a benchmark."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from uavctl.smpc.answer import Answer, Solver
 
 
 class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
-    """Of a figure over the states."""
+    """Quantiles of a figure over the states."""
 
     p50: float
     p99: float
@@ -26,7 +26,7 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def of(values: NDArray[np.float64]) -> Quantiles:
-        """Of values (n,)."""
+        """Return the quantiles of values (n,)."""
         p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
         return Quantiles(p50=p50, p99=p99, max=most)
 
@@ -40,7 +40,7 @@ class Shares(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """Decision of scheme `age-conditioned` for all axes, each with a covariance of its own and a setpoint sent last."""
+    """Times of scheme `age-conditioned` for all axes; each decision has its own covariance and last setpoint."""
 
     us: Quantiles
     iterations: Quantiles  # of all its programs together
@@ -57,7 +57,7 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Medians over the states and ratios of them; a time is of a decision for all axes unless it says otherwise."""
+    """Result of a benchmark: medians over the states, and ratios of them; a time is for all axes unless noted."""
 
     states: int
     components: int  # independent axes
@@ -107,13 +107,13 @@ _WARM = 5
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Times and answers, one a state."""
+    """Times and answers of one solver, one for each state."""
 
     us: Array  # median over the runs (n,) [µs]
     answers: tuple[Answer, ...]  # the last run's
 
     def of(self, method: str) -> Array:
-        """Times of the states that a method answered with a plan."""
+        """Return the times (n,) [µs] of the states that a method answered with a plan."""
         with_plan = [answer.method == method and bool(np.isfinite(answer.cost)) for answer in self.answers]
         times: Array = self.us[np.array(with_plan, dtype=bool)]
         return times
@@ -121,7 +121,7 @@ class Timed:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without garbage collection, whose pauses belong to nobody's decision."""
+    """Suspend garbage collection, whose pauses are not part of any decision."""
     enabled = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -134,7 +134,7 @@ def quiet() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is timed."""
+    """Solver and questions that are timed."""
 
     solver: Solver  # who decides
     points: Sequence[Array]  # from which states (n_x,)
@@ -142,17 +142,17 @@ class Case:
     once: bool = False  # whether each state is asked in one of the runs only; else in all of them
 
     def asked(self, run: int, runs: int) -> range:
-        """Indices of the states that a run asks."""
+        """Return the indices of the states that a run asks."""
         return range(run, len(self.points), runs) if self.once else range(len(self.points))
 
 
 def timed(cases: Sequence[Case], runs: int, told: Callable[[int], None] = lambda _: None) -> list[Timed]:
-    """Time solvers that are compared, run by run in turns: what else the machine does meets all of them alike.
+    """Time several solvers, run by run in turns, so that the machine's other load affects all of them alike.
 
     Args:
         cases: What is timed; a few states of each are asked before.
         runs: How often; a state's time is the median.
-        told: Told the number of decisions done, after each.
+        told: Called with the number of decisions done, after each.
     """
     for case in cases:
         for x in case.points[:_WARM]:
@@ -179,7 +179,7 @@ def timed(cases: Sequence[Case], runs: int, told: Callable[[int], None] = lambda
 
 
 def clock_us() -> float:
-    """Median of an empty measurement [µs]."""
+    """Return the median time of an empty measurement [µs]."""
     us = np.zeros(_EMPTY)
     for i in range(_EMPTY):
         start = time.perf_counter()
@@ -188,5 +188,5 @@ def clock_us() -> float:
 
 
 def median(times: Array) -> float | None:
-    """Median, None of nothing."""
+    """Return the median; None of no values."""
     return float(np.median(times)) if times.size else None

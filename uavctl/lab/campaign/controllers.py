@@ -1,4 +1,4 @@
-"""Settings and controllers of cells; baselines in the flight core."""
+"""Controllers of a campaign's cells, the settings they fly in, and baselines within the flight core."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ _DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 
 
 def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
-    """w(k) of every run (N, T, n_w).
+    """Return w(k) of every run (N, T, n_w).
 
     Args:
         spec: The kind; all have mean `bias` and covariance scale² W, gusts as they are once they have long blown.
@@ -73,7 +73,7 @@ def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
 
 
 def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
-    """Draws of mean 0 and covariance I."""
+    """Return draws of mean 0 and covariance I."""
     if spec.kind == "uniform":
         return np.asarray(np.sqrt(3.0) * (2.0 * ndtr(normal) - 1.0), dtype=np.float64)
     if spec.kind == "heavy":
@@ -96,7 +96,7 @@ _START = 2  # child of a run's seed that draws its start; 0 and 1 are those of `
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A cell without its controller."""
+    """Setting of a cell: everything but its controller."""
 
     spec: CampaignSpec  # the campaign's specification: steps, seed, start
     base: Config  # the base configuration, which every cell is judged by
@@ -107,7 +107,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """What N runs of T steps meet."""
+    """Disturbances, losses and noise that N runs of T steps meet."""
 
     scene: Scene  # the scene
     newest: Counts  # capture step of the newest position known in each step (N, T)
@@ -117,7 +117,7 @@ class Met:
 
 
 def met(setting: Setting, first: int, runs: int) -> Met:
-    """What the runs `first` … `first` + `runs` - 1 meet.
+    """Return what the runs `first` … `first` + `runs` - 1 meet.
 
     Raises:
         DesignError: The plant that flies is none.
@@ -146,7 +146,7 @@ def met(setting: Setting, first: int, runs: int) -> Met:
 
 
 def start_of(spec: CampaignSpec, base: Config) -> Array:
-    """The state in which runs start (n_x,); with a box, its middle."""
+    """Return the state in which runs start (n_x,); with a box, its middle."""
     if spec.start:
         return np.array(spec.start, dtype=np.float64)
     if spec.start_box:
@@ -156,7 +156,7 @@ def start_of(spec: CampaignSpec, base: Config) -> Array:
 
 
 def _starts(setting: Setting, first: int, runs: int) -> Array:
-    """x(0) of every run (N, n_x)."""
+    """Return x(0) of every run (N, n_x)."""
     spec = setting.spec
     if not spec.start_box:
         return np.tile(start_of(spec, setting.base), (runs, 1))
@@ -180,7 +180,7 @@ LibraryFor = Callable[[Config, Design], StoredLibrary | None]
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """All that a controller is built from; it can be sent to another process."""
+    """Everything that a controller is built from; it can be sent to another process."""
 
     key: str  # hash of all the others
     kind: str  # one of `uavctl.lab.campaign.plugins.KINDS`, or of another package
@@ -196,7 +196,7 @@ class Recipe:
 
 
 def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
-    """Make design, library and gains: what takes its time, or depends on chance.
+    """Make a recipe: design, library and gains, which take time or depend on chance.
 
     Args:
         config: The configuration that it believes in.
@@ -225,7 +225,7 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
 
 
 def build(recipe: Recipe) -> BatchController:
-    """A controller of a recipe.
+    """Build a controller from a recipe.
 
     Raises:
         DesignError: There is none.
@@ -257,7 +257,7 @@ def build(recipe: Recipe) -> BatchController:
 
 
 def sight_of(config: Config) -> FilterBelief:
-    """What a controller that believes in a configuration makes of positions."""
+    """Return what a controller with this configuration believes of positions."""
     return FilterBelief(build_plant(config), config.estimator.position_std_m, config.estimator.initial_std)
 
 
@@ -265,7 +265,7 @@ _built = threading.local()  # a controller has a state: each thread of a worker 
 
 
 def built(recipe: Recipe) -> BatchController:
-    """A controller of a recipe; the last one is kept, since a worker mostly goes on with the same."""
+    """Return a controller of a recipe; the last one is kept, as a worker mostly goes on with the same."""
     if getattr(_built, "key", None) != recipe.key:
         _built.key = None
         _built.controller = build(recipe)
@@ -288,7 +288,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
 
 
 def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
-    """The gains that suit what the PID believes in, from where the campaign starts."""
+    """Return gains tuned for what the PID believes in, from the campaign's start."""
     spec = msgspec.structs.replace(spec, steps=min(spec.steps, TUNING_STEPS))
     believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
     meets = met(believed, TUNING_FIRST, TUNING_RUNS)
@@ -304,7 +304,7 @@ def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
 
 
 class BaselineSolver:
-    """A baseline as a solver; implements `uavctl.smpc.answer.Solver`.
+    """Baseline in the form of a solver; implements `uavctl.smpc.answer.Solver`.
 
     Args:
         name: What plans say that they were found by.
@@ -318,7 +318,7 @@ class BaselineSolver:
         self._asked: list[Array] = []  # its inputs (n_u,) step by step, as far as they are flown
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        """See `Solver`; `outlook` is for those who know what to do with it."""
+        """See `Solver`; `outlook` is not used."""
         del outlook
         if self._target is None or not np.array_equal(target, self._target):
             self._problem, self._controller = self._make(target)
@@ -340,7 +340,7 @@ class BaselineSolver:
 
 
 def _twin(controller: BatchController) -> BatchController:
-    """The same controller with a state of its own, which of all baselines is in arrays."""
+    """Return a copy of a controller with a state of its own; the state of every baseline is in arrays."""
     twin = copy(controller)
     for name, value in vars(twin).items():
         if isinstance(value, np.ndarray):
@@ -349,7 +349,7 @@ def _twin(controller: BatchController) -> BatchController:
 
 
 def _answer(seq: int, name: str, problem: ControlProblem, x: Array, inputs: Array) -> Answer:
-    """A plan without back-offs; its states are those without disturbance, inputs cut to their limits."""
+    """Return a plan without back-offs: states without disturbance, inputs cut to their limits."""
     if not np.isfinite(inputs).all():
         return Answer.failed(seq, SolveStatus.FAILED, name)
     low, high = problem.input_set.bounds

@@ -1,4 +1,4 @@
-"""Intervals of rates, means and differences, from runs.
+"""Confidence intervals of rates, means and differences, from runs.
 
 The runs of a cell are independent, the steps of a run are not. So the exact interval (Clopper and Pearson) is that of a
 share of runs; figures of steps are means over runs, with the bootstrap over runs. All cells share their draws, so two
@@ -29,7 +29,7 @@ FEW = 20
 
 
 class PairedDifference(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean of a figure minus that of another controller's on the same draws, with its interval."""
+    """Mean difference of a figure between two controllers on the same draws, with its interval."""
 
     mean: float
     low: float
@@ -38,12 +38,12 @@ class PairedDifference(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def sign(self) -> int:
-        """-1 or 1 where the interval is on one side of zero, else 0."""
+        """-1 or 1 where the interval lies on one side of zero, else 0."""
         return int(self.low > 0.0) - int(self.high < 0.0)
 
 
 def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Pair:
-    """Exact interval of a probability (Clopper and Pearson, 1934), by quantiles of the beta distribution.
+    """Return the exact interval of a probability (Clopper and Pearson, 1934), by quantiles of the beta distribution.
 
     Args:
         hits: Number of independent trials in which it happened.
@@ -58,7 +58,7 @@ def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Pair:
 
 
 def worst_step(hits: NDArray[np.int64], runs: int, steps: int, level: float = LEVEL) -> tuple[float, Pair]:
-    """Rate of the step in which something happened most often, with an interval that goes for all steps at once.
+    """Return the highest rate of any step, with an interval that holds for all steps at once.
 
     The worst step is chosen by the same runs, so that an interval of its own would say too much: each step has the
     exact one at the level 1 - (1 - `level`) / T (Bonferroni), and the worst one's is told.
@@ -72,7 +72,7 @@ def worst_step(hits: NDArray[np.int64], runs: int, steps: int, level: float = LE
 
 
 def bootstrap_mean(values: Array, level: float = LEVEL, seed: int = 0) -> Pair:
-    """Interval of a mean: percentiles of resampled means, the normal approximation beyond `BOOTSTRAP_UP_TO` values.
+    """Return the interval of a mean by the bootstrap, beyond `BOOTSTRAP_UP_TO` values by the normal distribution.
 
     Args:
         values: Independent values (N,).
@@ -103,7 +103,7 @@ def bootstrap_mean(values: Array, level: float = LEVEL, seed: int = 0) -> Pair:
 
 
 def paired_difference(a: Array, b: Array, level: float = LEVEL) -> PairedDifference:
-    """Mean of a - b (N,), run against run on the same draws, with the interval of that mean.
+    """Return the mean of a - b (N,), run against run on the same draws, with its interval.
 
     Raises:
         UsageError: There are no pairs, or runs without a partner.
@@ -116,7 +116,7 @@ def paired_difference(a: Array, b: Array, level: float = LEVEL) -> PairedDiffere
 
 
 def paired_ratio(a: Array, b: Array, level: float = LEVEL) -> tuple[float, Pair]:
-    """Mean of a (N,) over the mean of b (N,), run against run on the same draws, with its interval.
+    """Return the mean of a (N,) over the mean of b (N,), run against run on the same draws, with its interval.
 
     The interval is that of the mean of a - r b, with r the ratio, over the mean of b: what moves both costs of a run
     alike is not counted.
@@ -133,7 +133,7 @@ def paired_ratio(a: Array, b: Array, level: float = LEVEL) -> tuple[float, Pair]
 
 
 def step_rate(hits: Array, steps: int, level: float = LEVEL) -> tuple[float, Pair]:
-    """Share of the steps in which something happened, with its interval over runs.
+    """Return the share of steps in which something happened, with its interval over runs.
 
     Where it happened in few runs, these are counted exactly instead of resampled: the share of such runs times what a
     run of them has on average; the whole share of runs (the rate can be no more) where there was none.

@@ -1,4 +1,4 @@
-"""Pages of campaigns."""
+"""Pages of campaigns, in the linear world and of quadrotor trials."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _WHAT = ("link", "disturbance", "plant")
 
 @dataclass(frozen=True, eq=False)
 class CampaignView:
-    """A campaign as its page shows it."""
+    """A campaign with everything worked out that its page shows."""
 
     results: Results  # the campaign
     cells: list[CellSummary]  # the figures of its cells
@@ -62,11 +62,11 @@ class CampaignView:
         return cls(results, cells, groups, list(verdicts(results, groups)), looks)
 
     def is_smpc(self, controller: str) -> bool:
-        """Whether a controller is an SMPC."""
+        """Return whether a controller is an SMPC."""
         return any(cell.controller == controller and cell.kind == SMPC for cell in self.cells)
 
     def place(self, group: Group) -> str:
-        """Where a cell is, by what is not the same for all."""
+        """Return the name of a group: its link, and what else is not the same for all groups."""
         names = list(group[:1])
         for which in (1, 2):
             if len({other[which] for other in self.groups}) > 1:
@@ -86,7 +86,7 @@ class CampaignView:
 
 
 def story(view: CampaignView) -> Iterator[str]:
-    """Sentences; each is true of this campaign's figures."""
+    """Yield sentences on the outcome of a campaign, made from its figures."""
     results, cells = view.results, view.cells
     refused = sum(bool(cell.refused) for cell in cells)
     failed = sum(cell.failed for cell in cells)
@@ -105,7 +105,7 @@ def story(view: CampaignView) -> Iterator[str]:
 
 
 def _outcome(judged: Sequence[CampaignVerdict]) -> str:
-    """How often the SMPC was below all baselines, how often one was below it, and what that one did."""
+    """Return a sentence on how often the SMPC beat all baselines, and how often a baseline beat it."""
     holds, beaten = sum(v.holds for v in judged), sum(v.beaten for v in judged)
     outright = sum(v.outright for v in judged)
     text = (
@@ -118,7 +118,7 @@ def _outcome(judged: Sequence[CampaignVerdict]) -> str:
 
 
 def _promise(view: CampaignView) -> Iterator[str]:
-    """Whether the risk promised was kept."""
+    """Yield sentences on whether the promised risk was kept."""
     kept = [cell for cell in view.cells if cell.promised_x is not None and cell.violation_ci is not None]
     if not kept:
         return
@@ -199,7 +199,7 @@ def _write(folder: Path, text: str) -> Path:
 
 
 def _specification(folder: Path) -> str:
-    """The campaign's file, folded; nothing where it is not there."""
+    """Return the campaign's file as folded HTML; empty where it is missing."""
     try:
         return page.folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
     except OSError:
@@ -207,7 +207,7 @@ def _specification(folder: Path) -> str:
 
 
 def report_html(results: Results) -> str:
-    """The page as text."""
+    """Return the page of a campaign as HTML."""
     view = CampaignView.of(results)
     subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
     return page.page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view))
@@ -298,7 +298,7 @@ def _difference_section(view: CampaignView) -> PageSection:
 
 
 def _suffix(view: CampaignView, scene: tuple[str, str]) -> str:
-    """The scene's name after a title; nothing where there is one scene only."""
+    """Return the scene's name to follow a title; empty where there is one scene only."""
     where = view.place(("", *scene)).removeprefix(", ")
     return f": {where}" if where else ""
 
@@ -312,7 +312,7 @@ def _age_section(view: CampaignView) -> PageSection:
 
 
 def _ways_section(view: CampaignView) -> Iterator[PageSection]:
-    """Of a room with walls; a box of other units has none that a vehicle could touch."""
+    """Return the section on ways through a room; none for a box of other units, which has no walls."""
     if all(cell.beyond_m is None for cell in view.cells):
         return
     columns = (
@@ -394,7 +394,7 @@ def _rate(value: float | None, interval: Pair | None) -> str:
 
 
 def _whole(interval: Pair, digits: int) -> str:
-    """An interval that no line breaks."""
+    """Return an interval as text that no line break splits."""
     return f"({interval[0]:.{digits}g} to {interval[1]:.{digits}g})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
@@ -414,7 +414,7 @@ def _failures_section(view: CampaignView) -> PageSection:
 def _table(
     columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int], remarks: Iterable[str] = ()
 ) -> str:
-    """A table of many columns, set small to be seen in full, with remarks as rows of their own below."""
+    """Return a table of many columns as HTML, in small print, with remarks as rows of their own below."""
     text = page.table(columns, rows, numbers).replace('class="many"', 'class="many dense"', 1)
     below = "".join(f'<tr><td colspan="{len(columns)}">{escape(remark)}</td></tr>' for remark in remarks)
     return text.replace("</tbody>", f"{below}</tbody>", 1)
@@ -449,7 +449,7 @@ def write_trial_report(folder: Path) -> Path:
 
 
 def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: str = "") -> str:
-    """The page as text."""
+    """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {told.master} · uavctl {told.uavctl_version}"
     return page.page(f"Campaign “{told.name}”", subtitle, _story(cells), _trial_sections(told, cells, specification))
 
@@ -469,7 +469,7 @@ def _story(cells: Sequence[TrialSummary]) -> Iterator[str]:
 
 
 def _best(cells: Sequence[TrialSummary], key: str) -> dict[str, int]:
-    """How often who had the least median of a figure."""
+    """Return how often each controller had the least median of a figure."""
     wins: dict[str, int] = {}
     for where in dict.fromkeys(map(_where, cells)):
         found = {c.place.controller: c.median[key] for c in cells if _where(c) == where}

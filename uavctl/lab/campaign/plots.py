@@ -1,4 +1,4 @@
-"""Figures of the page."""
+"""Figures of a campaign's page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SHAPES = {
 
 @dataclass(frozen=True)
 class MarkerStyle:
-    """How a controller or a link is drawn: a role's colour and a marker, full or hollow."""
+    """Style of a controller or a link in figures: a role's colour and a marker, full or hollow."""
 
     role: str
     marker: str
@@ -42,7 +42,7 @@ class MarkerStyle:
 
 
 def legend(entries: Iterable[tuple[MarkerStyle, str]], limit: str = "", cross: str = "") -> str:
-    """The legend as HTML.
+    """Return a legend as HTML.
 
     Args:
         limit: What a dashed line is; none where it is empty.
@@ -75,12 +75,12 @@ _LETTER_IN = 0.08  # of the page's font, the widest that browsers take for it
 
 
 def offset(place: int, count: int) -> float:
-    """Within a row, from -0.36 to 0.36."""
+    """Return the offset of marker `place` of `count` within a row, from -0.36 to 0.36."""
     return 0.0 if count == 1 else 0.72 * (place / (count - 1) - 0.5)
 
 
 def rows_in(labels: Sequence[str], count: int) -> float:
-    """Height of all rows [in]; they are alike, so the name of most lines counts."""
+    """Return the height of all rows [in]; they are alike, so the name with most lines counts."""
     lines = max(label.count("\n") + 1 for label in labels)
     return len(labels) * max(0.13 * count + 0.08, 0.15 * lines + 0.06)
 
@@ -93,12 +93,12 @@ def lower(ax: Axes, room_in: float) -> None:
 
 
 def left_in(labels: Sequence[str]) -> float:
-    """Room for the names of links beside the axis [in]."""
+    """Return the room for the names of links beside the axis [in]."""
     return 0.2 + _LETTER_IN * max(len(line) for label in labels for line in label.splitlines())
 
 
 def draw_rows(ax: Axes, labels: Sequence[str]) -> None:
-    """Names of the rows, the first on top, with lines between them."""
+    """Draw the names of the rows, the first on top, with lines between them."""
     ax.set_yticks(range(len(labels)), labels)
     ax.set_ylim(len(labels) - 0.5, -0.5)
     ax.grid(visible=False, axis="y")
@@ -114,7 +114,7 @@ _TICK_LETTER_IN, _TICK_GAP_IN = 0.075, 0.08  # of the axis of differences
 
 
 def spread_ticks(ax: Axes) -> None:
-    """Ticks at 1 and 3 of each decade, at 1 only where their numbers would touch."""
+    """Set ticks at 1 and 3 of each decade, at 1 only where their numbers would touch."""
     low, high = ax.get_xlim()
     dots_an_inch = ax.get_figure(root=True).dpi  # type: ignore[union-attr]
     for subs in ((1.0, 3.0), (1.0,)):
@@ -129,7 +129,7 @@ def spread_ticks(ax: Axes) -> None:
 
 
 def plain(value: float, _place: int) -> str:
-    """A number without an exponent, as a formatter of matplotlib is called."""
+    """Return a number without an exponent; called as a formatter of matplotlib is."""
     for least, suffix in ((1e6, "M"), (1e4, "k")):
         if abs(value) >= least:
             return f"{value / (1e6 if suffix == 'M' else 1e3):.6g}{suffix}"
@@ -160,22 +160,22 @@ _LOOKS = tuple(
 
 @dataclass(frozen=True)
 class Looks:
-    """How each controller is drawn, the same in all figures."""
+    """Styles of the controllers, the same in all figures."""
 
     controllers: tuple[str, ...]
 
     def of(self, controller: str) -> MarkerStyle:
-        """How one is drawn."""
+        """Return the style of a controller."""
         return _LOOKS[self.controllers.index(controller) % len(_LOOKS)]
 
     def entries(self, shown: Collection[str]) -> Iterator[tuple[MarkerStyle, str]]:
-        """The legend of those that are shown."""
+        """Return the legend's entries of the controllers shown."""
         return ((self.of(name), name) for name in self.controllers if name in shown)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a figure shows of each cell."""
+    """A quantity of each cell that a figure shows."""
 
     key: str  # in the figure's id
     title: str  # of the figure
@@ -211,7 +211,7 @@ QUANTITIES = (COST, STATES, SETTLED, INPUTS)
 
 
 def compared(cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str) -> Iterator[Drawing]:
-    """Every quantity of the cells of one disturbance and plant: over the loss where it is a number, by link else.
+    """Draw every quantity of the cells of one disturbance and plant: over the loss if that is a number, else by link.
 
     Args:
         losses: Loss of the links that are nothing but a loss.
@@ -253,7 +253,7 @@ def _over_loss(
 
 
 def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key: str) -> Drawing:
-    """Grouped dots: a row for each link, a dot with its interval for each controller."""
+    """Draw grouped dots: a row for each link, a dot with its interval for each controller."""
     name = f"{quantity.key}-link-{key}"
     links = list(dict.fromkeys(cell.link for cell in cells))
     who = list(dict.fromkeys(cell.controller for cell in cells))
@@ -277,7 +277,7 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
 
 
 def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, key: str) -> Drawing | None:
-    """Paired cost differences of each baseline to one SMPC by link, over the SMPC's cost."""
+    """Draw the paired cost difference of each baseline to one SMPC by link, over the SMPC's cost."""
     shown = [verdict for verdict in verdicts if any(one.share is not None for one in verdict.comparisons)]
     if not shown:
         return None
@@ -303,7 +303,7 @@ def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, k
 
 
 def _difference(ax: Axes, one: BaselineComparison, place: float, looks: Looks) -> None:
-    """The baseline's marker where the SMPC breaks no limit more often, else a cross."""
+    """Draw one difference: the baseline's marker where the SMPC breaks no limit more often, else a cross."""
     if one.share is None:
         return
     mean, low, high = np.clip(100.0 * np.array(one.share), -_FARTHEST_PERCENT, _FARTHEST_PERCENT)
@@ -315,7 +315,7 @@ def _difference(ax: Axes, one: BaselineComparison, place: float, looks: Looks) -
 
 
 def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawing]:
-    """How often the age of information was at least j, by link: for a wide page and for a narrow one."""
+    """Draw the share of steps with an age of information of at least j, by link, for a wide and a narrow page."""
     by_link: dict[str, list[int]] = {}
     for cell in cells:
         if cell.ages and len(cell.ages) >= len(by_link.get(cell.link, [])):
@@ -344,13 +344,13 @@ def _tails(ax: Axes, histograms: list[list[int]]) -> None:
 
 
 def age_entries(cells: Sequence[CellSummary]) -> Iterator[tuple[MarkerStyle, str]]:
-    """Its legend."""
+    """Return the legend of `ages`."""
     links = dict.fromkeys(cell.link for cell in cells if cell.ages)
     return ((_LOOKS[place % len(_LOOKS)], link) for place, link in enumerate(links))
 
 
 def _paint(look: MarkerStyle) -> tuple[str, str]:
-    """Colours of the line and of the marker's inside."""
+    """Return the colours of the line and of the marker's inside."""
     return colour(look.role), colour(look.role if look.full else "card")
 
 
@@ -360,7 +360,7 @@ def _figures(quantity: Quantity, cells: Sequence[CellSummary]) -> np.ndarray:
 
 
 def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale: Callable[[str], None]) -> float:
-    """A logarithmic axis where the figures lie far apart; at or below the value returned there is no place on it."""
+    """Set a logarithmic axis where figures lie far apart; return the value at or below which nothing can be drawn."""
     value, _, high = _figures(quantity, cells)
     above = value[value > 0.0]
     if not high.size or not (high > 0.0).any():
@@ -382,7 +382,7 @@ def _scale(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], set_scale
 
 
 def _promise(ax: Axes, quantity: Quantity, cells: Sequence[CellSummary], links: Sequence[str]) -> None:
-    """What is allowed, beside the link that it is allowed for."""
+    """Draw the allowed share of each link in its row."""
     for share, row in {(quantity.promised(cell), links.index(cell.link)) for cell in cells}:
         if share is not None:
             ax.vlines(quantity.scale * share, row - 0.5, row + 0.5, color=colour("limit"), lw=1.3, ls=DASHED)

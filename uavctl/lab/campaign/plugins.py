@@ -25,12 +25,12 @@ ControllerClass = Callable[[ControlProblem], BatchController]
 
 
 def installed() -> tuple[str, ...]:
-    """Names of the controllers that installed packages offer."""
+    """Return the names of the controllers that installed packages offer."""
     return tuple(sorted({point.name for point in entry_points(group=GROUP)} - set(KINDS)))
 
 
 def controller_class(kind: str) -> ControllerClass:
-    """Find the class of a controller that is none of `KINDS`; modules of the working directory count.
+    """Return the class of a controller that is none of `KINDS`; modules of the working directory count.
 
     Raises:
         DesignError: nothing has that name, it cannot be imported, or it is no controller.

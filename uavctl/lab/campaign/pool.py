@@ -1,4 +1,4 @@
-"""Who flies tasks: processes of this machine, or the workers of a Dask cluster; the same futures either way.
+"""Pool of workers that fly tasks: processes of this machine, or the workers of a Dask cluster.
 
 Every worker computes with one BLAS thread. With more, the last bits of a product depend on their number, and then the
 results would; the libraries read it from the environment before numpy is imported, so a campaign with one worker flies
@@ -38,7 +38,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Work(ABC):
-    """What a worker is given: runs `first` … `first` + `runs` - 1 of a cell, in any world."""
+    """Work for a worker: runs `first` … `first` + `runs` - 1 of a cell."""
 
     cell: int
     first: int
@@ -46,38 +46,38 @@ class Work(ABC):
 
     @property
     def name(self) -> str:
-        """Names it within its campaign; sorts as the rows do."""
+        """Name of the work within its campaign; names sort as the rows do."""
         return f"{self.cell:05d}-{self.first:08d}"
 
     @abstractmethod
     def fly(self) -> Columns:
-        """Fly the runs; what raises is told in a row, and stops nothing."""
+        """Fly the runs; an error of a run is put into its row, and stops nothing."""
 
     @abstractmethod
     def lost(self, error: str) -> Columns:
-        """The rows of runs that all ended without figures."""
+        """Return rows for runs that all ended without figures."""
 
 
 class Workers(Protocol):
-    """Workers."""
+    """Interface of a pool of workers."""
 
     size: int  # tasks that they fly at a time
 
     def submit(self, task: Work) -> Future[Columns]:
-        """Have a task flown."""
+        """Submit a task."""
         ...
 
     def broken(self, error: BaseException) -> bool:
-        """Whether a future ended like this because a worker died, not because of its task's code."""
+        """Return whether an error means that a worker died, and is not of its task's code."""
         ...
 
     def renew(self) -> None:
-        """Be ready for tasks again after a worker died."""
+        """Make ready for tasks again after a worker died."""
         ...
 
 
 class Processes:
-    """Processes of this machine."""
+    """Pool of processes on this machine."""
 
     def __init__(self, workers: int) -> None:
         self.size = workers
@@ -93,7 +93,7 @@ class Processes:
             return ended
 
     def each(self, done: Callable[[T], R], given: Iterable[T]) -> Iterator[R]:
-        """What is done with each of the given, in order.
+        """Return the results of a function for each of the given values, in order.
 
         Raises:
             BrokenProcessPool: A process died.
@@ -110,13 +110,13 @@ class Processes:
         self._pool = _pool(self.size)
 
     def close(self) -> None:
-        """End the processes once they have done what they do."""
+        """End the processes once they have done what was submitted."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
 def processes(workers: int) -> Iterator[Processes]:
-    """That many worker processes."""
+    """Return a pool of `workers` processes."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)  # children inherit it
     crew = Processes(workers)
@@ -149,12 +149,12 @@ class Cluster:
         return isinstance(error, KilledWorker)
 
     def renew(self) -> None:
-        """The scheduler has its own way with workers that died."""
+        """Do nothing: the scheduler replaces workers that died."""
 
 
 @contextmanager
 def cluster(address: str) -> Iterator[Cluster]:
-    """The workers of the Dask scheduler at an address, as many as it has now.
+    """Return the workers of the Dask scheduler at an address, as many as it has now.
 
     Raises:
         UsageError: There is no Dask here, no scheduler there, no worker, or one that would fly otherwise.
@@ -187,7 +187,7 @@ def cluster(address: str) -> Iterator[Cluster]:
 
 
 def _about() -> tuple[str, str]:
-    """Version and BLAS threads of the process that this runs in."""
+    """Return version and BLAS threads of the process that this runs in."""
     threads = os.environ.get("OPENBLAS_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "all"))
     return __version__, threads
 
@@ -210,7 +210,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ends."""
+    """Prepare a worker: leave Ctrl-C to the parent, and end with the parent however it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -231,7 +231,7 @@ _AHEAD = 2  # tasks for each worker: the one that it flies, and the next
 
 
 def fly_tasks(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
-    """Fly tasks and keep what comes of them, in any order.
+    """Fly tasks and keep their rows, in any order.
 
     A task whose worker dies is flown once more, alone; if that ends the same way, its runs are kept as lost.
 
@@ -266,7 +266,7 @@ def fly_tasks(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callabl
 
 
 def _fly_alone(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
-    """Fly tasks one after the other, so that it is clear which of them takes its worker with it."""
+    """Fly tasks one after the other, to find the one that kills its worker."""
     for task in tasks:
         if stopped():
             return
@@ -280,7 +280,7 @@ def _fly_alone(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callab
 
 
 def _kept(future: Future[Columns], task: Work, crew: Workers, keep: Keep) -> bool:
-    """Keep what came of a task; False if its worker died."""
+    """Keep the rows of a task; return False if its worker died."""
     error = future.exception()
     if error is None:
         keep(task, future.result())

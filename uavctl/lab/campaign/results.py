@@ -1,4 +1,4 @@
-"""Results: figures of cells, verdict."""
+"""Results of a campaign: figures of its cells, and verdicts on the SMPC."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ C = TypeVar("C", bound=ToldCell)
 
 
 class CellFigures(ToldCell, frozen=True, kw_only=True):
-    """One combination of controller, link, disturbance and plant."""
+    """One cell of a campaign: a combination of controller, link, disturbance and plant."""
 
     disturbance: str
     plant: str
@@ -86,7 +86,7 @@ class _Document(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """The runs of one cell that ended in order, sorted; and what ended the others."""
+    """Runs of one cell that ended in order, sorted, and the errors of the others."""
 
     index: NDArray[np.int64]  # indices of the runs (N,)
     figures: dict[str, Values]  # A value for each of them (N,), by column of the results
@@ -96,13 +96,13 @@ class Runs:
     failed: tuple[tuple[int, str], ...]  # (run, error) of the others
 
     def __getitem__(self, column: str) -> Values:
-        """A column (N,)."""
+        """Return a column (N,)."""
         return self.figures[column]
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """A campaign."""
+    """Results of a campaign."""
 
     folder: Path  # where it is
     name: str  # its name
@@ -135,7 +135,7 @@ def read_results(folder: Path) -> Results:
 
 
 def read_document(folder: Path, kind: type[D]) -> D:
-    """What was compared, by `campaign.json`.
+    """Read `campaign.json`.
 
     Raises:
         UavctlError: It is missing, damaged, or of another kind.
@@ -147,7 +147,7 @@ def read_document(folder: Path, kind: type[D]) -> D:
 
 
 def read_cells(folder: Path, cells: Sequence[C], figures: Callable[[pa.Table, C], F]) -> list[F]:
-    """What `figures` makes of the rows of each cell in `runs.parquet`.
+    """Return the result of `figures` for the rows of each cell in `runs.parquet`.
 
     Raises:
         UavctlError: It is missing or damaged.
@@ -184,7 +184,7 @@ def _column(rows: pa.Table, name: str, good: NDArray[np.bool_]) -> Values:
 
 
 def _histogram(lists: pa.ChunkedArray, good: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Sum of histograms of any lengths."""
+    """Return the sum of histograms of any lengths."""
     column = lists.combine_chunks().filter(pa.array(good))
     counts = column.flatten().to_numpy()
     lengths = column.value_lengths().to_numpy().astype(np.int64)
@@ -203,7 +203,7 @@ Figure = tuple[float, Pair] | tuple[None, None]
 
 
 class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a cell; null where it has no run that ended in order. Intervals are at the level 95 %."""
+    """Figures of a cell; null where it has no run that ended in order. Intervals are at the level 95 %."""
 
     controller: str
     link: str
@@ -246,7 +246,7 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(folder: Path) -> list[CellSummary]:
-    """The figures of every cell of a campaign.
+    """Return the figures of every cell of a campaign.
 
     Raises:
         CampaignError: The folder has no results that can be read.
@@ -256,7 +256,7 @@ def summarise(folder: Path) -> list[CellSummary]:
 
 
 def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
-    """The figures of one cell."""
+    """Return the figures of one cell."""
     runs = results.runs[cell.index]
     n = runs.index.size
     state, any_state = _step_and_run_rate(runs["state_violations"], results.steps)
@@ -309,13 +309,13 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
 
 
 def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
-    """A figure of values; None of none, and where it is infinite or none."""
+    """Return a figure of values; None of no values, and where the figure is not finite."""
     found = float(figure(values)) if values.size else math.nan
     return found if math.isfinite(found) else None
 
 
 def difference(a: Runs, b: Runs, column: str, per: float = 1.0) -> PairedDifference | None:
-    """Paired difference of a column, over `per`, over the runs that ended in order in both; None if none did."""
+    """Return the paired difference of a column over `per`, for runs that ended in order in both; None without any."""
     _, of_a, of_b = np.intersect1d(a.index, b.index, assume_unique=True, return_indices=True)
     return paired_difference(a[column][of_a] / per, b[column][of_b] / per) if of_a.size else None
 
@@ -325,7 +325,7 @@ def _mean(values: Array) -> Figure:
 
 
 def _step_and_run_rate(hits: Array, steps: int) -> tuple[Figure, Figure]:
-    """Of the steps in which something happened, and of the runs with any such step."""
+    """Return the share of steps in which something happened, and of the runs with any such step."""
     if not hits.size:
         return (None, None), (None, None)
     some = int(np.count_nonzero(hits))
@@ -361,7 +361,7 @@ class BaselineComparison:
 
     @property
     def safer(self) -> bool:
-        """Whether it breaks one of the limits less often."""
+        """Whether the SMPC breaks neither limit more often, and one of them less often."""
         return self.as_safe and any(kind is not None and kind.sign < 0 for kind in (self.state, self.inputs))
 
     @property
@@ -371,7 +371,7 @@ class BaselineComparison:
 
     @property
     def share(self) -> tuple[float, float, float] | None:
-        """What the baseline costs more, and its interval, over the SMPC's cost; None where that is not positive."""
+        """Extra cost of the baseline over the SMPC's cost, with its interval; None where that cost is not positive."""
         if self.cost is None or not self.smpc.cost:
             return None
         base = self.smpc.cost
@@ -380,7 +380,7 @@ class BaselineComparison:
 
 @dataclass(frozen=True)
 class CampaignVerdict:
-    """One SMPC in one group against all baselines there."""
+    """Verdict on one SMPC in one group, against all baselines there."""
 
     group: Group
     smpc: CellSummary
@@ -403,12 +403,12 @@ class CampaignVerdict:
 
 
 def group_of(cell: CellSummary) -> Group:
-    """What the controllers that are compared have in common."""
+    """Return the group of a cell: link, disturbance and plant."""
     return cell.link, cell.disturbance, cell.plant
 
 
 def grouped(cells: Sequence[CellSummary]) -> dict[Group, list[CellSummary]]:
-    """Cells by group, in the order of the specification."""
+    """Return the cells by group, in the order of the specification."""
     groups: dict[Group, list[CellSummary]] = {}
     for cell in cells:
         groups.setdefault(group_of(cell), []).append(cell)
@@ -416,7 +416,7 @@ def grouped(cells: Sequence[CellSummary]) -> dict[Group, list[CellSummary]]:
 
 
 def verdicts(results: Results, groups: Mapping[Group, Sequence[CellSummary]]) -> Iterator[CampaignVerdict]:
-    """Each SMPC of each group against the baselines of the group that have runs."""
+    """Yield the verdict on each SMPC of each group, against the group's baselines that have runs."""
     for group, cells in groups.items():
         baselines = [cell for cell in cells if cell.kind != SMPC and cell.cost is not None]
         for smpc in cells:
@@ -433,14 +433,14 @@ def _compare(results: Results, smpc: CellSummary, baseline: CellSummary) -> Base
 
 
 def word_of(verdict: CampaignVerdict) -> str:
-    """The verdict in a word."""
+    """Return the verdict in a word."""
     if not verdict.comparisons:
         return "–"
     return "yes" if verdict.holds else "no"
 
 
 def brief(one: BaselineComparison) -> str:
-    """A comparison in a few words, from the baseline's side."""
+    """Return a comparison in a few words, from the baseline's side."""
     if one.cost is None:
         return "no pairs of runs"
     limits = ""
@@ -452,7 +452,7 @@ def brief(one: BaselineComparison) -> str:
 
 
 def in_words(verdict: CampaignVerdict) -> list[str]:
-    """The verdict as sentences with the figures, first what the SMPC does not beat."""
+    """Return the verdict in sentences with figures; first the baselines that the SMPC does not beat."""
     smpc = verdict.smpc
     if smpc.refused:
         return [f"Not flown: {smpc.refused}."]
@@ -483,7 +483,7 @@ def _why_not(one: BaselineComparison) -> str:
 
 
 def _unused(one: BaselineComparison) -> str:
-    """What the baseline's savings are made of, by what the design allows."""
+    """Return a sentence on whether a cheaper baseline breaks limits more often than the SMPC's design allows."""
     promised, allowed = one.smpc.promised_x, one.smpc.promised_u
     state, inputs = one.baseline.violation_ci, one.baseline.input_violation_ci
     if one.cheaper < 0 or not one.safer or promised is None or allowed is None or state is None or inputs is None:
@@ -516,7 +516,7 @@ def _limits(one: BaselineComparison) -> str:
 
 
 def _signed(one: BaselineComparison, verb: str = "", *, interval: bool = True) -> str:
-    """What the baseline costs more or less, in percent of the SMPC's cost."""
+    """Return the extra or saved cost of the baseline, in percent of the SMPC's cost."""
     if one.share is None:
         return "no share of nothing"
     mean, low, high = (100.0 * part for part in one.share)
@@ -528,15 +528,15 @@ def _signed(one: BaselineComparison, verb: str = "", *, interval: bool = True) -
 
 
 def _short(value: float) -> str:
-    """Three digits, without an exponent below a million."""
+    """Return a number with three digits, without an exponent below a million."""
     return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}" if value < 1e6 else f"{value:.1e}"
 
 
 def exceeds(rate: float, allowed: float) -> bool:
-    """Whether a measured rate is above what is allowed, which is 1 - delta and so off by rounding."""
+    """Return whether a measured rate is above the allowed one, 1 - delta, which is off by rounding."""
     return rate > allowed * (1.0 + 1e-9)
 
 
 def percent(share: float | None) -> str:
-    """A share in percent."""
+    """Return a share in percent."""
     return "–" if share is None else f"{100.0 * share:.3g} %"

@@ -1,4 +1,4 @@
-"""Specification of a campaign: file, types, configurations."""
+"""Specification of a campaign: its file, its types, and the configurations that come of it."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class PlantSpec(Section, frozen=True, kw_only=True):
 
 
 class TuningSpec(Section, frozen=True, kw_only=True):
-    """What a user would set otherwise for some controllers on the links that they believe in."""
+    """Settings that differ for some controllers on the links that they believe in."""
 
     controllers: Annotated[
         tuple[str, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[controller]]s")
@@ -199,12 +199,12 @@ class Campaign:
     believed: Mapping[tuple[int, str], Config]
 
     def believed_link(self, controller: int, link: int) -> str:
-        """Name of the link that a controller believes in when it flies on this one."""
+        """Return the name of the link that a controller believes in when it flies on `link`."""
         own = self.spec.controller[controller].link
         return self.spec.link[link].name if own == TRUE else own
 
     def tuned(self, controller: int, believed: str) -> ControllerSpec:
-        """A controller with its margin for the link of that name, which it believes in; the last tuning wins."""
+        """Return a controller with its margin for the link that it believes in; the last tuning wins."""
         one = self.spec.controller[controller]
         for tuning in self.spec.tuning:
             if tuning.margin is not None and one.name in tuning.controllers and believed in tuning.links:
@@ -213,18 +213,18 @@ class Campaign:
 
 
 class SpecProblems:
-    """Problems with their places in the campaign's file, each once."""
+    """Problems with their places in the campaign's file, each listed once."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._problems: dict[str, None] = {}
 
     def tell(self, problems: Iterable[ConfigProblem]) -> None:
-        """Keep these problems."""
+        """Add problems."""
         self._problems.update((self._source.tell(problem), None) for problem in problems)
 
     def load(self, configure: Callable[[Sequence[str]], Config], placed: Placed) -> Config | None:
-        """The configuration with these overrides, or None: it has problems, which are kept."""
+        """Load the configuration with these overrides; add its problems and return None if it has any."""
         try:
             return configure([text for _, text in placed])
         except ConfigError as error:
@@ -233,7 +233,7 @@ class SpecProblems:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """All that were kept."""
+        """All problems added so far."""
         return tuple(self._problems)
 
     def _located(self, problem: str, placed: Placed) -> str:
@@ -248,7 +248,7 @@ class SpecProblems:
 
 
 def placed(key: str, overrides: Sequence[str]) -> Placed:
-    """Overrides with the places where they stand."""
+    """Return overrides with the keys where they stand."""
     return tuple((f"{key}[{i}]", text) for i, text in enumerate(overrides))
 
 
@@ -296,14 +296,14 @@ def compose(spec: CampaignSpec, configuration: str, told: SpecProblems | None = 
 
 
 def _one_a_step(believed: Config) -> Config:
-    """A campaign's links carry one position a step: a scheme that counts on all there are has to know."""
+    """Return the belief with one position a step, which campaigns carry; a scheme that counts on more has to know."""
     if not believed.conditioned:
         return believed
     return msgspec.structs.replace(believed, source=msgspec.structs.replace(believed.source, rate_hz=0.0))
 
 
 def _own(told: SpecProblems, table: str, index: int, overrides: Sequence[str]) -> Placed:
-    """Overrides of a [[link]] or a [[plant]], which act on the section of that name alone."""
+    """Return the overrides of a [[link]] or a [[plant]]; they must act on the section of that name alone."""
     pairs = placed(f"{table}[{index}].set", overrides)
     told.tell(
         ConfigProblem(key, f"{text}: only {table}.* acts on what is flown", f"write {table}.…, or move it to `set`")
@@ -314,7 +314,7 @@ def _own(told: SpecProblems, table: str, index: int, overrides: Sequence[str]) -
 
 
 def _beliefs(spec: CampaignSpec, controller: int, link: int) -> Placed:
-    """All that a controller believes, the strongest last."""
+    """Return all overrides that a controller believes, the strongest last."""
     one, other = spec.controller[controller], spec.link[link]
     tunings = (
         placed(f"tuning[{i}].set", tuning.set)
@@ -329,7 +329,7 @@ def _beliefs(spec: CampaignSpec, controller: int, link: int) -> Placed:
 
 
 def flown(one: Config, given: Placed, key: str) -> Iterator[ConfigProblem]:
-    """A vehicle that campaigns do not fly.
+    """Yield the problem that a configuration flies a vehicle that campaigns do not.
 
     Args:
         key: Where it stands, if none of them named the vehicle.
@@ -348,7 +348,7 @@ def _differs(base: Config, one: Config) -> bool:
 
 
 def _fits(key: str, base: Config, one: Config) -> ConfigProblem:
-    """A plant that is not of the base configuration's kind."""
+    """Return the problem that a plant has other sizes or another step than the base configuration's."""
     sizes = (f"n_x, n_u = {dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (one.plant, base.plant))
     return ConfigProblem(
         key, f"the plant has {' where the configuration has '.join(sizes)}", "keep its sizes and its step"
@@ -359,7 +359,7 @@ def _fits(key: str, base: Config, one: Config) -> ConfigProblem:
 
 
 def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
-    """The campaign of a file, with another number of runs if one is given, and the file's text.
+    """Read the campaign of a file, with another number of runs if one is given; return it with the file's text.
 
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
@@ -384,7 +384,7 @@ Spec = TypeVar("Spec", bound=Section)
 
 
 def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, SpecProblems, str]:
-    """The specification in a file, problems with it so far, and the file's text.
+    """Read the specification in a file; return it, its problems so far, and the file's text.
 
     Raises:
         ConfigError: There is none; with all problems found.
@@ -404,12 +404,12 @@ def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, SpecProblems, str]:
 
 
 def configuration_of(path: Path, config: str) -> str:
-    """The `config` of a campaign's file as `load_config` takes it: a preset, or a file seen from there."""
+    """Return the `config` of a campaign's file as `load_config` takes it: a preset, or a path relative to the file."""
     return config if config in presets() else str(path.parent / config)
 
 
 def text_of(path: Path) -> str:
-    """The text of a campaign's file.
+    """Read the text of a campaign's file.
 
     Raises:
         ConfigError: It cannot be read.
@@ -421,7 +421,7 @@ def text_of(path: Path) -> str:
 
 
 def _sizes(spec: CampaignSpec) -> Iterator[ConfigProblem]:
-    """More than can be designed in minutes, or held in memory."""
+    """Yield the problems of a campaign too large to design in minutes, or to hold in memory."""
     together = min(spec.runs, CHUNK)
     if spec.steps * together > MOST_STEPS_AT_ONCE:
         reason = f"{spec.steps} steps of {together} runs are flown at once"
@@ -438,7 +438,7 @@ def _sizes(spec: CampaignSpec) -> Iterator[ConfigProblem]:
 
 
 def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
-    """Names that are taken twice, or that name nothing."""
+    """Yield the problems of names that are taken twice, or that name nothing."""
     controllers, links = [one.name for one in spec.controller], [one.name for one in spec.link]
     lists = {
         "controller": controllers,
@@ -468,7 +468,7 @@ def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
 
 
 def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
-    """Controllers that are neither ours nor to be found."""
+    """Yield the problems of controllers that are neither ours nor found."""
     given = table.get("controller")
     for i, one in enumerate(given if isinstance(given, list) else ()):
         kind = one.get("kind") if isinstance(one, dict) else None
@@ -480,7 +480,7 @@ def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
 
 
 def taken_twice(key: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
-    """Names in the tables [[key]] that are there already."""
+    """Yield the problems of names that occur twice in the tables [[key]]."""
     for i, name in enumerate(names):
         if name in names[:i]:
             yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")

@@ -1,4 +1,4 @@
-"""A campaign's folder: what it is, its finished tasks as parts, and in the end one table of all runs.
+"""Folder of a campaign: its document, finished tasks as parts, and in the end one table of all runs.
 
 A task is there whole or not at all, so a campaign that was killed goes on where it was; the table's bytes depend on the
 runs alone.
@@ -58,7 +58,7 @@ SCHEMA = pa.schema(
 
 
 class Store:
-    """The folder of one campaign."""
+    """Folder of one campaign."""
 
     def __init__(self, folder: Path, schema: pa.Schema = SCHEMA) -> None:
         self.folder = folder
@@ -67,7 +67,7 @@ class Store:
 
     @contextmanager
     def opened(self, document: Mapping[str, object], specification: str, resume: bool) -> Iterator[None]:
-        """Begin a campaign, or go on with one; nobody else can meanwhile.
+        """Begin a campaign or go on with one, while nobody else can.
 
         Args:
             resume: Whether the folder's campaign is to go on.
@@ -87,11 +87,11 @@ class Store:
             yield
 
     def begun(self) -> bool:
-        """Whether there is a campaign that can go on."""
+        """Return whether there is a campaign that can go on."""
         return (self.folder / DOCUMENT).exists()
 
     def check(self, resume: bool) -> None:
-        """See that there is a campaign if one is to go on, and none if not.
+        """Check that there is a campaign if one is to go on, and none if not.
 
         Raises:
             UsageError: It is the other way round.
@@ -102,11 +102,11 @@ class Store:
             raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
 
     def complete(self) -> bool:
-        """Whether all runs are in the table."""
+        """Return whether all runs are in the table."""
         return (self.folder / RUNS).exists()
 
     def kept(self, tasks: Sequence[Work]) -> set[str]:
-        """Names of the tasks that are there."""
+        """Return the names of the finished tasks."""
         return {task.name for task in tasks if self._part(task).exists()}
 
     def keep(self, task: Work, columns: Columns) -> None:
@@ -173,7 +173,7 @@ class Store:
 
 
 def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
-    """Rows of a task as they are stored."""
+    """Return the rows of a task as they are stored."""
     arrays = []
     for name in schema.names:
         field, values = schema.field(name), columns[name]
@@ -183,7 +183,7 @@ def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
 
 
 def first_difference(there: object, here: object, path: str = "") -> str | None:
-    """The first place in which two JSON documents differ, in words."""
+    """Return the first place in which two JSON documents differ, in words."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in dict.fromkeys((*there, *here)):
             found = first_difference(there.get(key), here.get(key), f"{path}.{key}" if path else str(key))
@@ -202,7 +202,7 @@ def _short(value: object) -> str:
 
 
 def _histograms(counts: NDArray[np.generic]) -> pa.ListArray:
-    """Rows (N, T) as lists up to their last entry that is not 0."""
+    """Return rows (N, T) as lists up to their last entry that is not 0."""
     used = counts.shape[1] - (counts[:, ::-1] != 0).argmax(axis=1)
     used = np.where(counts.any(axis=1), used, 0)
     inside = np.arange(counts.shape[1]) < used[:, None]
@@ -224,7 +224,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _settle(draft: Path, path: Path) -> None:
-    """Give a file its name once the disk has it."""
+    """Rename a temporary file once it is on the disk."""
     for one in (draft, path.parent):
         if one == path.parent:
             draft.replace(path)

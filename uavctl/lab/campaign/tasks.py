@@ -1,4 +1,4 @@
-"""Cells and tasks."""
+"""Cells and tasks of a campaign in the linear world."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One combination."""
+    """One cell of a campaign: a controller in a setting."""
 
     index: int  # its number
     names: tuple[str, str, str, str]  # of controller, link, disturbance and plant
@@ -42,7 +42,7 @@ class Cell:
 
 
 def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
-    """Make every cell, and each controller's recipe once.
+    """Make every cell of a campaign, and each controller's recipe once.
 
     Args:
         library_for: Gives the policy library of a design.
@@ -65,7 +65,7 @@ def _product(campaign: Campaign) -> list[Which]:
 
 
 def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
-    """The recipe of a controller for the link that it believes in, or why there is none."""
+    """Return the recipe of a controller for the link that it believes in, or why there is none."""
     try:
         return recipe_for(campaign.tuned(*key), campaign.believed[key], campaign.spec, library_for)
     except DesignError as error:
@@ -89,7 +89,7 @@ def _cell(campaign: Campaign, index: int, which: Which, recipe: Recipe | str) ->
 
 
 def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
-    """What `campaign.json` holds."""
+    """Return the content of `campaign.json`."""
     spec = campaign.spec
     return {
         "version": VERSION,
@@ -105,7 +105,7 @@ def document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
 
 
 def told(cell: Cell) -> dict[str, object]:
-    """What `campaign.json` holds of a cell."""
+    """Return what `campaign.json` holds of a cell."""
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
     design, gains = (None, None) if recipe is None else (recipe.design, recipe.gains)
     smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
@@ -129,7 +129,7 @@ def told(cell: Cell) -> dict[str, object]:
 
 
 def _usable(recipe: Recipe) -> float | None:
-    """Share of the room in which a plan may rest; None where a wall is open, or the plant cannot rest anywhere."""
+    """Return the share of the room in which a plan may rest; None where a wall is open, or there is no such place."""
     try:
         share = usable_seen(recipe.config, recipe.design)
     except DesignError:
@@ -138,13 +138,13 @@ def _usable(recipe: Recipe) -> float | None:
 
 
 def _plain_loss(link: LinkConfig) -> float | None:
-    """Loss of a link on which nothing else happens to a position than to be lost, each by itself."""
+    """Return the loss of a link with independent losses and nothing else; None of any other link."""
     plain = LinkConfig(loss=link.loss)
     return link.loss if link == plain else None
 
 
 def _refused(setting: Setting) -> str:
-    """Why nothing can fly there, if nothing can."""
+    """Return why nothing can fly in a setting; empty if it can."""
     try:
         met(setting, 0, 1)
     except DesignError as error:
@@ -161,7 +161,7 @@ _AXES = ("north", "east", "down")
 
 
 def ways(config: Config, states: Array) -> dict[str, Array]:
-    """Figures (N,) of runs, by column of the results.
+    """Return figures (N,) of runs by column of the results: way to the target, hold, and distance to walls.
 
     `near_s` and `nearer_s` are when the target was first that near, infinite if it never was; `hold_rms_m` is of the
     second half of a run; `beyond_m` is the furthest beyond a wall, negative for the room that was left.
@@ -186,7 +186,7 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
 
 
 def _first_s(near: NDArray[np.bool_], dt_s: float) -> Array:
-    """Time of the first step (N,) in which it was so; infinite where it never was."""
+    """Return the time of the first step (N,) that is true [s]; infinite where there is none."""
     return np.where(near.any(axis=1), near.argmax(axis=1) * dt_s, np.inf)
 
 
@@ -202,7 +202,7 @@ _AT_LIMIT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Task(Work):
-    """Runs `first` … `first` + `runs` - 1 of a cell."""
+    """Task of a campaign: runs `first` … `first` + `runs` - 1 of a cell."""
 
     setting: Setting
     recipe: Recipe
@@ -217,7 +217,7 @@ class Task(Work):
 
 
 def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:
-    """All tasks of a campaign, in order."""
+    """Return all tasks of a campaign, in order."""
     for cell in cells:
         if cell.recipe is not None:
             runs = cell.setting.spec.runs
@@ -226,7 +226,7 @@ def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:
 
 
 def fly_task(task: Task) -> Columns:
-    """Fly the runs of a task at once; if that raises, one by one, and those that raise have its message.
+    """Fly the runs of a task at once; if that raises, one by one, with the message of those that raise.
 
     Returns:
         Columns as in the results, each with a row a run; `ages` and `outside` are (runs, steps).
@@ -243,7 +243,7 @@ def fly_task(task: Task) -> Columns:
 
 
 def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:
-    """Fly some runs: their trajectories, and what their controller met where it counts that."""
+    """Fly some runs; return their trajectories, and the solver's tally where the controller has one."""
     controller = built(task.recipe)
     meets = met(task.setting, first, runs)
     seen = None
@@ -263,7 +263,7 @@ def _alone(task: Task, run: int) -> Columns:
 
 
 def told_of(error: Exception) -> str:
-    """What ended a run, in words."""
+    """Return the error that ended a run, in words."""
     return f"{type(error).__name__}: {error}"
 
 
@@ -312,7 +312,7 @@ def _figures(task: Task, first: int, runs: int) -> Columns:
 
 
 def _at_limit(task: Task, found: Flown) -> NDArray[np.bool_]:
-    """Steps in which an input acted at its limit (N, T)."""
+    """Return the steps in which an input acted at its limit (N, T)."""
     sets = task.setting.base.sets
     low, high = np.array(sets.input_lower), np.array(sets.input_upper)
     near = np.where(np.isfinite(high - low), _AT_LIMIT * (high - low), 0.0)

@@ -1,4 +1,4 @@
-"""Campaigns of quadrotor trials; reference of keys."""
+"""Campaigns of quadrotor trials: specification, cells, tasks, figures."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ Rate = Annotated[float, Meta(ge=0.01, le=1000)]
 
 
 class TrialControllerSpec(Section, frozen=True, kw_only=True):
-    """One that flies: a controller of ours, or the vehicle by its own position loop."""
+    """One controller of a trial campaign: one of ours, or the vehicle's own position loop."""
 
     name: Name
     kind: Annotated[
@@ -156,7 +156,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class TrialPlace:
-    """One combination of a campaign."""
+    """One cell of a trial campaign."""
 
     index: int  # its number
     cell: TrialCell  # what is flown
@@ -168,7 +168,7 @@ class TrialPlace:
 
 @dataclass(frozen=True)
 class TrialTask(Work):
-    """Flights `first` … `first` + `runs` - 1 of a cell."""
+    """Task of a trial campaign: flights `first` … `first` + `runs` - 1 of a cell."""
 
     flown: TrialCell
     seconds: float
@@ -176,7 +176,7 @@ class TrialTask(Work):
     master: int
 
     def fly(self) -> Columns:
-        """Fly; a flight that raises has what ended it in its row, and stops nothing."""
+        """Fly the task; a flight that raises has the error in its row, and stops nothing."""
         rows = []
         for run in range(self.first, self.first + self.runs):
             seed = seed_of(self.master, run)
@@ -204,12 +204,12 @@ class TrialTask(Work):
 
 
 def seed_of(master: int, run: int) -> int:
-    """Seed of a flight: run i has the same in every cell."""
+    """Return the seed of a flight: run i has the same in every cell."""
     return int(np.random.SeedSequence([master, run]).generate_state(1)[0])
 
 
 def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...]:
-    """Every cell of a campaign; what cannot be designed is refused here, and libraries are made.
+    """Return every cell of a campaign, with libraries made; a design that cannot be made is refused here.
 
     Args:
         library_for: Gives the policy library of a design.
@@ -249,7 +249,7 @@ def _designed(knows: Config, library_for: LibraryFor) -> tuple[str | None, float
 
 
 def trial_tasks(spec: TrialSpec, places: Sequence[TrialPlace]) -> Iterator[TrialTask]:
-    """All tasks of a campaign, in order."""
+    """Return all tasks of a campaign, in order."""
     for place in places:
         if not place.refused:
             for first in range(0, spec.runs, CHUNK):
@@ -258,7 +258,7 @@ def trial_tasks(spec: TrialSpec, places: Sequence[TrialPlace]) -> Iterator[Trial
 
 
 def trial_document(spec: TrialSpec, places: Sequence[TrialPlace]) -> dict[str, object]:
-    """What `campaign.json` holds."""
+    """Return the content of `campaign.json`."""
     return {
         "version": VERSION,
         "world": spec.world,
@@ -294,7 +294,7 @@ def _told(place: TrialPlace) -> dict[str, object]:
 
 
 def is_trial(path: Path) -> bool:
-    """Whether a campaign's file is of flights of the quadrotor.
+    """Return whether a campaign's file is one of quadrotor flights.
 
     Raises:
         ConfigError: It cannot be read.
@@ -303,7 +303,7 @@ def is_trial(path: Path) -> bool:
 
 
 def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
-    """The specification of a file, with another number of runs if one is given, and the file's text.
+    """Read the specification of a file, with another number of runs if one is given; return it with the file's text.
 
     Its `config` is as `load_config` takes it.
 
@@ -376,7 +376,7 @@ class ToldTrial(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a cell; null where one says nothing of its scenario, or is infinite."""
+    """Figures of a cell; null where a figure does not apply to its scenario, or is infinite."""
 
     place: ToldPlace
     runs: int
@@ -389,7 +389,7 @@ class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise_trial(folder: Path) -> tuple[ToldTrial, list[TrialSummary]]:
-    """The figures of every cell of a campaign.
+    """Return the figures of every cell of a campaign.
 
     Raises:
         UavctlError: The folder has no results that can be read.

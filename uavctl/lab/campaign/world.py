@@ -1,4 +1,4 @@
-"""The linear world: runs in step, link, filter, random numbers."""
+"""Linear world of campaigns: many runs in step, their link, filter and random numbers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOISE = 3  # child of a run's seed: 0 and 1 are those of `draw`, 2 draws its st
 
 @dataclass(frozen=True, eq=False)
 class Chances:
-    """Draws of N runs of T steps."""
+    """Random draws of N runs of T steps."""
 
     normal: Array  # standard normal draws (N, T, n_w): the disturbances'
     # Uniform draws (N, T+1, 3): for each step's position, of the channel's state, of its loss, of its delay
@@ -31,7 +31,7 @@ class Chances:
 
 
 def draw(master: int, first: int, runs: int, steps: int, n_w: int) -> Chances:
-    """Draws of the runs `first` … `first` + `runs` - 1 of a campaign; longer runs begin with the same draws."""
+    """Draw for the runs `first` … `first` + `runs` - 1 of a campaign; longer runs begin with the same draws."""
     normal, link = np.empty((runs, steps, n_w)), np.empty((runs, steps + 1, 3))
     for i in range(runs):
         for_plant, for_link = np.random.SeedSequence([master, first + i]).spawn(2)
@@ -41,7 +41,7 @@ def draw(master: int, first: int, runs: int, steps: int, n_w: int) -> Chances:
 
 
 def draw_noise(master: int, first: int, runs: int, steps: int, axes: int) -> Array:
-    """Standard normal draws (N, T, axes) of the positions' noise, apart from all others of a run; see `draw`."""
+    """Draw the standard normal noise of positions (N, T, axes), apart from all other draws of a run; see `draw`."""
     noise = np.empty((runs, steps, axes))
     for i in range(runs):
         seed = np.random.SeedSequence([master, first + i]).spawn(_NOISE + 1)[_NOISE]
@@ -58,7 +58,7 @@ _ROUNDING = 1e-9
 
 
 def known(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
-    """Step that knows the position of each step first, T or more for those that no step does.
+    """Return the first step that knows the position of each step; T or more for those that no step does.
 
     One position is captured a step; the first one is known at once, as in the paper. As in the design, the age counts
     whole steps: where every delay is below Δt, a position is known in its own step; else one that is under way for
@@ -89,12 +89,12 @@ def known(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
 
 
 def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
-    """Capture step (N, T) of the newest position that is known at the beginning of each step; see `known`."""
+    """Return the capture step (N, T) of the newest position known at the beginning of each step; see `known`."""
     return newest_of(known(link, dt_s, chances))
 
 
 def newest_of(known: Counts) -> Counts:
-    """The same, from the step (N, T) that knows each position first."""
+    """Return the capture step (N, T) of the newest position, from the first step (N, T) that knows each one."""
     steps = known.shape[1]
     found = np.zeros(known.shape, dtype=np.intp)
     runs = np.arange(known.shape[0])
@@ -106,7 +106,7 @@ def newest_of(known: Counts) -> Counts:
 
 
 def _traced(link: LinkConfig, chances: Array) -> Array:
-    """Delay [s] of each position (N, T) in the trace, infinite for a lost one; each run begins where it is drawn."""
+    """Return the delay of each position (N, T) in the trace [s], infinite if lost; each run has its own start in it."""
     trace = np.array(link.trace_s)
     first = (chances[:, 0, 0] * len(trace)).astype(np.intp)
     index = (first[:, np.newaxis] + np.arange(chances.shape[1])) % len(trace)
@@ -114,7 +114,7 @@ def _traced(link: LinkConfig, chances: Array) -> Array:
 
 
 def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
-    """Which positions (N, T) never arrive."""
+    """Return which positions (N, T) never arrive."""
     steps = chances.shape[1]
     at_s = np.arange(steps) * dt_s
     dark = np.any([(begin <= at_s) & (at_s <= end) for begin, end in link.blackout] or [np.zeros(steps, bool)], axis=0)
@@ -133,7 +133,7 @@ def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
 
 
 def _bursts(link: LinkConfig, chances: Array) -> Flags:
-    """Gilbert and Elliott's channel: good before the first packet, a step of the chain before each."""
+    """Return losses of a Gilbert-Elliott channel: good before the first packet, a step of the chain before each."""
     lost = np.zeros(chances.shape[:2], dtype=np.bool_)
     bad = np.zeros(chances.shape[0], dtype=np.bool_)
     for k in range(chances.shape[1]):
@@ -144,7 +144,7 @@ def _bursts(link: LinkConfig, chances: Array) -> Flags:
 
 
 def _gaps(link: LinkConfig, chances: Array) -> Flags:
-    """Runs of losses as measured: one is drawn before the first packet, and after each that arrives."""
+    """Return runs of losses as measured: one is drawn before the first packet, and after each that arrives."""
     runs = np.cumsum(link.gaps)
     lost = np.zeros(chances.shape[:2], dtype=np.bool_)
     to_lose = np.full(chances.shape[0], -1, dtype=np.intp)
@@ -160,7 +160,7 @@ def _gaps(link: LinkConfig, chances: Array) -> Flags:
 
 @dataclass(frozen=True, eq=False)
 class FilterBelief:
-    """What a controller believes of the positions that it is told."""
+    """Plant and noise that a controller assumes of positions."""
 
     plant: Plant  # the plant that it believes in
     position_std_m: float  # standard deviation of a position, each axis [m]
@@ -196,7 +196,7 @@ class PositionFilter:
         self._mean, self._cov = mean.copy(), cov.copy()
 
     def told(self, step: int, positions: Array, newest: Counts, inputs: Array) -> tuple[Array, Array]:
-        """State (N, n_x) at the capture of the newest position known, by all that are known, and its covariance.
+        """Return the state (N, n_x) at the capture of the newest position known, and its covariance.
 
         Args:
             step: The step that begins; called for 0, 1, … in turn.
@@ -219,12 +219,12 @@ class PositionFilter:
         return self._mean.copy(), self._cov.copy()
 
     def _moved(self, mean: Array, cov: Array, u: Array) -> tuple[Array, Array]:
-        """A step on, under the inputs (N, n_u)."""
+        """Move beliefs on by a step, under the inputs (N, n_u)."""
         plant = self._plant
         return mean @ plant.a.T + u @ plant.b.T, plant.a @ cov @ plant.a.T + self._noise
 
     def _seen(self, past: int, step: int) -> tuple[Array, Array]:
-        """What is known of a step by its own position too, in the runs that know it in `step`."""
+        """Return the belief of a step by its own position too, in the runs that know it in `step`."""
         mean, cov = (one.copy() for one in self._before[past])
         index = self._index
         if not past:
@@ -252,7 +252,7 @@ class PositionFilter:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is flown, and by which limits and costs it is judged."""
+    """Plant that is flown, and the limits and costs by which it is judged."""
 
     plant: Plant  # the plant that flies; the controllers may believe in another one
     state_set: Polytope  # X
@@ -280,7 +280,7 @@ class Flown:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPositions:
-    """What is told of the states of N runs where positions alone are measured."""
+    """Filter and noise of N runs in which positions alone are measured."""
 
     filter: PositionFilter  # makes states of them
     noise: Array  # theirs (N, T, n_axes) [m]
@@ -334,6 +334,6 @@ def fly(
 
 
 def _outside(limits: Polytope, points: Array) -> Flags:
-    """Which points (…, n) break a row of the set."""
+    """Return which points (…, n) are outside the set."""
     room = limits.b * (1.0 + _ROUNDING * np.sign(limits.b)) + _ROUNDING
     return np.asarray((points @ limits.c.T > room).any(axis=-1), dtype=np.bool_)

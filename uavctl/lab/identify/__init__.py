@@ -1,3 +1,3 @@
-"""What a recording tells of the vehicle and of the link: plant, lag, disturbance, losses and delays."""
+"""Identification of vehicle and link from a recording: plant, lag, disturbance, losses and delays."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The dead time of a plant by its likelihood, and what a plant predicts of the half of a flight it was not fitted to.
+"""Fit of a plant to a flight: its parameters, its dead time, and how well it predicts the half it was not fitted to.
 
 The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
 and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
@@ -56,7 +56,7 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-4, 1e6
 
 @dataclass(frozen=True)
 class AxisFit:
-    """Response of one axis."""
+    """Fitted response of one axis."""
 
     model: AxisModel  # the plant
     dead_time_s: float  # d [s]
@@ -64,7 +64,7 @@ class AxisFit:
     deviance: float  # -2 log likelihood, up to a constant
 
     def value(self, name: str) -> float:
-        """A fitted value by its name."""
+        """Return a fitted value by its name."""
         return values(self.model, self.parameters)[name]
 
 
@@ -110,7 +110,7 @@ def fit_axes(
 
 
 def standard_errors(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> dict[str, float]:
-    """Standard error of each fitted value with the dead time as given, by the curvature at the optimum.
+    """Return the standard error of each fitted value with the dead time given, by the curvature at the optimum.
 
     Infinite where the flight tells nothing, or where the value is at its bound.
     """
@@ -139,7 +139,7 @@ class _Slope(NamedTuple):
 
 
 def _search(x: Array, model: AxisModel, close: float) -> Generator[Array, _Slope, tuple[Array, float]]:
-    """Ask for the slope at one parameter vector after the other; the last, downhill of x, has the least deviance."""
+    """Search the least deviance by damped Newton steps: yield parameter vectors, take their slopes."""
     least, most = np.array([(one.inside(one.least), one.inside(one.most)) for one in model.free]).T
     now, damping = (yield x), _DAMPING
     for _ in range(_MOST_STEPS):
@@ -164,12 +164,12 @@ def _search(x: Array, model: AxisModel, close: float) -> Generator[Array, _Slope
 
 
 def _damped(curvature: Array, gradient: Array, damping: float) -> Array:
-    """The step uphill of a parabola, shorter the more it is damped."""
+    """Return the Newton step uphill, shorter the more it is damped."""
     return np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient), dtype=np.float64)
 
 
 def _corrected(curvature: Array, step: Array, change: Array) -> Array:
-    """The expected curvature, with what a step has shown of the gradient's change along it (BFGS)."""
+    """Return the expected curvature, corrected by how the gradient changed along a step (BFGS)."""
     bent = curvature @ step
     if step @ change <= 0.0 or np.abs(step).max() > _NEAR:
         return curvature
@@ -179,13 +179,13 @@ def _corrected(curvature: Array, step: Array, change: Array) -> Array:
 
 
 def _slopes(parts: Sequence[Timeline], asked: Sequence[tuple[int, AxisModel, Array]]) -> list[_Slope]:
-    """Deviance and what it does around each of some (place of the axis, plant, parameter vector), in one pass."""
+    """Return the slope at each of some (place of the axis, plant, parameter vector), all in one pass."""
     tried = [Tried(place, model, np.vstack([x, x + _STEP * np.eye(len(x))])) for place, model, x in asked]
     return [_slope(one) for one in likelihood(parts, tried)]
 
 
 def _slope(found: Likelihood) -> _Slope:
-    """By the differences of the vectors from the first."""
+    """Return the slope by finite differences of the other parameter vectors from the first."""
     std = np.sqrt(found.variances_m2[:, 0])
     pulls = (found.innovations_m[:, 1:] - found.innovations_m[:, :1]) / (_STEP * std[:, None])
     pulls[np.abs(found.innovations_m[:, 0]) > OUTLIER * std] = 0.0  # an outlier pulls the same wherever it is
@@ -207,7 +207,7 @@ _SETTLED = 4.0  # where a stretch begins, the filter does not know the velocity 
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """Motion from each position to the first one at least so much later."""
+    """Motion from each position to the first one at least a given time later."""
 
     times_s: Array  # (k,), where it begins [s]
     moved_m: Array  # (k,), how far the vehicle went [m]
@@ -215,13 +215,13 @@ class Ahead:
 
     @property
     def errors_m(self) -> Array:
-        """What was not predicted (k,) [m]."""
+        """Errors of the predicted motion (k,) [m]."""
         return self.moved_m - self.predicted_m
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """How one axis was predicted."""
+    """Prediction of one axis' motion against the flight."""
 
     times_s: Array  # (m,), of the positions [s]
     innovations_m: Array  # (m,), position minus its prediction from the one before [m]
@@ -237,13 +237,13 @@ class Prediction:
 
     @property
     def r2(self) -> float:
-        """Share of the motion of the next second that was predicted; 0 where nothing moved."""
+        """Share of the motion of the next second that was predicted, R²; 0 where nothing moved."""
         spread = float(np.sum((self.moved_m - self.moved_m.mean()) ** 2)) if len(self.moved_m) else 0.0
         return 1.0 - float(np.sum((self.moved_m - self.predicted_m) ** 2)) / spread if spread > 0.0 else 0.0
 
 
 def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
-    """Predict each position of the flight from the ones before it."""
+    """Predict each position of a flight from the ones before it."""
     times, innovations, stds = [], [], []
     for stretch in flown:
         cut = timeline(stretch, (axis,), fit.dead_time_s)
@@ -268,7 +268,7 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
 def predict_ahead(
     flown: Sequence[Stretch], axis: int, fit: AxisFit, ahead_s: Sequence[float] = AHEAD_S
 ) -> tuple[Ahead, ...]:
-    """Predict the motion over each of some times from every position, with the setpoints as they were sent.
+    """Predict the motion over some times from every position, with the setpoints as they were sent.
 
     The state there is the filter's, by that position and those before; what follows is known of the setpoints alone.
     """
@@ -305,7 +305,7 @@ def _ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) 
 
 
 def _correlation(values: Array) -> Array:
-    """Correlation of a sequence with itself, 1 to LAGS places on."""
+    """Return the autocorrelation of a sequence, 1 to LAGS places on."""
     centred = values - values.mean()
     size = float(centred @ centred)
     lags = range(1, min(LAGS, len(values) - 1) + 1)
@@ -323,7 +323,7 @@ _CERTAIN = 2.0  # standard errors
 
 @dataclass(frozen=True, eq=False)
 class HeldOutError:
-    """What a plant predicts of the halves that it was not fitted to."""
+    """Prediction errors of a plant on the halves that it was not fitted to."""
 
     squares: Array  # sums of squared errors by group of time, axis and time ahead (groups, axes, ahead) [m²]
     counts: Array  # how many they are, alike
@@ -334,7 +334,7 @@ class HeldOutError:
         return np.asarray(np.sqrt(self.squares.sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)))
 
     def scores(self) -> Array:
-        """Logarithm of the figure without each group in turn (groups + 1,), and last with all."""
+        """Return the logarithm of `error_m` without each group in turn (groups + 1,), and last with all."""
         squares = np.vstack([self.squares.sum(axis=0) - self.squares, self.squares.sum(axis=0)[None]])
         counts = np.vstack([self.counts.sum(axis=0) - self.counts, self.counts.sum(axis=0)[None]])
         return np.asarray(0.5 * np.log(np.maximum(squares, 1e-12) / np.maximum(counts, 1.0)).mean(axis=(1, 2)))
@@ -358,14 +358,14 @@ class ChosenPlant:
 
     @property
     def name(self) -> str:
-        """Of the plant."""
+        """Name of the plant."""
         return self.fits[0].model.name
 
 
 def choose_dead_time(
     flown: Sequence[Stretch], axes: Sequence[int], models: Sequence[AxisModel], advance: Callable[[], None]
 ) -> ChosenPlant:
-    """One dead time for all axes.
+    """Choose the likeliest dead time, one for all axes.
 
     Args:
         axes: 0 north, 1 east, 2 down.
@@ -405,7 +405,7 @@ def _total(fits: Sequence[AxisFit]) -> float:
 
 
 def _range_s(curve: Sequence[tuple[float, float]], best_s: float) -> tuple[float, float]:
-    """Where the deviance crosses 4 on either side of its least; the end of the curve where it does not."""
+    """Return where the deviance is 4 above its least on either side [s]; the end of the curve where it never is."""
     ends = []
     for side in ([one for one in curve if one[0] <= best_s][::-1], [one for one in curve if one[0] >= best_s]):
         end_s = side[-1][0]
@@ -418,7 +418,7 @@ def _range_s(curve: Sequence[tuple[float, float]], best_s: float) -> tuple[float
 
 
 def is_worse(one: HeldOutError, other: HeldOutError) -> bool:
-    """Whether an error is larger beyond two standard errors of the difference (jackknife over groups of 4 s)."""
+    """Return whether an error is larger by over two standard errors of the difference (jackknife, groups of 4 s)."""
     difference = one.scores() - other.scores()
     without, whole = difference[:-1], difference[-1]
     count = len(without)
@@ -434,7 +434,7 @@ class Block(NamedTuple):
 
 
 def halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ...]]:
-    """Blocks of each stretch in turn.
+    """Return two halves of a flight: blocks of each stretch in turn.
 
     Raises:
         RecordingError: There are no two blocks.
@@ -477,6 +477,6 @@ def _judged(
 
 
 def _within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
-    """Whether a block of a half holds each of some times, and the time so much later."""
+    """Return whether one block of a half contains both each of some times and the time so much later."""
     held = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in half]
     return np.asarray(np.logical_or.reduce(held), dtype=np.bool_)

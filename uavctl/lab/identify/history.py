@@ -1,4 +1,4 @@
-"""History of a flight from recordings."""
+"""Flight history for identification, from recordings: setpoints, positions, messages and their senders."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Address = tuple[int, int]
 
 
 class RoundTrip(NamedTuple):
-    """An answer to a client's request: who gave it, when the request went [ns], what the answer tells [ns]."""
+    """Answer to a client's request: who gave it, when the request was sent [ns], the time in the answer [ns]."""
 
     address: Address
     sent_ns: int
@@ -39,7 +39,7 @@ class RoundTrip(NamedTuple):
 
 
 class Exchange:
-    """Pairs requests with their answers by the client's own stamp that both carry.
+    """Pairs a client's requests with their answers, by the client's stamp that both carry.
 
     Times are the recorder's, so those of the client's clock do not matter.
     """
@@ -49,7 +49,7 @@ class Exchange:
         self._parser = mavlink.MAVLink(None)
 
     def take(self, data: bytes, at_ns: int, *, outgoing: bool) -> Iterator[RoundTrip]:
-        """Read a packet; gives the round trip that it ends, if any."""
+        """Take a packet; return the round trip that it completes, if any."""
         for frame in scan(data, final=True).frames:
             if frame.message_id != mavlink.MAVLINK_MSG_ID_TIMESYNC:
                 continue
@@ -105,12 +105,12 @@ class Stretch:
 
     @property
     def length_s(self) -> float:
-        """From the first to the last position [s]."""
+        """Time from the first to the last position [s]."""
         return float(self.times_s[-1] - self.times_s[0])
 
 
 def stretches(asked: SetpointHistory, seen: PositionHistory) -> tuple[Stretch, ...]:
-    """The parts of a flight that show how the vehicle answers.
+    """Return the parts of a flight that show how the vehicle responds.
 
     Raises:
         RecordingError: There is none that is long enough; says what is missing.
@@ -130,7 +130,7 @@ def stretches(asked: SetpointHistory, seen: PositionHistory) -> tuple[Stretch, .
 
 
 def thinned(stretch: Stretch, spacing_s: float) -> Stretch:
-    """The same with positions at least this far apart: what happens within a step is not the controller's affair."""
+    """Return a stretch with positions thinned to at least `spacing_s` apart, the controller's own step."""
     kept, last_s = [], -np.inf
     for index, at_s in enumerate(stretch.times_s):
         if at_s - last_s >= spacing_s:
@@ -140,7 +140,7 @@ def thinned(stretch: Stretch, spacing_s: float) -> Stretch:
 
 
 def seen_from(rows: Sequence[tuple[float, float, tuple[float, float, float]]]) -> PositionHistory:
-    """Positions (capture [s], arrival [s], position [m]) sorted by capture; of equal captures the first counts."""
+    """Sort positions (capture [s], arrival [s], position [m]) by capture; drop repeated and implausible ones."""
     captured = np.array([row[0] for row in rows])
     _, first = np.unique(captured, return_index=True)
     arrived = np.array([row[1] for row in rows])
@@ -150,7 +150,7 @@ def seen_from(rows: Sequence[tuple[float, float, tuple[float, float, float]]]) -
 
 
 def _plausible(positions_m: Array) -> NDArray[np.bool_]:
-    """Whether each position (m, 3) is near the median of its neighbours: swapped bodies and reflections are not."""
+    """Return whether each position (m, 3) is near its neighbours' median, unlike swapped bodies and reflections."""
     if len(positions_m) < _NEIGHBOURS:
         return np.ones(len(positions_m), dtype=np.bool_)
     half = _NEIGHBOURS // 2
@@ -161,7 +161,7 @@ def _plausible(positions_m: Array) -> NDArray[np.bool_]:
 
 
 def _spans(asked: SetpointHistory) -> Iterator[tuple[float, float]]:
-    """Begin and end of each run of setpoints that were flown without a pause [s]."""
+    """Return begin and end of each run of setpoints that were flown without a pause [s]."""
     begin: float | None = None
     for now, then in pairwise(range(len(asked.times_s))):
         if begin is None and asked.flown[now]:
@@ -207,7 +207,7 @@ Row = tuple[float, float, tuple[float, float, float]]
 
 @dataclass(frozen=True, eq=False)
 class FlightHistory:
-    """What a flight asked for and saw; times count from its first position [s]."""
+    """Setpoints, positions and losses of a flight; times count from its first position [s]."""
 
     asked: SetpointHistory  # setpoints
     seen: PositionHistory  # positions
@@ -220,7 +220,7 @@ class FlightHistory:
 
 
 class VehicleWords:
-    """What the vehicle says of itself: whose software it flies, and its parameters of the position loops."""
+    """What the vehicle says of itself: its autopilot, and its parameters of the position loops."""
 
     def __init__(self) -> None:
         self.autopilot = ""
@@ -228,7 +228,7 @@ class VehicleWords:
         self._parser = mavlink.MAVLink(None)
 
     def take(self, data: bytes) -> None:
-        """Read what a datagram, or a packet, holds."""
+        """Read the messages of a datagram or packet."""
         for frame in scan(data, final=True).frames:
             if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 name = autopilot_name(self._parser.decode(bytearray(frame.data)).autopilot)
@@ -240,14 +240,14 @@ class VehicleWords:
 
 
 class Senders:
-    """Who sent what: numbers of the messages of each, modulo 256 as they come, and stamps of its positions."""
+    """Senders of messages: the sequence number of each message, and the stamps of their positions."""
 
     def __init__(self) -> None:
         self._numbers: defaultdict[Address, list[int]] = defaultdict(list)
         self._stamps: defaultdict[Address, list[tuple[int, int]]] = defaultdict(list)
 
     def take(self, data: bytes, at_ns: int) -> None:
-        """Count what a datagram, or a packet, holds: messages of unknown ids too, by their lengths."""
+        """Count the messages of a datagram or packet, those of unknown ids too, by their lengths."""
         for head in _heads(data):
             known = self._numbers[head.sender]
             newest = max(known[-_REMEMBERED:], default=head.number)
@@ -256,7 +256,7 @@ class Senders:
                 self._stamps[head.sender].append((int.from_bytes(head.payload[:8], "little"), at_ns))
 
     def gaps(self, sender: Address) -> NDArray[np.int64]:
-        """Messages of a sender lost after each one: by the stamps if they are regular, else by the numbers.
+        """Return how many messages of a sender were lost after each one: by regular stamps, else by sequence numbers.
 
         A bridge numbers what it sends, and tells nothing of what was lost on the way to it.
         """
@@ -268,13 +268,13 @@ class Senders:
         return np.array([after - before - 1 for before, after in pairwise(numbers)], dtype=np.int64)
 
     def shortest_delay_s(self, sender: Address) -> float | None:
-        """The least time from a stamp to its arrival [s], if both are of one clock: then only is it a short one."""
+        """Return the least time from a stamp to its arrival [s], if both are of one clock; else None."""
         delays_s = [1e-9 * (at_ns - 1000 * stamp) for stamp, at_ns in self._stamps.get(sender, ())]
         return min(delays_s) if delays_s and 0.0 <= min(delays_s) <= _SHORT_S else None
 
 
 def _missing_of(spacings: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Frames that are missing in each of the spacings of a regular camera's stamps; None of any other's."""
+    """Return how many frames a regular camera's stamps lack between each two; None if it is not regular."""
     if len(spacings) < LEAST_SAMPLES:
         return None
     period = float(np.quantile(spacings, _QUICK))
@@ -289,7 +289,7 @@ def _missing_of(spacings: NDArray[np.int64]) -> NDArray[np.int64] | None:
 
 
 class _Head(NamedTuple):
-    """Head of a frame, and what it carries."""
+    """Head of a frame, with its payload."""
 
     number: int
     sender: Address
@@ -298,7 +298,7 @@ class _Head(NamedTuple):
 
 
 def _heads(data: bytes) -> Iterator[_Head]:
-    """Each frame, one after the other up to the first byte that begins none."""
+    """Yield the head of each frame, up to the first byte that begins none."""
     at = 0
     while at + _SHORTEST <= len(data):
         length = data[at + 1]
@@ -315,7 +315,7 @@ def _heads(data: bytes) -> Iterator[_Head]:
 
 
 def from_records(records: Iterable[tuple[str, int, Record]]) -> FlightHistory:
-    """Out of a recording of ours.
+    """Make the history of one of our recordings.
 
     Raises:
         RecordingError: No position or no setpoint in it.
@@ -337,7 +337,7 @@ def from_records(records: Iterable[tuple[str, int, Record]]) -> FlightHistory:
 
 
 def from_tlog(packets: Iterable[TlogPacket], config: Config) -> FlightHistory:
-    """Out of a `.tlog`: positions as the daemon would take them, acceleration setpoints as they were sent.
+    """Make the history of a `.tlog`: positions as the daemon would take them, setpoints as they were sent.
 
     Args:
         config: Says which messages count as positions, and how their frame and clock are turned into ours.
@@ -367,7 +367,7 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> FlightHistory:
 
 
 def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[PositionSample], list[PositionSample]]:
-    """Positions as the daemon would take them, and those of them whose clock the client's own exchange told.
+    """Return positions as the daemon would take them, and those with a clock known by the client's own exchange.
 
     A source that answers nothing may stamp by the vehicle's clock: its answers are tried for such stamps too.
     """
@@ -390,7 +390,7 @@ def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[Positi
 
 
 def _source(samples: Iterable[PositionSample]) -> Address:
-    """System and component of who sent most of the positions that were taken."""
+    """Return system and component that sent most of the accepted positions."""
     ((source, _),) = Counter(one.source for one in samples).most_common(1)
     system, component = source.rsplit(" ", 1)[-1].split("/")
     return int(system), int(component)
@@ -420,7 +420,7 @@ def _history(
 
 
 def _accelerations(data: bytes) -> Iterable[tuple[tuple[float, float, float], bool]]:
-    """Setpoints in a client's packet, and whether each asks for an acceleration and nothing else."""
+    """Return the setpoints in a client's packet, with whether each asks for an acceleration and nothing else."""
     parser = mavlink.MAVLink(None)
     for frame in scan(data, final=True).frames:
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:

@@ -1,4 +1,4 @@
-"""The page of an identification: the fit in plots, beside its figures."""
+"""Page of an identification: plots of the fit, beside its figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST_DELAYS = 2000  # dots of a picture
 
 
 def write_page(found: Identification, seen: PositionHistory, source: str) -> str:
-    """HTML of an identification.
+    """Return the page of an identification as HTML.
 
     Args:
         seen: The positions that it was made from.
@@ -50,7 +50,7 @@ def _ramps(result: Identified) -> Iterator[str]:
 
 
 def _is_told(axis: str, warnings: Sequence[str]) -> bool:
-    """Whether a warning says already how little of an axis' motion is predicted."""
+    """Return whether a warning already says how little of an axis' motion is predicted."""
     return any(warning.startswith(f"{axis}: only ") for warning in warnings)
 
 

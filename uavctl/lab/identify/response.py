@@ -1,4 +1,4 @@
-"""How likely a recorded axis is under one of the plants: the innovations of a Kalman filter.
+"""Likelihood of a recorded axis under one of the plants, by the innovations of a Kalman filter.
 
 The motion is linear, so the filter steps from position to position, however many inputs lie between: what they do is
 summed beforehand. So are its gains, which come of the times alone. All times are counted in instants of half a
@@ -34,7 +34,7 @@ DRAG_LAG, VELOCITY_REFERENCE = "drag-lag", "velocity-reference"
 
 
 class Free(NamedTuple):
-    """A parameter that is fitted."""
+    """A parameter that is fitted, with its bounds."""
 
     name: str  # what it is, with its unit
     least: float  # least value
@@ -42,12 +42,12 @@ class Free(NamedTuple):
     logarithmic: bool  # whether its logarithm is what is fitted
 
     def inside(self, value: float) -> float:
-        """The place of a value among what is fitted, within its bounds."""
+        """Return the place of a value within the bounds, on the scale of the search."""
         value = min(max(value, self.least), self.most)
         return math.log(value) if self.logarithmic else value
 
     def outside(self, place: float) -> float:
-        """The value at a place."""
+        """Return the value at a place on the scale of the search."""
         return math.exp(place) if self.logarithmic else place
 
 
@@ -60,11 +60,11 @@ class LinearMotion(NamedTuple):
 
 
 class AxisModel(Protocol):
-    """A plant of an axis; position is the first state, velocity the second."""
+    """Interface of a plant of one axis; position is the first state, velocity the second."""
 
     @property
     def name(self) -> str:
-        """Name as `plant.model` has it."""
+        """Name as in `plant.model`."""
 
     @property
     def free(self) -> tuple[Free, ...]:
@@ -76,10 +76,10 @@ class AxisModel(Protocol):
 
     @property
     def starts(self) -> tuple[dict[str, float], ...]:
-        """Values to begin the search with, by name."""
+        """Values to start the search with, by name."""
 
     def motion(self, parameters: Array) -> LinearMotion:
-        """Motion for k parameter vectors (k, len(free))."""
+        """Return the motion for k parameter vectors (k, len(free))."""
 
 
 # The lag's pole stays above the drag's: a motion does not tell which is whose.
@@ -95,7 +95,7 @@ _MOTION_STD = (10.0, 2.0, 2.0)  # of position, velocity and acceleration
 
 @dataclass(frozen=True)
 class DragLagAxis:
-    """Model drag-lag."""
+    """Plant of model drag-lag."""
 
     drifts: bool  # whether the bias is a random walk, as the estimator's is with `bias_drift`, and not a constant
     name: ClassVar[str] = DRAG_LAG
@@ -108,12 +108,12 @@ class DragLagAxis:
 
     @property
     def starts(self) -> tuple[dict[str, float], ...]:
-        """The likelihood has more than one hill: one start with little drag, one with much."""
+        """Two starts, with little and with much drag, as the likelihood has more than one maximum."""
         rest = {"lag_s": 0.2, "gain": 1.0, "wind_mps2_rts": 0.05, "noise_m": 0.01, "drift_mps2_rts": 0.05}
         return tuple({**rest, "drag_1ps": drag} for drag in (0.1, 1.0))
 
     def motion(self, parameters: Array) -> LinearMotion:
-        """States (p, v, a, b)."""
+        """Return the motion of the states (p, v, a, b)."""
         count, lag_s = len(parameters), np.exp(parameters[:, 0])
         a, b, noise = np.zeros((count, 4, 4)), np.zeros((count, 4)), np.zeros((count, 4, 4))
         a[:, 0, 1] = a[:, 1, 2] = a[:, 1, 3] = 1.0
@@ -128,7 +128,7 @@ class DragLagAxis:
 
 @dataclass(frozen=True)
 class ReferenceAxis:
-    """Model velocity-reference with loop gains that are known."""
+    """Plant of model velocity-reference with known loop gains."""
 
     position_1ps: float  # gain kp of the position loop [1/s]
     velocity_1ps: float  # gain kv of the velocity loop [1/s]
@@ -148,7 +148,7 @@ class ReferenceAxis:
     )
 
     def motion(self, parameters: Array) -> LinearMotion:
-        """States (p, v, a, q, s, i)."""
+        """Return the motion of the states (p, v, a, q, s, i)."""
         count, rate_1ps = len(parameters), np.exp(-parameters[:, 0])
         kp, kv, ki = self.position_1ps, self.velocity_1ps, self.integral_1ps2
         a, b, noise = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -169,12 +169,12 @@ class ReferenceAxis:
 
 
 def places(model: AxisModel, values: dict[str, float]) -> Array:
-    """Parameter vector of values by name; what the model has not is passed over."""
+    """Return the parameter vector of values by name; names that the model lacks are ignored."""
     return np.array([one.inside(values[one.name]) for one in model.free])
 
 
 def values(model: AxisModel, parameters: Sequence[float]) -> dict[str, float]:
-    """Values by name of a parameter vector."""
+    """Return the values of a parameter vector by name."""
     return {one.name: one.outside(place) for one, place in zip(model.free, parameters, strict=True)}
 
 
@@ -188,7 +188,7 @@ _PART_S = 0.01  # a ramp at 5 m/s³ is 0.05 m/s² high in it
 
 
 def ramped(stretch: Stretch, level_mps3: float, down_mps3: float) -> Stretch:
-    """The stretch with ramps instead of steps; it begins at its first setpoint.
+    """Return the stretch with setpoints ramped by a jerk limit instead of steps; it begins at its first setpoint.
 
     Args:
         level_mps3: Jerk limit of north and east together [m/s³].
@@ -213,7 +213,7 @@ def ramped(stretch: Stretch, level_mps3: float, down_mps3: float) -> Stretch:
 
 
 def _towards(accel: Array, wanted: Array, level_mps2: float, down_mps2: float) -> Array:
-    """The acceleration after a change of no more than this."""
+    """Return the acceleration after a step towards the wanted one, limited in its change."""
     change = wanted - accel
     level = float(np.hypot(change[0], change[1]))
     share = min(1.0, level_mps2 / level) if level > 0.0 else 1.0
@@ -231,7 +231,7 @@ _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """A stretch of some axes, cut where an input changes or a position was captured."""
+    """A stretch of some axes, cut wherever an input changes or a position was captured."""
 
     lengths: Counts  # (n,) of the parts [instants]
     inputs_mps2: Array  # (n, axes), held in each [m/s²]
@@ -241,18 +241,18 @@ class Timeline:
 
     @cached_property
     def captured(self) -> Counts:
-        """Time of capture of each position, from the first one on (m,) [instants]."""
+        """Capture time of each position, counted from the first one (m,) [instants]."""
         return np.cumsum(self.lengths)[self.measured]
 
     @cached_property
     def spacings(self) -> tuple[Counts, Counts]:
-        """Different times between two positions [instants], and which of them each is (m - 1,)."""
+        """Distinct times between two positions [instants], and the index of each into them (m - 1,)."""
         different, which = np.unique(np.diff(self.captured), return_inverse=True)
         return different, which
 
     @cached_property
     def pieces(self) -> tuple[Counts, Counts, Counts]:
-        """Different lengths of parts and times from their ends to the next position, and which of them each is (n,)."""
+        """Distinct lengths of pieces and of their distance to the next position; each one's index into them (n,)."""
         ends = np.cumsum(self.lengths)
         rests = self.captured[np.searchsorted(self.measured, np.arange(len(ends)))] - ends
         most = int(rests.max()) + 1
@@ -261,7 +261,7 @@ class Timeline:
 
 
 class Advance(NamedTuple):
-    """Motion over different lengths, for k parameter vectors."""
+    """Transition of the motion over different lengths, for k parameter vectors."""
 
     move: Array  # (lengths, k, n, n)
     push: Array  # (lengths, k, n), by a held input of one
@@ -270,7 +270,7 @@ class Advance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What the filter made of a timeline, under one parameter vector."""
+    """States and innovations of a timeline under one parameter vector."""
 
     driven: Array  # (m, n), what the inputs alone have done since the begin
     rest: Array  # (m, n), the state without that, with the position there
@@ -279,7 +279,7 @@ class Filtered:
 
 
 class Tried(NamedTuple):
-    """Parameter vectors of an axis."""
+    """Parameter vectors of an axis, to be tried."""
 
     place: int  # of the axis among those of the timeline
     model: AxisModel  # the plant, with as many states as all that are tried in one pass
@@ -287,7 +287,7 @@ class Tried(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """How likely the positions of an axis are under k parameter vectors."""
+    """Likelihood of an axis' positions under k parameter vectors."""
 
     deviances: Array  # -2 log likelihood, up to a constant (k,)
     innovations_m: Array  # of each position that counts (m, k) [m]
@@ -295,7 +295,7 @@ class Likelihood(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """What the filter made of a timeline, for k parameter vectors."""
+    """Result of one pass of the filter over a timeline, for k parameter vectors."""
 
     deviances: Array  # -2 log likelihood, up to a constant (k,)
     states: Array  # with the position there (m, k, n)
@@ -304,7 +304,7 @@ class Passed(NamedTuple):
 
 
 def timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> Timeline:
-    """Cut a stretch for some axes, their inputs acting `dead_time_s` after they were sent."""
+    """Cut a stretch for some axes, with inputs that act `dead_time_s` after they were sent."""
     chosen = list(axes)
     captured, first = np.unique(_instants(stretch.times_s), return_index=True)
     changes = _instants(stretch.input_times_s + dead_time_s)
@@ -321,7 +321,7 @@ def timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> Timel
 
 
 def likelihood(parts: Sequence[Timeline], tried: Sequence[Tried]) -> tuple[Likelihood, ...]:
-    """Likelihood of all parts of each axis that is tried, all in one pass."""
+    """Return the likelihood of all parts of each axis that is tried, computed in one pass."""
     counts = [len(one.parameters) for one in tried]
     place = np.repeat([one.place for one in tried], counts)
     motion = LinearMotion(*map(np.concatenate, zip(*(one.model.motion(one.parameters) for one in tried), strict=True)))
@@ -343,7 +343,7 @@ def likelihood(parts: Sequence[Timeline], tried: Sequence[Tried]) -> tuple[Likel
 
 
 def filtered(part: Timeline, model: AxisModel, parameters: Array) -> Filtered:
-    """States and innovations of one part's first axis under one parameter vector (l,)."""
+    """Return states and innovations of one part's first axis under one parameter vector (l,)."""
     motion, place = model.motion(parameters[None]), np.zeros(1, dtype=np.int64)
     passed = _pass(part, place, motion, _seen_var(model, parameters[None]), model.start_std)
     driven = _driven(part, place, motion)[:, 0]
@@ -353,7 +353,7 @@ def filtered(part: Timeline, model: AxisModel, parameters: Array) -> Filtered:
 
 
 def advance(motion: LinearMotion, lengths: Counts) -> Advance:
-    """Motion over some lengths (n,) [instants], by the binary digits of each."""
+    """Return the transition over some lengths (n,) [instants], by the binary digits of each."""
     move, push, spread = _instant(motion)
     count, size = len(lengths), move.shape[-1]
     moves = np.tile(np.eye(size), (count, len(move), 1, 1))
@@ -374,7 +374,7 @@ def _instants(times_s: Array) -> Counts:
 
 
 def _instant(motion: LinearMotion) -> tuple[Array, Array, Array]:
-    """Transition, effect of a held input, and covariance of the noise, of one instant."""
+    """Return transition, effect of a held input, and covariance of the noise, for one instant."""
     move, integral = _series(motion.a, INSTANT_S)
     spread = np.zeros_like(motion.noise)
     for node, weight in zip(_GAUSS_X, _GAUSS_W, strict=True):
@@ -384,7 +384,7 @@ def _instant(motion: LinearMotion) -> tuple[Array, Array, Array]:
 
 
 def _series(slope: Array, time_s: float) -> tuple[Array, Array]:
-    """exp(A t) and its integral from 0 to t, (k, n, n) each."""
+    """Return exp(A t) and its integral from 0 to t, (k, n, n) each."""
     term = np.broadcast_to(np.eye(slope.shape[-1]), slope.shape)
     power, integral = term.copy(), time_s * term
     for order in range(1, _ORDER + 1):
@@ -395,7 +395,7 @@ def _series(slope: Array, time_s: float) -> tuple[Array, Array]:
 
 
 def _seen_var(model: AxisModel, parameters: Array) -> Array:
-    """Variance of a position's noise (k,) [m²]."""
+    """Return the variance of a position's noise (k,) [m²]."""
     return np.exp(2.0 * parameters[:, [one.name for one in model.free].index("noise_m")])
 
 
@@ -429,7 +429,7 @@ def _pass(part: Timeline, place: Counts, motion: LinearMotion, seen_var: Array, 
 def _gains(
     moves: Array, spreads: Array, which: Counts, seen_var: Array, start_std: Sequence[float]
 ) -> tuple[Array, Array]:
-    """Gain (m, k, n) and variance of the innovation (m, k) at each position: they come of the times alone."""
+    """Return gain (m, k, n) and variance of the innovation (m, k) at each position; they depend on the times alone."""
     turned = np.ascontiguousarray(moves.swapaxes(-1, -2))
     size, count = len(start_std), len(seen_var)
     cov = np.tile(np.diag(np.square(start_std)), (count, 1, 1))
@@ -448,7 +448,7 @@ def _gains(
 
 
 def _pushed(part: Timeline, place: Counts, motion: LinearMotion) -> Array:
-    """What the inputs since the position before have done at each position (m, k, n, 1)."""
+    """Return the effect at each position of the inputs since the position before (m, k, n, 1)."""
     lengths, rests, which = part.pieces
     different, held = np.unique(lengths, return_inverse=True)
     pushes = advance(motion, different).push[held]
@@ -459,7 +459,7 @@ def _pushed(part: Timeline, place: Counts, motion: LinearMotion) -> Array:
 
 
 def _driven(part: Timeline, place: Counts, motion: LinearMotion) -> Array:
-    """What the inputs alone have done at each position (m, k, n)."""
+    """Return the effect at each position of all inputs (m, k, n)."""
     different, which = part.spacings
     moves, pushed = advance(motion, different).move, _pushed(part, place, motion)
     states = np.empty(pushed.shape)

@@ -1,4 +1,4 @@
-"""What was identified; the link."""
+"""Result of an identification: the plant, the link, and the configuration with both."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OUTAGE_S, _OUTAGE_CHANCE, _LEAST_RUNS = 1.0, 1e-3, 8
 
 @dataclass(frozen=True)
 class LinkFit:
-    """What positions did on their way."""
+    """Losses and delays of positions."""
 
     rate_hz: float  # positions sent a second: those that came, and their share of the lost messages
     received: int  # messages of the positions' sender that came
@@ -58,7 +58,7 @@ class LinkFit:
 
 
 def fit_link(seen: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
-    """The link by the messages' numbers, their capture stamps and times of arrival.
+    """Fit the link by the messages' numbers, capture stamps and arrival times.
 
     Args:
         missing: Messages lost after each one that came.
@@ -89,7 +89,7 @@ def fit_link(seen: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
 
 
 def loss_words(link: LinkFit) -> str:
-    """Loss, how well it is known, and the outages beside it."""
+    """Return the loss in words, with its uncertainty and the outages beside it."""
     text = f"{link.loss:.1%} ± {link.loss_std:.1%}, {'in bursts' if link.bursts else 'each by itself'}"
     if not link.outages_s:
         return text
@@ -98,7 +98,7 @@ def loss_words(link: LinkFit) -> str:
 
 
 def _outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool_]:
-    """Which runs are longer than the link's others make them, whose lengths are taken for geometric."""
+    """Return which runs of losses are longer than a geometric distribution of the others explains."""
     found = np.zeros(len(missing), dtype=np.bool_)
     for place in np.argsort(missing)[::-1].tolist():
         others = missing[(missing > 0) & ~found]
@@ -112,7 +112,7 @@ def _outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool_]:
 
 
 def _burst_statistic(missing: NDArray[np.int64]) -> float:
-    """Runs test of Wald and Wolfowitz on the sequence of arrivals and losses, positive if there are too few runs."""
+    """Return the runs test of Wald and Wolfowitz on arrivals and losses; positive if there are too few runs."""
     lost, came = float(missing.sum()), float(len(missing))
     if lost < 2 or came < 2:
         return 0.0
@@ -138,7 +138,7 @@ _OF_OTHER_MODELS = (
 
 
 class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
-    """Response of one axis, with the dead time that all axes have; None where the plant has no such number."""
+    """Response of one axis, with the dead time common to all; None where the plant has no such number."""
 
     axis: str
     lag_s: float
@@ -156,7 +156,7 @@ class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
-    """One kind of plant, and what it predicts of the halves that it was not fitted to."""
+    """One kind of plant with its prediction errors on the halves that it was not fitted to."""
 
     model: str
     dead_time_s: float
@@ -169,7 +169,7 @@ class Candidate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Identified(msgspec.Struct, frozen=True, kw_only=True):
-    """What `uavctl identify` tells."""
+    """Result of `uavctl identify`; the fields are the keys of `--json`."""
 
     flown_s: float
     positions: int
@@ -185,7 +185,7 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Result, the configuration with it, and what it is from."""
+    """Result of an identification, the configuration with it, and the data that it is from."""
 
     result: Identified  # what is told
     config: Config  # the configuration with it
@@ -197,12 +197,12 @@ class Identification:
 
 
 def fits_of(history: FlightHistory, config: Config) -> int:
-    """How often `identify` advances."""
+    """Return how often `identify` advances."""
     return TRIES * len(kinds_of(history, config))
 
 
 def identify(history: FlightHistory, config: Config, advance: Callable[[], None]) -> Identification:
-    """Identify plant and link.
+    """Identify plant and link of a flight.
 
     Args:
         config: What the result is put into; its kind of plant, axes and Δt are kept.
@@ -247,7 +247,7 @@ def identify(history: FlightHistory, config: Config, advance: Callable[[], None]
 
 
 def flown_stretches(history: FlightHistory, config: Config) -> tuple[Stretch, ...]:
-    """The flight as a plant is fitted to it: one position a step at most, setpoints ramped as the autopilot does.
+    """Return a flight as a plant is fitted to it: one position a step at most, setpoints ramped as the autopilot does.
 
     Raises:
         RecordingError: No stretch is long enough.
@@ -259,7 +259,7 @@ def flown_stretches(history: FlightHistory, config: Config) -> tuple[Stretch, ..
 
 
 def kinds_of(history: FlightHistory, config: Config) -> list[tuple[AxisModel, ...]]:
-    """The plants to fit, each axis; the configuration's own first."""
+    """Return the plants to fit to each axis, the configuration's own first."""
     plant = config.plant
     own = plant.model == VELOCITY_REFERENCE
     drifts = own or config.estimator.bias_drift > 0.0
@@ -270,7 +270,7 @@ def kinds_of(history: FlightHistory, config: Config) -> list[tuple[AxisModel, ..
 
 
 def _gains(history: FlightHistory, config: Config) -> list[tuple[float, float, float]]:
-    """Loop gains of each axis: as the vehicle told them, else as configured, else ArduPilot's own defaults.
+    """Return the loop gains of each axis: as the vehicle told them, else as configured, else ArduPilot's defaults.
 
     The plant has no loop without an integral (PSC_VELZ_I is 0 as shipped): there the acceleration loop's does its work.
     """
@@ -286,7 +286,7 @@ def _gains(history: FlightHistory, config: Config) -> list[tuple[float, float, f
 
 
 def _jerk_limits(history: FlightHistory, config: Config) -> tuple[float, float]:
-    """Jerk limits of the level and of down [m/s³] where the autopilot ramps setpoints: as told, else as shipped."""
+    """Return the horizontal and vertical jerk limits of an autopilot's ramps [m/s³]: as told, else its defaults."""
     if history.autopilot != "ardupilot" and config.plant.model != VELOCITY_REFERENCE:
         return math.inf, math.inf
     told = (history.parameters.get(f"PSC_JERK_{side}", 0.0) for side in ("XY", "Z"))
@@ -295,7 +295,7 @@ def _jerk_limits(history: FlightHistory, config: Config) -> tuple[float, float]:
 
 
 def ramp_of(history: FlightHistory, config: Config) -> float:
-    """How late the ramp to each of the configuration's own setpoints is on the whole, which its plant has not [s].
+    """Return the mean delay of the ramp to each of the configuration's setpoints [s], which its plant lacks.
 
     That of a level setpoint that changes as much as it may; it ends with the next setpoint at the latest.
     """
@@ -367,7 +367,7 @@ def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
 def _config(
     config: Config, chosen: ChosenPlant, ramp_s: float, responses: Sequence[AxisResponse], link: LinkFit
 ) -> Config:
-    """The configuration with what was identified."""
+    """Return the configuration with what was identified."""
     plant = msgspec.structs.replace(
         config.plant,
         model=chosen.name,
@@ -397,7 +397,7 @@ def _config(
 
 
 def _of_model(chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
-    """Keys of `[plant]` that only one kind of plant has."""
+    """Return the keys of `[plant]` that only one kind of plant has."""
     if chosen.name == DRAG_LAG:
         return {"gain": _rounded(one.gain or 0.0 for one in responses)}
     models = [fit.model for fit in chosen.fits if isinstance(fit.model, ReferenceAxis)]
@@ -417,7 +417,7 @@ def _plant_section(config: Config) -> dict[str, object]:
 
 
 def _link_section(link: LinkFit) -> dict[str, object]:
-    """Keys of `[link]`: independent losses where they may be, else runs as measured."""
+    """Return the keys of `[link]`: independent losses if the data allow that, else runs as measured."""
     times: dict[str, object] = {"delay_s": link.delay_s, "jitter_s": link.jitter_s}
     if not link.bursts:
         return {"model": "bernoulli", "loss": round(link.loss, _DIGITS), **times}

@@ -1,4 +1,4 @@
-"""Claims of Sections 4 to 6 beside what was measured."""
+"""Claims of Sections 4 to 6 of the paper, beside what was measured."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Rate(msgspec.Struct, frozen=True, kw_only=True):
-    """A share of independent runs, with its exact 95 % interval (Clopper and Pearson)."""
+    """Share of independent runs, with its exact 95 % interval (Clopper and Pearson)."""
 
     rate: float
     low: float
@@ -40,7 +40,7 @@ class Rate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Neighbourhood(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the second halves of the runs are, against the 95 % ellipsoid of Σ_ξ."""
+    """Distribution of the second halves of the runs, against the 95 % ellipsoid of Σ_ξ."""
 
     area_ratio: list[float]  # of each axis' plane: area of the measured 95 % ellipse over that of the ellipsoid's
     inside: float  # share of settled states in the ellipsoid
@@ -50,7 +50,7 @@ class Neighbourhood(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WorstCase(msgspec.Struct, frozen=True, kw_only=True):
-    """MPC for the worst-case delay on the first runs."""
+    """Figures of an MPC for the worst-case delay on the first runs."""
 
     runs: int
     delay: int
@@ -61,7 +61,7 @@ class WorstCase(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class VariantResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The runs of one design; *settled* is the second half of a run."""
+    """Result of the runs of one design; *settled* is the second half of a run."""
 
     tau: int
     note: str
@@ -103,7 +103,7 @@ class VariantResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DesignTried(msgspec.Struct, frozen=True, kw_only=True):
-    """A schedule for some τ, and whether a design comes of it."""
+    """A schedule for some τ, with whether it makes a design."""
 
     tau: int
     schedule: str
@@ -114,7 +114,7 @@ class DesignTried(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Complexity(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis' decision problem for one τ, and medians of its times over the same seeded states."""
+    """Size of one axis' decision problem for one τ, with median times over the same seeded states."""
 
     tau: int
     horizon: int
@@ -127,7 +127,7 @@ class Complexity(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Depth(msgspec.Struct, frozen=True, kw_only=True):
-    """What takes minutes."""
+    """Results of the measurements that take minutes."""
 
     designs: list[DesignTried]
     complexity: list[Complexity]
@@ -148,7 +148,7 @@ _GROWS = 1.5  # "does not significantly grow"
 
 
 def claims_of(result: VariantResult, loss: float, horizon: int, delta_x: float, delta_u: float) -> list[Claim]:
-    """All claims about the runs.
+    """Return all claims about the runs.
 
     Args:
         result: What the runs came to; its own claims are not read.
@@ -242,7 +242,7 @@ def _limits(r: VariantResult, delta_x: float, delta_u: float) -> Iterator[Claim]
 
 
 def _few(count: float) -> str:
-    """Two digits, without an exponent."""
+    """Return a number with two digits, without an exponent."""
     return f"{count:.2g}" if count < 100.0 else f"{round(count, -1):.0f}"
 
 
@@ -302,7 +302,7 @@ def _cost(r: VariantResult) -> Iterator[Claim]:
 
 
 def claims_of_depth(depth: Depth, settled_cost: float) -> list[Claim]:
-    """The claims that take minutes to look at.
+    """Return the claims that take minutes to check.
 
     Args:
         settled_cost: The SMPC's, of a step and axis.
@@ -327,7 +327,7 @@ def claims_of_depth(depth: Depth, settled_cost: float) -> list[Claim]:
 
 
 def _times(depth: Depth, method: str) -> list[float]:
-    """Of a method over τ, at the printed horizon."""
+    """Return the times of a method over τ, at the printed horizon."""
     sizes = [one for one in depth.complexity if one.horizon == depth.complexity[0].horizon and not one.refused]
     return [float(getattr(one, method)) for one in sizes]
 
@@ -352,7 +352,7 @@ Array = NDArray[np.float64]
 
 
 def worst_case(setup: Setup, seed: int, runs: int, steps: int) -> WorstCase:
-    """MPC for a constant delay of τ, with the likelihoods of the constraints themselves."""
+    """Fly an MPC for a constant delay of τ, with the likelihoods of the constraints themselves."""
     design, smpc = setup.design, setup.config.smpc
     tau, delta_u = design.terminal.tau, needed(smpc.delta_u, "smpc.delta_u")
     controller = WorstCaseDelay(
@@ -374,7 +374,7 @@ def worst_case(setup: Setup, seed: int, runs: int, steps: int) -> WorstCase:
 
 
 def lqg_asking(setup: Setup, seed: int, runs: int, steps: int) -> float:
-    """Share of settled steps and inputs in which LQG breaks the input limits, where nothing stops it from doing so."""
+    """Return the share of settled steps and inputs in which an unrestrained LQG breaks the input limits."""
     limits = setup.design.input_set
     open_sides = Polytope(limits.c, np.full(limits.b.size, np.inf))
     problem = replace(build_problem(setup.config), input_set=open_sides)
@@ -384,7 +384,7 @@ def lqg_asking(setup: Setup, seed: int, runs: int, steps: int) -> float:
 
 
 def area_ratios(covariance: Array, design: Design) -> list[float]:
-    """Areas of a covariance's ellipses over those of Σ_ξ, in each axis' plane; the likelihood cancels out."""
+    """Return areas of a covariance's ellipses over those of Σ_ξ, in each axis' plane; the likelihood cancels out."""
     pairs = [np.ix_(pair, pair) for pair in planes(design.plant)]
     sigma = design.terminal.sigma_x
     return [float(np.sqrt(np.linalg.det(covariance[two]) / np.linalg.det(sigma[two]))) for two in pairs]
@@ -394,7 +394,7 @@ def area_ratios(covariance: Array, design: Design) -> list[float]:
 
 
 def assess(setup: Setup, note: str, flights: Flights, seed: int) -> VariantResult:
-    """Everything that is told of a design's runs."""
+    """Compute every figure of a design's runs."""
     config, design, totals = setup.config, setup.design, flights.totals
     runs, steps, axes = totals.cost.count, len(totals.outside), len(design.plant.axes)
     covariance, mean = _settled(totals)
@@ -444,20 +444,20 @@ def assess(setup: Setup, note: str, flights: Flights, seed: int) -> VariantResul
 
 
 def age_distribution(totals: Totals) -> list[float]:
-    """Share of steps with age 0, 1 … up to the largest."""
+    """Return the share of steps with age 0, 1 … up to the largest."""
     ages = totals.ages.sum(axis=0)
     shares: list[float] = (ages[: np.flatnonzero(ages).max() + 1] / ages.sum()).tolist()
     return shares
 
 
 def _aged(totals: Totals) -> list[float]:
-    """Share of runs with an age above 0: mean over the steps, least, largest; x(0) is known, so k = 0 is left out."""
+    """Return the share of runs with an age above 0: mean over the steps but k = 0, least, largest."""
     shares = 1.0 - totals.ages[1:, 0] / totals.cost.count
     return [float(shares.mean()), float(shares.min()), float(shares.max())] if shares.size else [0.0] * 3
 
 
 def _settled(totals: Totals) -> tuple[Array, Array]:
-    """Covariance (n_x, n_x) and mean (n_x,) of the settled states."""
+    """Return covariance (n_x, n_x) and mean (n_x,) of the settled states."""
     mean = totals.settled_sum / totals.settled
     return totals.settled_squares / totals.settled - np.outer(mean, mean), mean
 
@@ -486,7 +486,7 @@ PRESET = "paper"
 
 @dataclass(frozen=True)
 class Variant:
-    """A reading of the paper's example."""
+    """One reading of the paper's example, where the text leaves a choice."""
 
     tau: int  # τ
     overrides: tuple[str, ...]  # what is changed in preset `paper`

@@ -1,4 +1,4 @@
-"""The least settled cost that anything can have within the input limits: dynamic programming on what is known.
+"""Lower bound of the settled cost within the input limits, by dynamic programming over what is known.
 
 For one axis. With the newest state known exactly and a steps old, the state is N(m, C_a) with C_a the sum of
 A^i E W E' A^i' over i < a, whatever was done. With y = A m + B u, news comes with p and makes m ~ N(y, C_{a+1}), a = 0;
@@ -48,14 +48,14 @@ _MOST = 200
 
 @dataclass(frozen=True)
 class Fineness:
-    """Points of the grid in each state, and of the inputs tried."""
+    """Numbers of grid points in each state, and of inputs tried."""
 
     states: int = 65
     inputs: int = 61
 
 
 class _Grid:
-    """Functions of (position, velocity), cubic between the points of a grid, constant beyond it."""
+    """Functions of (position, velocity): cubic between the points of a grid, constant beyond it."""
 
     def __init__(self, reach: Array, points: int) -> None:
         self._reach, self._shape = reach, (points, points)
@@ -64,11 +64,11 @@ class _Grid:
         self.home = len(self.points) // 2
 
     def coefficients(self, values: Array) -> Array:
-        """Of the spline through values (G,)."""
+        """Return the coefficients of the spline through values (G,)."""
         return np.asarray(spline_filter(values.reshape(self._shape), 3, mode="nearest"), dtype=np.float64)
 
     def at(self, coefficients: Array, points: Array) -> Array:
-        """Values (…) at points (…, 2)."""
+        """Return values (…) at points (…, 2)."""
         place = (np.clip(points, -self._reach, self._reach) + self._reach) / (2 * self._reach) * (self._shape[0] - 1)
         return np.asarray(
             map_coordinates(coefficients, np.moveaxis(place, -1, 0), order=3, prefilter=False, mode="nearest"),
@@ -79,7 +79,7 @@ class _Grid:
 def least_settled_cost(
     plant: Plant, input_set: Polytope, q_x: Array, q_u: Array, loss: float, fineness: Fineness = Fineness()
 ) -> float:
-    """λ, the least mean stage cost of a plant with one axis and one input.
+    """Return λ, the least mean stage cost of a plant with one axis and one input.
 
     Args:
         q_x: Q_x (2, 2).
@@ -117,7 +117,7 @@ def least_settled_cost(
 
 
 def _growing(a: Array, noise: Array) -> list[Array]:
-    """C_0 … C_{oldest+1}."""
+    """Return the covariances C_0 … C_{oldest+1}."""
     found = [np.zeros_like(noise)]
     for _ in range(_OLDEST + 1):
         found.append(noise + a @ found[-1] @ a.T)
@@ -125,7 +125,7 @@ def _growing(a: Array, noise: Array) -> list[Array]:
 
 
 def _normal(covariance: Array) -> tuple[Array, Array]:
-    """Nodes (n, 2) and weights (n,) of a normal distribution."""
+    """Return nodes (n, 2) and weights (n,) of a normal distribution."""
     nodes, weights = roots_hermitenorm(_NODES)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
     values, vectors = np.linalg.eigh(covariance)
@@ -134,7 +134,7 @@ def _normal(covariance: Array) -> tuple[Array, Array]:
 
 
 def _least(values: Array) -> Array:
-    """Minimum of each row (G,), by a parabola through the least value and its neighbours."""
+    """Return the minimum of each row (G,), by a parabola through the least value and its neighbours."""
     rows, at = np.arange(len(values)), np.clip(values.argmin(axis=1), 1, values.shape[1] - 2)
     before, here, after = values[rows, at - 1], values[rows, at], values[rows, at + 1]
     step = np.clip(0.5 * (before - after) / (before - 2 * here + after), -1.0, 1.0)
@@ -143,7 +143,7 @@ def _least(values: Array) -> Array:
 
 
 def _square(points: Array, weight: Array) -> Array:
-    """x'W x of points (…, 2)."""
+    """Return x'W x of points (…, 2)."""
     return np.asarray(np.einsum("...i,ij,...j->...", points, weight, points), dtype=np.float64)
 
 
@@ -162,7 +162,7 @@ _TRIES_PER_POLICY = 50
 
 
 def measure_depth(seed: int, told: Told) -> Depth:
-    """Measure all of it."""
+    """Measure all that takes minutes."""
     config = load(PRESET).config
     design, loss = build_design(config), build_spec(config).link.outage(1)
     one = alone(design, decompose(design)[0])
@@ -206,7 +206,7 @@ def _tried(tau: int, name: str, overrides: tuple[str, ...], told: Told) -> Desig
 
 
 def _complexity(seed: int, told: Told) -> list[Complexity]:
-    """One axis' problem over τ, with H and then with N = H - τ as printed; all on the same states."""
+    """Measure one axis' problem over τ, with H and then with N = H - τ as printed, on the same states."""
     sizes = [(tau, _HORIZON) for tau in _TAUS] + [(tau, tau + _FREE) for tau in _TAUS if tau + _FREE != _HORIZON]
     found, cases = [], []
     points = _points(seed)
@@ -238,7 +238,7 @@ def _complexity(seed: int, told: Told) -> list[Complexity]:
 
 
 def _points(seed: int) -> list[Array]:
-    """States of one axis around the target: in its terminal ellipsoid, whatever τ is."""
+    """Return states of one axis around the target: in its terminal ellipsoid, whatever τ is."""
     design = build_design(load(PRESET, PRINTED.overrides).config)
     component = decompose(design)[0]
     values, vectors = np.linalg.eigh(component.sigma_x)
@@ -247,7 +247,7 @@ def _points(seed: int) -> list[Array]:
 
 
 def _one_axis(tau: int, horizon: int) -> Design | str:
-    """The design of one axis, or why there is none."""
+    """Return the design of one axis, or why there is none."""
     overrides = (f"smpc.tau={tau}", f"smpc.horizon={horizon}", f"schedule.delays={tau + 1}", _JOINT)
     try:
         design = build_design(load(PRESET, overrides).config)
@@ -261,7 +261,7 @@ def _ms(us: float | None) -> float | None:
 
 
 def few_policies(design: Design, count: int, rng: np.random.Generator) -> tuple[Library, int] | None:
-    """A library of `count` policies for a design of one component, and its number of gains; None if there is none."""
+    """Make a library of `count` policies for a one-component design; return it with its number of gains, or None."""
     (component,) = decompose(design)
     problem = MeanProblem(design, horizon_of(design, component))
     program, region = PolicyProgram(problem, design.max_iterations), Region(design, component)
@@ -283,7 +283,7 @@ def few_policies(design: Design, count: int, rng: np.random.Generator) -> tuple[
 
 
 def alone(design: Design, component: Component) -> Design:
-    """The design of one component alone; likelihoods and schedule stay the design's.
+    """Return the design of one component alone; likelihoods and schedule stay the design's.
 
     The axis has no meaning in space; only the component's first position is named.
     """

@@ -32,7 +32,7 @@ _DASHED, _DOTTED = (0, (4, 3)), (0, (1, 2))
 
 @dataclass(frozen=True)
 class AgeReference:
-    """What ages are held against."""
+    """Link and design that measured ages are compared with."""
 
     tau: int  # τ
     horizon: int  # H
@@ -40,7 +40,7 @@ class AgeReference:
 
 
 def trajectories_svg(states: Array, design: Design) -> str:
-    """Fig. 3: every run in the plane of each axis, and their positions, if there are two axes.
+    """Draw Fig. 3: every run in the plane of each axis, and their positions, if there are two axes.
 
     Args:
         states: Trajectories (N, T+1, n_x).
@@ -71,7 +71,7 @@ def trajectories_svg(states: Array, design: Design) -> str:
 
 
 def _draw_plane(ax: Axes, points: Array, pair: tuple[int, int], design: Design) -> None:
-    """The runs (N, T+1, 2) in one plane."""
+    """Draw the runs (N, T+1, 2) in one plane."""
     (x0, x1), (y0, y1) = np.stack(design.state_set.bounds)[:, list(pair)].T
     ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=colour("grid"), ec=colour("muted"), gid=f"box-{pair}"))
     # One broken line a colour: drawn in half the time of one a run.
@@ -91,7 +91,7 @@ def _hue(run: int) -> str:
 
 
 def _ellipse(design: Design, pair: tuple[int, int], points: int = 120) -> Array:
-    """Outline (points, 2) of the projection of the 95 % ellipsoid of a single state: that of its marginal."""
+    """Return the outline (points, 2) of the projected 95 % ellipsoid of a single state, by its marginal."""
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
     root = np.linalg.cholesky(design.terminal.sigma_x[np.ix_(pair, pair)])
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -100,7 +100,7 @@ def _ellipse(design: Design, pair: tuple[int, int], points: int = 120) -> Array:
 
 
 def ages_svg(ages: Counts, link: AgeReference) -> str:
-    """Fig. 4: the distribution of the age in each step; beside it, how rarely an age is reached, and the model's.
+    """Draw Fig. 4: the distribution of the age in each step, and beside it P(age >= j) with the model's.
 
     Args:
         ages: Runs of each age in each step (T, T).
@@ -120,7 +120,7 @@ def ages_svg(ages: Counts, link: AgeReference) -> str:
 
 
 def _draw_over_time(ax: Axes, shares: Array) -> None:
-    """Shares (T, ages), stacked."""
+    """Draw shares (T, ages), stacked."""
     steps, oldest = len(shares), min(_SAME_COLOUR, shares.shape[1] - 1)
     tops = np.cumsum(np.column_stack([shares[:, :oldest], shares[:, oldest:].sum(axis=1)]), axis=1)
     edges, below = np.arange(steps + 1) - 0.5, np.zeros(steps)
@@ -134,7 +134,7 @@ def _draw_over_time(ax: Axes, shares: Array) -> None:
 
 
 def _draw_tail(ax: Axes, ages: Counts, link: AgeReference) -> None:
-    """P(a >= j) as measured, and as the model has it over the same steps."""
+    """Draw P(a >= j) as measured, and as the model has it over the same steps."""
     steps, total = len(ages), ages.sum()
     reached = np.cumsum(ages.sum(axis=0)[::-1])[::-1] / total
     oldest = min(int(np.flatnonzero(reached).max()) + 1, steps - 1)

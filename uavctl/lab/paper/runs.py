@@ -1,4 +1,4 @@
-"""Runs of the example, in chunks; their totals."""
+"""Runs of the paper's example in chunks, and their totals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _MISS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What flies: a configuration, its design, and the design's policy library."""
+    """Configuration, design, and the design's policy library."""
 
     config: Config
     design: Design
@@ -46,7 +46,7 @@ class Setup:
 
 
 class Watched:
-    """A decider whose plans are held against (19c): the last mean state is the target."""
+    """Decider that checks its plans against (19c): the last mean state is the target."""
 
     def __init__(self, decider: Decider, design: Design) -> None:
         a, b, steps = design.plant.a, design.plant.b, design.horizon
@@ -66,7 +66,7 @@ class Watched:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Runs that were flown together, and what the SMPC met."""
+    """Runs that were flown together, with the tally of the SMPC."""
 
     flown: Flown  # the runs
     decisions: int  # plans asked for
@@ -78,7 +78,7 @@ class Chunk:
 
 
 class ChunkRunner:
-    """Flies chunks of one design's runs."""
+    """Runner of chunks of one design's runs."""
 
     def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
@@ -90,7 +90,7 @@ class ChunkRunner:
         )
 
     def fly(self, seed: int, first: int, runs: int, steps: int) -> Chunk:
-        """The runs `first` … `first` + `runs` - 1 of a seed, whatever else is flown."""
+        """Fly the runs `first` … `first` + `runs` - 1 of a seed, whatever else is flown."""
         self._watched.missed = 0
         flown = fly_runs(self._setup, self._smpc, seed, range(first, first + runs), steps)
         tally = self._smpc.tally
@@ -108,7 +108,7 @@ class ChunkRunner:
 def fly_runs(
     setup: Setup, controller: BatchController, seed: int, runs: range, steps: int, input_set: Polytope | None = None
 ) -> Flown:
-    """Runs of a seed under any controller.
+    """Fly runs of a seed with any controller.
 
     Args:
         input_set: The actuators' limits; those of the configuration if it is not given.
@@ -131,7 +131,7 @@ def fly_runs(
 
 
 def planes(plant: Plant) -> Sequence[tuple[int, int]]:
-    """State indices (position, velocity) of each axis."""
+    """Return the state indices (position, velocity) of each axis."""
     return list(zip(plant.position_index, plant.velocity_index, strict=True))
 
 
@@ -153,7 +153,7 @@ class Moments:
 
     @classmethod
     def of(cls, values: Array) -> Moments:
-        """Of values (N,)."""
+        """Return the moments of values (N,)."""
         mean = float(values.mean())
         return cls(values.size, mean, float(((values - mean) ** 2).sum()))
 
@@ -212,7 +212,7 @@ _EXTREMES = ("largest_gap", "closest")
 
 
 def total(chunk: Chunk, design: Design) -> Totals:
-    """Totals of one chunk."""
+    """Return the totals of one chunk."""
     flown = chunk.flown
     (runs, steps), half = flown.age.shape, flown.age.shape[1] // 2
     settled = flown.states[:, half:].reshape(-1, design.plant.n_x)
@@ -247,17 +247,17 @@ def total(chunk: Chunk, design: Design) -> Totals:
 
 
 def together(parts: list[Totals]) -> Totals:
-    """Totals of all parts, added in their order."""
+    """Return the totals of all parts, added in their order."""
     return reduce(Totals.__add__, parts)
 
 
 def ellipsoid_scale(design: Design) -> float:
-    """Factor of Σ in the 95 % ellipsoid of a single state: the χ² quantile with n_x degrees of freedom."""
+    """Return the factor of Σ in the 95 % ellipsoid of a single state: the χ² quantile with n_x degrees of freedom."""
     return float(2.0 * gammaincinv(0.5 * design.plant.n_x, LIKELIHOOD))
 
 
 def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
-    """Which states (…, n_x) are in the 95 % ellipsoid of Σ_ξ, that is of its block of a single state."""
+    """Return which states (…, n_x) are in the 95 % ellipsoid of Σ_ξ's block of a single state."""
     root = np.linalg.cholesky(design.terminal.sigma_x)
     whitened = np.linalg.solve(root, (states - design.target).reshape(-1, design.plant.n_x).T)
     distance: Array = (whitened**2).sum(axis=0).reshape(states.shape[:-1])
@@ -276,7 +276,7 @@ DRAWN = 200  # runs whose trajectories are kept, for the figures
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """What the runs of one design came to."""
+    """Result of the runs of one design."""
 
     totals: Totals  # over all runs
     drawn: Array  # trajectories (at most 200, T+1, n_x) of the first runs
@@ -284,7 +284,7 @@ class Flights:
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """One chunk: runs `first` … `first` + `runs` - 1 of the design `which`."""
+    """Task of one chunk: runs `first` … `first` + `runs` - 1 of the design `which`."""
 
     which: int
     seed: int
@@ -299,7 +299,7 @@ def fly_all(setups: Sequence[Setup], runs: int, steps: int, seed: int, workers: 
     Args:
         runs: N; run i is the same whatever N is.
         workers: Processes; they change no figure.
-        advance: Told the number of runs done since it was told last.
+        advance: Called with the number of runs done since it was told last.
 
     Raises:
         UavctlError: A worker process ended.
@@ -325,7 +325,7 @@ def fly_all(setups: Sequence[Setup], runs: int, steps: int, seed: int, workers: 
 def _flier(
     setups: Sequence[Setup], runs: int, workers: int
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
-    """Maps tasks to their results, in order."""
+    """Yield a function that maps tasks to their results, in order."""
     if runs <= HERE_UP_TO:
         crew = RunnerOfDesign(setups)
         yield lambda tasks: map(crew.fly, tasks)
@@ -341,14 +341,14 @@ def _flier(
 
 
 class RunnerOfDesign:
-    """One pilot a design."""
+    """Runners by design, each made once."""
 
     def __init__(self, setups: Sequence[Setup]) -> None:
         self._designs = [setup.design for setup in setups]
         self._pilots = [ChunkRunner(setup) for setup in setups]
 
     def fly(self, task: ChunkTask) -> Flights:
-        """The runs of one task; those of the first one are kept for the figures."""
+        """Fly the runs of one task; those of the first one are kept for the figures."""
         chunk = self._pilots[task.which].fly(task.seed, task.first, task.runs, task.steps)
         kept = 0 if task.first else DRAWN
         return Flights(total(chunk, self._designs[task.which]), chunk.flown.states[:kept].copy())
@@ -356,7 +356,7 @@ class RunnerOfDesign:
 
 @cache
 def _crew(path: Path) -> RunnerOfDesign:
-    """Of a worker process; made for its first task."""
+    """Return the runners of a worker process, made for its first task."""
     return RunnerOfDesign(pickle.loads(path.read_bytes()))
 
 

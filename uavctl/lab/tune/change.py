@@ -1,4 +1,4 @@
-"""What of a configuration a flight changes: what it tells well, and nothing else.
+"""Changes of a configuration by a flight: values that the flight shows well, and nothing else.
 
 Dead time, lag, drag and gain are taken over where the flight tells them. Noise, loss and delay are raised where the
 flight was worse than believed, and never lowered: a calm minute says nothing of the next day's air or radio. Inputs may
@@ -36,7 +36,7 @@ AHEAD_S = (0.25, 0.5, 1.0, 2.0)
 
 
 class PredictionErrors(msgspec.Struct, frozen=True, kw_only=True):
-    """Root mean square error of the predicted motion, by axis and time ahead."""
+    """Root mean square errors of the predicted motion, by axis and time ahead."""
 
     axes: tuple[str, ...]
     ahead_s: tuple[float, ...]  # the first is one step
@@ -51,7 +51,7 @@ class PredictionErrors(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class PinnedAxis:
-    """A plant of an axis of which some values are given, and only the others fitted."""
+    """Plant of an axis with some values given, so that only the others are fitted."""
 
     model: AxisModel  # the plant
     given: Mapping[str, float]  # values by name; what the model has not is passed over
@@ -63,7 +63,7 @@ class PinnedAxis:
 
     @property
     def free(self) -> tuple[Free, ...]:
-        """See `AxisModel`: those that are not given."""
+        """See `AxisModel`: the parameters that are not given."""
         return tuple(one for one in self.model.free if one.name not in self.given)
 
     @property
@@ -87,14 +87,14 @@ class PinnedAxis:
 
 @dataclass(frozen=True)
 class Believed:
-    """Response of a configuration."""
+    """Response that a configuration assumes."""
 
     dead_time_s: float  # as a fit has it: without the ramp that the configured one holds [s]
     axes: tuple[Mapping[str, float], ...]  # lag, drag and gain of each axis by name
 
 
 def believed(config: Config, ramp_s: float) -> Believed:
-    """What a configuration believes.
+    """Return the response that a configuration assumes.
 
     Args:
         ramp_s: Part of its dead time that is the ramp of a setpoint, which the fitted inputs have already [s].
@@ -118,7 +118,7 @@ def held_out_errors(
     dead_time_s: float,
     dt_s: float,
 ) -> PredictionErrors:
-    """Errors on each half of a flight by plants that were fitted to the other.
+    """Return errors on each half of a flight, by plants that were fitted to the other.
 
     Args:
         places: 0 north, 1 east, 2 down.
@@ -141,7 +141,7 @@ def held_out_errors(
 
 
 def _within(blocks: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
-    """Whether one of some blocks holds each time, and the time so much later."""
+    """Return whether one of some blocks contains both each time and the time so much later."""
     held = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in blocks]
     return np.asarray(np.logical_or.reduce(held), dtype=np.bool_)
 
@@ -164,7 +164,7 @@ _NO_BETTER = "kept: the flight is predicted no better with it"
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):
-    """One value of the configuration beside what the flight says."""
+    """One value of the configuration beside what the flight shows."""
 
     key: str
     axis: str  # empty where it is of all
@@ -182,7 +182,7 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TunedResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What is changed, and how well both models predict what they were not fitted to."""
+    """Changes of a configuration, and the prediction errors of both models on data they were not fitted to."""
 
     changes: tuple[Change, ...]
     dead_time_range_s: tuple[float, float]
@@ -197,7 +197,7 @@ class TunedResult(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """The result, and the configuration with it."""
+    """Result of a tuning, and the configuration with it."""
 
     result: TunedResult
     config: Config
@@ -217,7 +217,7 @@ def check_tunable(config: Config) -> None:
 
 
 def tuned(config: Config, found: Identification) -> Tuned:
-    """The configuration with what a flight tells well.
+    """Return the configuration with what a flight shows well.
 
     Args:
         found: What was identified from the flight.
@@ -274,7 +274,7 @@ def tuned(config: Config, found: Identification) -> Tuned:
 
 
 def _at_a_dead_time(found: Identification, where: list[int], believed_s: float) -> tuple[tuple[AxisFit, ...], str]:
-    """The fits at the dead time that the flight tells; where it tells none, at the one that was believed."""
+    """Return the fits at the dead time that the flight shows, else at the configured one."""
     low_s, high_s = found.result.candidates[0].dead_time_range_s
     if high_s - low_s <= MOST_DEAD_RANGE_S:
         return found.fits, _TOLD
@@ -290,7 +290,7 @@ def _refitted(
     dead_time_s: float,
     rows: Sequence[Sequence[Change]],
 ) -> list[list[Change]]:
-    """The rows with what is told fitted again beside what is kept: the one stands in for the other."""
+    """Return the rows with what is shown fitted again beside what is kept, as one can stand in for the other."""
     fits = fit_axes(found.flown, where, models, dead_time_s, [None] * len(models))
     return [
         [
@@ -312,7 +312,7 @@ def _axis_rows(
     before: Mapping[str, float],
     has_gain: bool,
 ) -> Iterator[Change]:
-    """Lag, drag and gain of an axis, each with why it is changed or kept."""
+    """Return lag, drag and gain of an axis, each with why it is changed or kept."""
     errors = standard_errors(found.flown, place, fit)
     keys = [("lag_s", "s"), ("drag_1ps", "1/s"), *([("gain", "")] if has_gain else [])]
     for key, unit in keys:
@@ -332,7 +332,7 @@ def _axis_rows(
 
 
 def _against(key: str, value: float, std: float | None, r2: float) -> str:
-    """Why a fitted value is not taken over; empty if it is."""
+    """Return why a fitted value is not adopted; empty if it is."""
     if r2 < LEAST_R2:
         return f"only {100.0 * r2:.0f} % of the motion of the next second is predicted"
     if key == "lag_s" and value < SHORTEST_LAG_S:
@@ -346,7 +346,7 @@ def _against(key: str, value: float, std: float | None, r2: float) -> str:
 
 
 def _noises(config: Config, found: Identification) -> Iterator[Change]:
-    """Noises that the flight showed larger than believed."""
+    """Yield a change for each noise, raised where the flight showed more than configured."""
     made = found.config
     for row, name in enumerate(config.plant.axes):
         old, flight = config.plant.wind_std_mps2[row], made.plant.wind_std_mps2[row]
@@ -355,7 +355,7 @@ def _noises(config: Config, found: Identification) -> Iterator[Change]:
 
 
 def _links(config: Config, link: LinkFit) -> Iterator[Change]:
-    """What the link was worse in than believed."""
+    """Yield the changes of loss and delay, raised where the link was worse than configured."""
     sure = link.loss - CERTAIN * link.loss_std
     old = config.link.loss
     if config.link.model == "bernoulli" and not config.link.probability:
@@ -392,7 +392,7 @@ def _links(config: Config, link: LinkFit) -> Iterator[Change]:
 
 
 def _weights(config: Config, errors: PredictionErrors) -> Iterator[Change]:
-    """Weights of the inputs: lower where the model tells the motion well enough for quicker ones."""
+    """Yield the changes of input weights, lower where the model predicts motion well enough for quicker inputs."""
     size = config.plant.states_per_axis
     column = errors.ahead_s.index(QUICK_AHEAD_S)
     for row, name in enumerate(config.plant.axes):
@@ -437,7 +437,7 @@ def _name(row: Change) -> str:
 
 
 def _applied(config: Config, changes: tuple[Change, ...], link: LinkFit) -> Config:
-    """The configuration with the new values."""
+    """Return the configuration with the new values."""
 
     def of(key: str) -> tuple[float, ...]:
         return tuple(row.new for row in changes if row.key == key)
@@ -463,7 +463,7 @@ def _applied(config: Config, changes: tuple[Change, ...], link: LinkFit) -> Conf
 
 
 def _worse(config: Config, loss: tuple[float, ...], jitter_s: tuple[float, ...], link: LinkFit) -> LinkConfig:
-    """`[link]` with what was worse; losses that came in bursts are taken as measured, if there were no fewer."""
+    """Return `[link]` with what was worse; losses in bursts are adopted as measured, if there were no fewer."""
     made = config.link
     if jitter_s:
         made = msgspec.structs.replace(made, jitter_s=jitter_s[0])

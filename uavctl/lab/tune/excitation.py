@@ -1,4 +1,4 @@
-"""What is flown to learn how the vehicle answers: waypoints inside a box, each axis by itself and then all together.
+"""Excitation to learn the vehicle's response: waypoints in a box, each axis by itself and then all together.
 
 The controller of the configuration flies them, so its own limits of speed and acceleration hold. The box is a fence to
 it, and the waypoints stay as far inside as a plan has to that rests there, and a reserve for what it cannot plan.
@@ -38,19 +38,19 @@ _LEG_S = 0.5  # that arriving takes beside the way
 
 @dataclass(frozen=True)
 class SafeBox:
-    """The part of the room in which the vehicle may be excited."""
+    """Part of the room in which the vehicle may be excited."""
 
     lower: Vec3  # least north, east and down, local NED [m]
     upper: Vec3  # largest
 
     @property
     def centre(self) -> Vec3:
-        """Its middle [m]."""
+        """Centre of the box [m]."""
         north, east, down = ((low + high) / 2.0 for low, high in zip(self.lower, self.upper, strict=True))
         return round(north, 3), round(east, 3), round(down, 3)
 
     def outside(self, place: Sequence[float], axes: Sequence[int] = (0, 1, 2)) -> str:
-        """By which axis a place is outside, in words; empty if it is inside."""
+        """Return along which axis a place is outside, in words; empty if it is inside."""
         for axis in axes:
             if not self.lower[axis] <= place[axis] <= self.upper[axis]:
                 return f"{AXES[axis]} {place[axis]:.2f} m is outside [{self.lower[axis]:g}, {self.upper[axis]:g}] m"
@@ -58,7 +58,7 @@ class SafeBox:
 
 
 class BoxAxis(NamedTuple):
-    """An axis of the box: where waypoints may be [m]."""
+    """Axis of the box, with the range of waypoints [m]."""
 
     axis: int
     low_m: float
@@ -66,7 +66,7 @@ class BoxAxis(NamedTuple):
 
 
 def parse_box(text: str) -> SafeBox:
-    """Two opposite corners, north, east and down of each.
+    """Parse a box: two opposite corners, north, east and down of each [m].
 
     Raises:
         UsageError: They are not six numbers.
@@ -86,7 +86,7 @@ def parse_box(text: str) -> SafeBox:
 
 
 def excited(config: Config, design: AnyDesign, box: SafeBox, *, lands: bool) -> Config:
-    """The configuration with the excitation as its mission, and the box as its fences.
+    """Return the configuration with the excitation as its mission, and the box as its fences.
 
     Args:
         config: The configuration; its own mission and fences are left out.
@@ -115,7 +115,7 @@ def excited(config: Config, design: AnyDesign, box: SafeBox, *, lands: bool) -> 
 def check_start(
     box: SafeBox, start: Sequence[float], what: str, axes: Sequence[int] = (0, 1, 2), hint: str = "begin inside"
 ) -> None:
-    """Refuse a flight that would begin outside of the box.
+    """Refuse a flight that would begin outside the box.
 
     Raises:
         UsageError: It would.
@@ -126,7 +126,7 @@ def check_start(
 
 
 def _sides(config: Config, design: AnyDesign, box: SafeBox) -> list[BoxAxis]:
-    """Where waypoints may be, of each axis of the plant."""
+    """Return the range of waypoints of each axis of the plant."""
     plant = config.plant
     if set(plant.axes) != set(AXES):
         raise UsageError(f"plant.axes = {list(plant.axes)}: a box has three axes, and so must the plant that is tuned")
@@ -162,7 +162,7 @@ def _sides(config: Config, design: AnyDesign, box: SafeBox) -> list[BoxAxis]:
 
 
 def _fenced(config: Config, lower: list[float], upper: list[float]) -> tuple[list[float], list[float]]:
-    """The room where the configuration's own fences are tightest, as far as they are of positions."""
+    """Return the room where the configuration's own fences on positions are tightest."""
     for one in config.fence:
         if one.state in AXES:
             axis = AXES.index(str(one.state))
@@ -174,7 +174,7 @@ def _fenced(config: Config, lower: list[float], upper: list[float]) -> tuple[lis
 
 
 def _waypoints(sides: Sequence[BoxAxis], centre: Vec3) -> Iterator[Vec3]:
-    """Steps of each axis there and back, then of all of them together."""
+    """Return steps of each axis there and back, then of all axes together."""
     for side in sides:
         for step in range(STEPS):
             yield _moved(centre, [(side, step % 2 == 0)])
@@ -190,7 +190,7 @@ def _moved(centre: Vec3, ends: Sequence[tuple[BoxAxis, bool]]) -> Vec3:
 
 
 def _fences(config: Config, box: SafeBox) -> Iterator[FenceConfig]:
-    """The sides of the box that are closer than the room."""
+    """Return the sides of the box that are tighter than the room, as fences."""
     lower, upper = room_of(config)
     for name in config.plant.axes:
         axis = AXES.index(name)
@@ -201,7 +201,7 @@ def _fences(config: Config, box: SafeBox) -> Iterator[FenceConfig]:
 
 
 def _length_s(config: Config, waypoints: Sequence[Vec3], sides: Sequence[BoxAxis]) -> float:
-    """How long the ways take at most, if nothing is in the way [s]."""
+    """Return how long the ways take at most, if nothing is in the way [s]."""
     limits = config.limits.accel_mps2
     size = config.plant.states_per_axis
     total_s, at = 0.0, waypoints[-1]

@@ -1,4 +1,4 @@
-"""Page and summary text."""
+"""Page and summary of a tuning run."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ _NONE = "–"
 
 
 def change_rows(told: TunedResult) -> Iterator[tuple[str, ...]]:
-    """Each value: its name, what it was, what the flight says, what it is, and why."""
+    """Return a row for each value: name, old value, what the flight shows, new value, reason."""
     for row in told.changes:
         yield (name_of(row), f"{row.old:.4g}", _said(row), f"{row.new:.4g}" if row.changed else "=", row.reason)
 
 
 def name_of(row: Change) -> str:
-    """Key, axis and unit of a value."""
+    """Return key, axis and unit of a value."""
     unit = f" [{row.unit}]" if row.unit else ""
     return f"{row.key}{f' {row.axis}' if row.axis else ''}{unit}"
 
 
 def error_columns(errors: PredictionErrors) -> tuple[str, ...]:
-    """Headings of the errors of prediction."""
+    """Return the headings of the prediction errors."""
     return ("axis", "model", *(f"{time_s:g} s [mm]" for time_s in errors.ahead_s))
 
 
 def error_rows(old: PredictionErrors, new: PredictionErrors) -> Iterator[tuple[str, ...]]:
-    """Rms errors of both models, axis by axis."""
+    """Return the rms errors of both models, axis by axis."""
     for axis, before, after in zip(old.axes, old.rms_m, new.rms_m, strict=True):
         for model, row in (("old", before), ("new", after)):
             yield (axis, model, *(f"{1e3 * value:.1f}" for value in row))
 
 
 def figure_rows(found: TuneComparison) -> Iterator[tuple[str, ...]]:
-    """Figures of both flights."""
+    """Return the figures of both flights."""
     before, after = found.before, found.after
     yield _row("held to, rms [cm]", before.hold_rms_m, after.hold_rms_m, 100.0)
     yield _row("held to, at most [cm]", before.hold_max_m, after.hold_max_m, 100.0)
@@ -59,7 +59,7 @@ def figure_rows(found: TuneComparison) -> Iterator[tuple[str, ...]]:
 
 
 def story(told: TunedResult, found: TuneComparison | None) -> list[str]:
-    """What came of it, in sentences."""
+    """Return sentences on the result."""
     changed = sum(row.changed for row in told.changes)
     old_m, new_m = told.old_errors.overall_m, told.new_errors.overall_m
     said = [
@@ -116,7 +116,7 @@ _HOLD = "Distance from the last place, from when it was to be held."
 
 
 def write_page(progress: TuneProgress, before: FlightData, after: FlightData, box: SafeBox | None) -> str:
-    """HTML of a run that is done.
+    """Return the page of a run that is done as HTML.
 
     Args:
         progress: The run; changes and comparison are there.
@@ -162,7 +162,7 @@ def _held(before: FlightData, after: FlightData) -> Drawing:
 
 
 def _growing(key: str, old: PredictionErrors, new: PredictionErrors) -> Drawing:
-    """How errors grow with the time ahead, a line each axis."""
+    """Draw how errors grow with the time ahead, a line for each axis."""
     title = "Error over the time ahead, each axis"
     with canvas(f"growing-{key}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(title, "time ahead [s]", "error [mm]")

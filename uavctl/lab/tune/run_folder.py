@@ -1,4 +1,4 @@
-"""The folder of a tuning run: what was asked for, how far it has come, and where its files are.
+"""Folder of a tuning run: what was asked for, how far it has come, and where its files are.
 
 Every step writes its files first and its note last, so a run that was cut off goes on after the last one that is whole.
 """
@@ -38,7 +38,7 @@ _SAME_M = 1e-6
 
 
 class TunedFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one of the two flights; None where it shows nothing of it."""
+    """Figures of one of the two flights; None where it does not show them."""
 
     recording: str
     judged_by: str  # "truth" where the simulator told it, else "estimate"
@@ -52,7 +52,7 @@ class TunedFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TuneComparison(msgspec.Struct, frozen=True, kw_only=True):
-    """Both flights, and both models on the second one, which neither was fitted to."""
+    """Comparison of both flights, and of both models on the second, which neither was fitted to."""
 
     before: TunedFlight
     after: TunedFlight
@@ -61,7 +61,7 @@ class TuneComparison(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox | None) -> TunedFlight:
-    """Figures of a flight.
+    """Return the figures of a flight.
 
     Args:
         fallbacks: Entries into braking, holding or landing that nobody wanted.
@@ -87,7 +87,7 @@ def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox 
 
 
 def last_place(flight: FlightData) -> tuple[NDArray[np.bool_], float]:
-    """Which steps were flown to the last place of the mission by plans (n,), and since when that was the place [s]."""
+    """Return which steps were flown by plans to the mission's last place (n,), and since when it was the target [s]."""
     steps = flight.steps
     tracked = np.array([d.mode is ControlMode.TRACK for d in steps.decisions], dtype=np.bool_)
     if not tracked.any():
@@ -102,13 +102,13 @@ def last_place(flight: FlightData) -> tuple[NDArray[np.bool_], float]:
 
 
 def holding(flight: FlightData) -> NDArray[np.bool_]:
-    """Steps (n,) at which the last place was held: from `SETTLES_S` after it became the place to fly to."""
+    """Return the steps (n,) at which the last place was held: from `SETTLES_S` after it became the target."""
     chosen, since_s = last_place(flight)
     return np.asarray(chosen & (flight.steps.t_s >= since_s + SETTLES_S), dtype=np.bool_)
 
 
 def plan_errors_m(flight: FlightData) -> Array:
-    """Distance between where plans had the vehicle `PLANNED_AHEAD_S` later and where it was then (n,) [m]."""
+    """Return the distance between plan and flight `PLANNED_AHEAD_S` later (n,) [m]."""
     steps, index = flight.steps, list(flight.design.position_index)
     ahead = max(1, round(PLANNED_AHEAD_S / flight.design.dt_s))
     dt_ns = flight.design.dt_ns
@@ -132,7 +132,7 @@ def plan_errors_m(flight: FlightData) -> Array:
 
 
 def _beyond(flight: FlightData, box: SafeBox) -> float | None:
-    """Furthest outside of the box at a step flown by plans [m]."""
+    """Return how far outside the box a step flown by plans was at most [m]."""
     steps = flight.steps
     tracked = [place for place, d in enumerate(steps.decisions) if d.mode is ControlMode.TRACK]
     if not tracked:
@@ -153,7 +153,7 @@ _MOST_TOLD = 5
 
 
 class TuneAsked(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is of; it may not change between two calls."""
+    """What a tuning run was asked for; it may not change between two calls."""
 
     box: str  # as it was understood; empty without one
     flight: str  # the recording that is begun with; empty where one is flown
@@ -162,7 +162,7 @@ class TuneAsked(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TuneProgress(msgspec.Struct, frozen=True, kw_only=True):
-    """How far a run has come."""
+    """Progress of a tuning run."""
 
     asked: TuneAsked
     digest: str  # of the configuration
@@ -173,7 +173,7 @@ class TuneProgress(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TuneFolder:
-    """A run on disk."""
+    """Folder of a tuning run on disk."""
 
     def __init__(self, path: Path, progress: TuneProgress) -> None:
         self.path = path
@@ -217,7 +217,7 @@ class TuneFolder:
         return folder
 
     def note(self, **done: object) -> None:
-        """Write down that a step is done.
+        """Record that a step is done.
 
         Raises:
             RecordingError: It cannot be written.
@@ -226,11 +226,11 @@ class TuneFolder:
         write_whole(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
 
     def free(self, name: str) -> Path:
-        """A folder for one more flight: the first of NAME, NAME-2, NAME-3, … that is not there yet."""
+        """Return a folder for one more flight: the first of NAME, NAME-2, NAME-3, … that does not exist yet."""
         return self._attempts(name)[1]
 
     def newest(self, name: str) -> Path | None:
-        """The folder of the newest attempt at a flight; None before the first."""
+        """Return the folder of the newest attempt at a flight; None before the first."""
         return self._attempts(name)[0]
 
     def _attempts(self, name: str) -> tuple[Path | None, Path]:
@@ -240,11 +240,11 @@ class TuneFolder:
         return newest, found
 
     def recording(self, noted: str) -> Path:
-        """Path of a recording that the progress names."""
+        """Return the path of a recording that the progress names."""
         return self.path / noted  # an absolute one stays what it is
 
     def relative(self, recording: Path) -> str:
-        """How the progress names a recording: so that the folder may be moved."""
+        """Return the name of a recording for the progress, relative, so that the folder may be moved."""
         try:
             return str(recording.relative_to(self.path))
         except ValueError:
@@ -253,7 +253,7 @@ class TuneFolder:
 
 @contextmanager
 def sole_run(path: Path) -> Iterator[None]:
-    """Hold the folder of a run, which is made if there is none; the kernel lets go of it when its holder ends.
+    """Lock the folder of a run, made if there is none; the kernel releases it when its holder ends.
 
     Raises:
         UsageError: Another process has it, or it cannot be made.
@@ -275,7 +275,7 @@ def sole_run(path: Path) -> Iterator[None]:
 
 
 def read_tuned(path: Path) -> Config:
-    """The tuned configuration, as it was written or as its owner has changed it since.
+    """Read the tuned configuration, as it was written or as its owner has changed it since.
 
     Raises:
         UsageError: It was cut: what it lacks would be a preset's, and nobody has seen that fly.
@@ -302,7 +302,7 @@ def _read(path: Path) -> TuneProgress:
 
 
 def _differences(settings: Path, text: str) -> Iterator[str]:
-    """The first keys in which two configurations differ, with both values."""
+    """Return the first keys in which two configurations differ, with both values."""
     try:
         old = dict(_dotted(tomllib.loads(settings.read_text(encoding="utf-8")), ""))
     except (OSError, tomllib.TOMLDecodeError):

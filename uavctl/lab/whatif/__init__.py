@@ -1,3 +1,3 @@
-"""A recorded flight flown by another controller, schedule or link: what would have been."""
+"""What-if: a recorded flight flown again with another controller, schedule or link."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a what-if is worth; its page."""
+"""Comparison of a what-if with the recorded flight, and its page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _Transition = Callable[[int], tuple[Array, Array, Array]]
 
 
 class Reproduction(msgspec.Struct, frozen=True, kw_only=True):
-    """The recorded flight flown again with nothing changed, beside the recorded one: what is not ours shows here."""
+    """Recorded flight flown again with nothing changed, against the recording: shows differences not of our making."""
 
     identical: bool  # every plan, decision and setpoint, bit for bit
     decisions: int  # compared
@@ -41,7 +41,7 @@ class Reproduction(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
-    """How well the model tells the recorded flight: what it does not is disturbance, or an error of the model."""
+    """Prediction errors of the model on the recorded flight; they are disturbance, or an error of the model."""
 
     source: str
     ahead_s: float
@@ -51,7 +51,7 @@ class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
-    """A recorded flight, and what might have been; field names are the keys of `--json`."""
+    """Result of a what-if beside the recorded flight; field names are the keys of `--json`."""
 
     flight: str
     reproduction: Reproduction
@@ -73,12 +73,12 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def until(entries: Iterable[Entry], end_ns: int) -> list[Entry]:
-    """The part of a recording up to a tick, that included [ns], with all that the recorder says of itself."""
+    """Yield the part of a recording up to and including a tick [ns], with all notes of the recorder."""
     return [entry for entry in entries if entry[1] <= end_ns or isinstance(entry[2], RecorderNote)]
 
 
 def reproduction(recorded: FlightData, again: FlightData) -> Reproduction:
-    """How a flight that should be the recorded one compares with it."""
+    """Compare a flight that should equal the recorded one with it."""
     return Reproduction(
         identical=all(_same(_of(recorded, kind), _of(again, kind)) for kind in _COMPARED),
         decisions=len(recorded.decisions),
@@ -130,7 +130,7 @@ def model_fit(history: RecordedFlight, response: Response, source: str) -> Model
 def _predicted(
     history: RecordedFlight, response: Response, transition: _Transition, x: Array, begin_ns: int, end_ns: int
 ) -> Array | None:
-    """State at the end under the setpoints that were flown; None if any was not."""
+    """Return the state at the end under the setpoints that were flown; None if any was not."""
     tick_ns, model = max(1, history.flight.tick_ns), response.model
     late = -(-response.dead_ns // tick_ns)  # ticks in which what acts at the begin was sent
     for sent_ns in range(begin_ns - late * tick_ns, end_ns - response.dead_ns, tick_ns):
@@ -145,7 +145,7 @@ def _predicted(
 
 
 def departure_m(recorded: FlightData, other: FlightData) -> float:
-    """Largest distance between two flights at a boundary: of the true states if known, else of the estimates [m]."""
+    """Return the largest distance between two flights at a boundary [m], by true states if known, else by estimates."""
     index = list(recorded.design.position_index)
     sides = [
         {one.at_ns: np.array(one.state)[index] for one in flight.truths}
@@ -166,7 +166,7 @@ def _same(some: tuple[Record, ...], others: tuple[Record, ...]) -> bool:
 
 
 def _largest(sides: Iterable[dict[int, tuple[float, ...]]]) -> float:
-    """Largest difference of vectors of the same time."""
+    """Return the largest difference of vectors of the same time."""
     some, others = sides
     gaps = (np.abs(np.array(some[at]) - np.array(others[at])).max(initial=0.0) for at in some.keys() & others.keys())
     return max(map(float, gaps), default=0.0)
@@ -200,7 +200,7 @@ _AGE = "Age of the newest position at each decision: a link that loses more, or 
 
 
 def write_page(found: WhatIf, recorded: FlightData, other: FlightData) -> str:
-    """HTML of a what-if.
+    """Return the page of a what-if as HTML.
 
     Args:
         recorded: The recorded flight, as far as it is compared.
@@ -209,7 +209,7 @@ def write_page(found: WhatIf, recorded: FlightData, other: FlightData) -> str:
 
 
 def story(found: WhatIf) -> list[str]:
-    """What was done, and what it is worth, in sentences."""
+    """Return sentences on what was done, and how far it can be trusted."""
     again, model = found.reproduction, found.model
     same = "bit for bit"
     if not again.identical:
@@ -235,7 +235,7 @@ def story(found: WhatIf) -> list[str]:
 
 
 def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
-    """Rows of the figures: name, recorded, reproduced, what-if."""
+    """Return rows of the figures: name, recorded, reproduced, what-if."""
     bare = [replace(one, recording=None, report=None) for one in (found.recorded, found.reproduced, found.what_if)]
     columns = [dict(rows(one)) for one in bare]
     for name in dict.fromkeys(name for column in columns for name in column):

@@ -1,4 +1,4 @@
-"""A recording through another loop or over another link."""
+"""Flight of a recording through another control loop, or over another link."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Response:
-    """How a vehicle answers to setpoints."""
+    """Response of a vehicle to setpoints."""
 
     model: LinearModel  # its motion
     dead_ns: int = 0  # time from sending a setpoint until it begins to act [ns]
 
 
 class _Node(NamedTuple):
-    """From here on this input acts."""
+    """Time from which an input acts."""
 
     at_ns: int
     state: Array
@@ -58,7 +58,7 @@ class _Node(NamedTuple):
 
 
 class Departure:
-    """δ of state and input, from the first difference of the setpoints on.
+    """Difference δ of state and input from the recorded flight, from the first difference of the setpoints on.
 
     Args:
         response: How the vehicle answers to a difference of the setpoints.
@@ -73,11 +73,11 @@ class Departure:
 
     @property
     def begun_ns(self) -> int | None:
-        """When a difference of the setpoints acted first [ns]; None if they never differed."""
+        """Time at which a difference of the setpoints first acted [ns]; None if they never differed."""
         return self._nodes[1].at_ns if len(self._nodes) > 1 else None
 
     def steer(self, at_ns: int, accel_mps2: Vec3) -> None:
-        """Send setpoints that differ by this [m/s²] from `at_ns` on, no earlier than the last time."""
+        """Send setpoints that differ by this [m/s²] from `at_ns` on, which is no earlier than the last time."""
         model = self._model
         u = np.array([accel_mps2[axis] for axis in model.axes]) / model.accel_per_input
         if not np.array_equal(u, self._nodes[-1].input):
@@ -85,7 +85,7 @@ class Departure:
             self._nodes.append(_Node(acts_ns, self.state(acts_ns), u))
 
     def state(self, at_ns: int) -> Array:
-        """δx (n_x,) at a time [ns]."""
+        """Return δx (n_x,) at a time [ns]."""
         node = self._node(at_ns)
         if at_ns <= node.at_ns or not (node.state.any() or node.input.any()):
             return node.state
@@ -93,19 +93,19 @@ class Departure:
         return np.asarray(a @ node.state + b @ node.input)
 
     def input(self, at_ns: int) -> Array:
-        """δu (n_u,) that is sent from `at_ns` on."""
+        """Return δu (n_u,) that is sent from `at_ns` on."""
         return self._node(at_ns + self._dead_ns).input
 
     def position_m(self, at_ns: int) -> Vec3:
-        """δ of the position in local NED [m]; zero along axes that the plant has not."""
+        """Return δ of the position, local NED [m]; zero along axes that the plant does not have."""
         return self._ned(self.state(at_ns)[list(self._model.position_index)])
 
     def velocity_mps(self, at_ns: int) -> Vec3:
-        """δ of the velocity in local NED [m/s]."""
+        """Return δ of the velocity, local NED [m/s]."""
         return self._ned(self.state(at_ns)[list(self._model.velocity_index)])
 
     def acceleration_mps2(self, at_ns: int) -> Vec3:
-        """δ of the acceleration in local NED [m/s²]: what inertial sensors would have shown more."""
+        """Return δ of the acceleration, local NED [m/s²]: what inertial sensors would have shown more."""
         state, acts = self.state(at_ns), self._node(at_ns).input
         known = state.size + acts.size
         return self._ned(self._speeding[:, :known] @ np.concatenate((state, acts)))
@@ -129,7 +129,7 @@ LEAST_POSITIONS = 2
 
 @dataclass(frozen=True, eq=False)
 class RecordedFlight:
-    """A recorded flight."""
+    """Recorded flight, sorted for flying it again."""
 
     # (topic, log time [ns], record), in the order of recording; of a byte stream, each chunk holds the whole frames
     # that could be read by then
@@ -141,7 +141,7 @@ class RecordedFlight:
     samples: dict[int, list[PositionSample]]  # positions that came to the controller, by time of arrival [ns]
 
     def captured_ns(self, seen: PositionFrame, at_ns: int) -> int | None:
-        """When a position that arrived at `at_ns` was captured [ns]; None if the controller never got it.
+        """Return when a position that arrived at `at_ns` was captured [ns]; None if the controller never got it.
 
         By the simulator's own clock where it is a simulated flight, else as the controller believed.
         """
@@ -154,7 +154,7 @@ class RecordedFlight:
         return None
 
     def simulated_ns(self, position: Position) -> int | None:
-        """The same by the stamp of the simulated cameras; None where it is not theirs."""
+        """Return the capture time by the stamp of the simulated cameras [ns]; None if it is not theirs."""
         theirs = (position.system, position.component) == (SYSTEM_ID, COMPONENT_ID)
         if not (self.flight.truths and theirs and position.stamp_us):
             return None
@@ -166,7 +166,7 @@ class RecordedFlight:
 
 
 def history_of(entries: Iterable[Entry], config: Config, name: str) -> RecordedFlight:
-    """Sort out a recording.
+    """Sort a recording for flying it again.
 
     Args:
         entries: (topic, log time [ns], record), in the order of recording.
@@ -200,7 +200,7 @@ def history_of(entries: Iterable[Entry], config: Config, name: str) -> RecordedF
 
 
 def response_of(history: RecordedFlight, plant: PlantConfig) -> Response:
-    """How the recorded vehicle answers to setpoints if this is its plant; the simulator's linear one has no dead time.
+    """Return the recorded vehicle's response if this is its plant; the simulator's linear one has no dead time.
 
     Raises:
         DesignError: There is no motion between its steps.
@@ -210,7 +210,7 @@ def response_of(history: RecordedFlight, plant: PlantConfig) -> Response:
 
 
 def _whole_frames(entries: Iterable[Entry], daemon: DaemonConfig) -> Iterator[Entry]:
-    """The same, byte streams cut between frames in place of anywhere."""
+    """Return the entries with byte streams cut between frames instead of anywhere."""
     urls = {VEHICLE: daemon.vehicle, MOCAP: daemon.mocap}
     streams = {name: _Stream() for name, url in urls.items() if url.startswith(STREAM_SCHEMES)}
     for topic, at_ns, record in entries:
@@ -221,14 +221,14 @@ def _whole_frames(entries: Iterable[Entry], daemon: DaemonConfig) -> Iterator[En
 
 
 class _Stream:
-    """A byte stream in chunks."""
+    """Stream of bytes that comes in chunks."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._in_step = True
 
     def whole(self, chunk: bytes) -> bytes:
-        """All that can be read now; what a frame is still missing of waits."""
+        """Return the whole frames so far; an incomplete one waits for the rest."""
         data = self._rest + chunk
         found = scan(data, final=False, in_step=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.in_step
@@ -247,7 +247,7 @@ Watch = Callable[[Iterable[Entry]], Iterable[Entry]]
 
 
 class OtherLink(Protocol):
-    """A link that positions come over in place of the recorded one."""
+    """Interface of a link that carries the positions in place of the recorded one."""
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -255,13 +255,13 @@ class OtherLink(Protocol):
         ...
 
     def due(self, to_ns: int, departure: Departure) -> list[tuple[int, bytes]]:
-        """What arrives up to and including `to_ns`, as (arrival [ns], bytes)."""
+        """Return what arrives up to and including `to_ns`, as (arrival [ns], bytes)."""
         ...
 
 
 @dataclass
 class FlownCourse:
-    """How a flight went, as far as it can be told."""
+    """Outcome of flying a recording again."""
 
     departure: Departure  # from the recorded one
     end_ns: int = 0  # tick up to which both were flown on setpoints [ns]
@@ -280,7 +280,7 @@ def fly(
     other: OtherLink | None = None,
     watch: Watch = iter,
 ) -> FlownCourse:
-    """Fly a recorded flight otherwise.
+    """Fly a recorded flight again, with something changed.
 
     Args:
         config: What flies in it now; connections, frame and source are those of the recording.
@@ -310,7 +310,7 @@ def fly(
 
 
 class _Tap:
-    """A sink that notes the setpoint of the tick."""
+    """Sink that notes the setpoint of the tick."""
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -340,13 +340,13 @@ class _Flight:
         self._apart_ns: int | None = None  # since when one of the two is not flown on setpoints
 
     def arrive(self, record: Datagram) -> None:
-        """Let a recorded datagram come, its positions moved, or taken out where another link carries them."""
+        """Pass on a recorded datagram, its positions moved, or taken out where another link carries them."""
         data = self._moved(record.data, record.at_ns, of_vehicle=record.link == VEHICLE)
         if data or not record.data:
             self._loop.receive(record.link, data, record.at_ns)
 
     def tick(self, record: StepInput) -> None:
-        """Decide, and let the vehicle answer to what is decided otherwise."""
+        """Run a tick, and let the vehicle respond to the difference in its setpoint."""
         at_ns = record.at_ns
         if self._other is not None:
             for arrival_ns, data in self._other.due(at_ns, self.course.departure):
@@ -360,7 +360,7 @@ class _Flight:
         self.tell(at_ns)
 
     def tell(self, to_ns: int) -> None:
-        """Put down where the vehicle would have been at the boundaries up to `to_ns`."""
+        """Record the true state that would have been, at the boundaries up to `to_ns`."""
         departure = self.course.departure
         while self.truths and self.truths[0].at_ns <= to_ns:
             told = self.truths.popleft()
@@ -394,7 +394,7 @@ class _Flight:
             self.over = at_ns - self._apart_ns > LONGEST_PAUSE_NS
 
     def _moved(self, data: bytes, at_ns: int, *, of_vehicle: bool) -> bytes:
-        """The bytes as they would have come: positions, own velocity and inertial data of the other course."""
+        """Return the bytes as they would have come: positions, own velocity and inertial data of the other course."""
         departure = self.course.departure
         begun = departure.begun_ns is not None
         if not (begun or of_vehicle or self._other is not None):
@@ -415,7 +415,7 @@ class _Flight:
         return b"".join((*parts, data[done:]))
 
     def _shown(self, frame: RawFrame, at_ns: int, *, begun: bool) -> bytes:
-        """A frame, its position moved; nothing where another link carries it."""
+        """Return a frame with its position moved; empty where another link carries it."""
         seen = self._axes.position(frame) if begun or self._other is not None else None
         if seen is None:
             return frame.data
@@ -444,7 +444,7 @@ _USUAL_SHARE = 0.2  # of the spacings: those of positions with none lost between
 
 @dataclass(frozen=True)
 class Capture:
-    """One position, as its source sent it or would have."""
+    """One position at its capture, as its source sent it, or would have sent a lost one."""
 
     at_ns: int  # time of capture, which counts as that of sending [ns]
     seen: PositionFrame  # its frame, or that of the last one before it
@@ -491,7 +491,7 @@ class Relinked:
 
 
 def captures(history: RecordedFlight, noise: Callable[[], Array]) -> list[Capture]:
-    """All positions of a recording in the order of capture, those that were lost put back in where they were.
+    """Return all positions of a recording in order of capture, with the lost ones put back in.
 
     Raises:
         RecordingError: Too few of them carry a stamp.
@@ -512,7 +512,7 @@ def captures(history: RecordedFlight, noise: Callable[[], Array]) -> list[Captur
 
 
 def _came(history: RecordedFlight) -> list[Capture]:
-    """Those that came, each capture once."""
+    """Return the positions that came, each capture once."""
     axes = SourceFrames(history.config.frame)
     found: dict[int, Capture] = {}
     for _, at_ns, record in history.entries:
@@ -525,7 +525,7 @@ def _came(history: RecordedFlight) -> list[Capture]:
 
 
 def _usual_spacing(history: RecordedFlight, came: list[Capture]) -> float:
-    """Time between two positions with none lost between them [µs]."""
+    """Return the time between two positions with none lost between them [µs]."""
     if history.flight.truths:
         return 1e6 / history.config.sim.camera.rate_hz
     spacings = np.diff([_stamp(one) for one in came])
@@ -533,7 +533,7 @@ def _usual_spacing(history: RecordedFlight, came: list[Capture]) -> float:
 
 
 def _lost(before: Capture, after: Capture, usual_us: float, path: _Path, noise: Callable[[], Array]) -> list[Capture]:
-    """Those between two that came, evenly spread."""
+    """Return the positions lost between two that came, evenly spread."""
     missing = round((_stamp(after) - _stamp(before)) / usual_us) - 1
     numbered = (after.seen.frame.data[_number(after)] - before.seen.frame.data[_number(before)] - 1) % 256
     if missing < 1 or not numbered:  # the source numbers what it sends: nothing was sent between these
@@ -551,7 +551,7 @@ def _lost(before: Capture, after: Capture, usual_us: float, path: _Path, noise: 
 
 
 class _Path:
-    """Where the vehicle was: through the true states where they are known, else through the positions that came."""
+    """Path of the vehicle: through the true states if known, else through the positions that came."""
 
     def __init__(self, history: RecordedFlight, came: list[Capture]) -> None:
         truths = history.flight.truths
@@ -566,7 +566,7 @@ class _Path:
         self._slope = self._spline.derivative()
 
     def at(self, at_ns: int) -> tuple[Array, Array]:
-        """Position (3,) [m] and velocity (3,) [m/s], local NED."""
+        """Return position (3,) [m] and velocity (3,) [m/s] at a time, local NED."""
         time_s = float(self._s([at_ns])[0])
         return np.asarray(self._spline(time_s)), np.asarray(self._slope(time_s))
 
@@ -581,7 +581,7 @@ def _stamp(capture: Capture) -> int:
 
 
 def _number(capture: Capture) -> int:
-    """Place of the running number in the head of a frame."""
+    """Return the offset of the sequence number in the head of a frame."""
     return 4 if capture.seen.frame.data[0] == 0xFD else 2
 
 

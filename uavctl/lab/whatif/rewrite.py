@@ -1,4 +1,4 @@
-"""Specific forces of the vehicle's inertial sensors, as they would have been in another course of the flight.
+"""Rewriting of position and inertial messages, as they would have been in another course of the flight.
 
 The controller turns a specific force by the attitude that the vehicle told last, R f + g. In the other course the
 vehicle accelerates by δa more, so it is told f + Rᵀ δa: the recorded attitude turns that into just δa more. The vehicle
@@ -28,7 +28,7 @@ _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
 
 
 class PositionFrame(NamedTuple):
-    """A frame that holds a position, and the position in local NED [m]."""
+    """Frame that holds a position, with the position in local NED [m]."""
 
     frame: RawFrame
     position: Position
@@ -42,21 +42,21 @@ class SourceFrames:
         self._config = frame
 
     def seen(self, data: bytes) -> Iterator[PositionFrame]:
-        """The positions in some bytes, in order."""
+        """Return the positions in some bytes, in order."""
         for frame in scan(data, final=True).frames:
             seen = self.position(frame)
             if seen is not None:
                 yield seen
 
     def position(self, frame: RawFrame) -> PositionFrame | None:
-        """The position that a frame holds, if any."""
+        """Return the position that a frame holds, if any."""
         for message in decode(frame.data).messages:
             if isinstance(message, Position):
                 return PositionFrame(frame, message, self._to_ned(message))
         return None
 
     def moved(self, seen: PositionFrame, by_m: Vec3, by_mps: Vec3, *, stamp_us: int | None = None) -> bytes:
-        """The frame with its position and velocity moved.
+        """Return a frame with its position and velocity moved.
 
         Args:
             by_m: Change of the position, local NED [m].
@@ -89,14 +89,14 @@ class SourceFrames:
 
 
 def packed(message: Any, frame: RawFrame) -> bytes:
-    """Pack a message as the sender of a frame did: in its version of MAVLink, with its address and number."""
+    """Pack a message as the sender of a frame did: same MAVLink version, address and sequence number."""
     sender = mavlink.MAVLink(None, message.get_srcSystem(), message.get_srcComponent())
     sender.seq = message.get_seq()
     return bytes(message.pack(sender, force_mavlink1=frame.data[0] == mavlink.PROTOCOL_MARKER_V1))
 
 
 def system(frame: RawFrame) -> int:
-    """Which system sent a frame."""
+    """Return which system sent a frame."""
     return frame.data[3 if frame.data[0] == mavlink.PROTOCOL_MARKER_V1 else 5]
 
 
@@ -121,7 +121,7 @@ _LARGEST = 2**15 - 1
 
 
 class InertialFrames:
-    """Follows the vehicle through a recording, and moves what its inertial sensors say.
+    """Follows the vehicle through a recording, and changes what its inertial sensors say.
 
     It counts frames in the other course alone, which before its departure is the recorded one.
 
@@ -136,7 +136,7 @@ class InertialFrames:
         self.moved = self.left_out = 0
 
     def heard(self, frame: RawFrame, at_ns: int, by_mps2: Vec3 | None) -> bytes:
-        """Take a frame of the vehicle's connection, and give what takes its place: itself, another one, or nothing.
+        """Take a frame of the vehicle's connection; return its replacement: itself, another one, or none.
 
         Args:
             at_ns: Its arrival [ns].
@@ -162,7 +162,7 @@ class InertialFrames:
 
 
 def shifted(frame: RawFrame, attitude: Quaternion, by_mps2: Vec3) -> bytes:
-    """Give the inertial frame with an acceleration added, rounded to the resolution of its message.
+    """Return an inertial frame with an acceleration added, rounded to the resolution of its message.
 
     Args:
         frame: A frame of HIGHRES_IMU, RAW_IMU, or SCALED_IMU and its kind.
