@@ -348,7 +348,7 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
 
     Args:
         port: TCP port on the loopback address, 0 for a free one; None: nobody looks, and nothing is imported.
-        on_open: told the port once viewers can connect.
+        on_open: called with the port once viewers can connect.
 
     Raises:
         UsageError: foxglove-sdk is not installed, or the port cannot be had.

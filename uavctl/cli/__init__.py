@@ -1,4 +1,4 @@
-"""The command line: composes configuration, controller, simulator and recorder; one module a command."""
+"""Command line: joins configuration, controller, simulator and recorder; one module for each command."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ INTERRUPTED = 130  # as a shell says of what SIGINT ended
 
 
 def main() -> None:
-    """Entry point of `uavctl`; ends the process with the command's exit code."""
+    """Run `uavctl`; end the process with the command's exit code."""
     # The matrices are small: BLAS threads only disturb the control loop. Read once, when numpy is imported.
     for variable in _THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")

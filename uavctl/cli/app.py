@@ -1,4 +1,4 @@
-"""The `uavctl` application: its commands by name, and how errors and exit codes leave it."""
+"""Application `uavctl`: commands by name, errors, exit codes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ app.register_install_completion_command(add_to_startup=False)
 
 
 def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -> int:
-    """Run one command line; returns its exit code. Errors meant for a person come without a traceback.
+    """Run one command line; return its exit code. Errors meant for a person come without a traceback.
 
     Args:
         arguments: The words after the program's name.
@@ -84,7 +84,7 @@ def _refuse(problems: Sequence[str], exit_code: int) -> int:
 
 
 def _shown(text: str) -> str:
-    """One line of a length that a person reads, and nothing in it that a terminal would take for an order."""
+    """Return a line cut to a readable length, with control characters escaped, so a terminal takes none as an order."""
     if len(text) > 2 * _LONGEST_HALF:
         text = f"{text[:_LONGEST_HALF]} … {text[-_LONGEST_HALF:]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -1,4 +1,4 @@
-"""Uavctl bench."""
+"""Command `uavctl bench`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from uavctl.smpc.conditioned.planner import ConditionedSolver
 
 
 def bench_loop(common: Common, seconds: float, runs: int) -> int:
-    """Measure and show."""
+    """Measure the control loop and show the result."""
     options = ["--config", common.config]
     for override in common.overrides:
         options += ["--set", override]
@@ -45,7 +45,7 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
 
 
 def loop_picture(result: LoopBench) -> RenderableType:
-    """The figures as a table."""
+    """Return the figures of the control loop as a table."""
     table = Table(title="Control loop on real UDP, recording", title_justify="left")
     for heading in ("", "median", "p99", "p99.9", "largest"):
         table.add_column(heading, justify="right" if heading else "left")
@@ -133,7 +133,7 @@ def bench(
 
 
 def _conditioned_solver(config: Config) -> ConditionedSolver | None:
-    """The solver of scheme `age-conditioned`; None where silence outlasts the horizon too often for it."""
+    """Make the solver of scheme `age-conditioned`; None where silence outlasts the horizon too often for it."""
     try:
         return build_conditioned(config).solver
     except DesignError:
@@ -141,7 +141,7 @@ def _conditioned_solver(config: Config) -> ConditionedSolver | None:
 
 
 def _decisions(found: DecisionBench, name: str) -> str:
-    """The figures of scheme `age-conditioned` in words."""
+    """Return the figures of scheme `age-conditioned` in words."""
     us, iterations, flight = found.us, found.iterations, found.flight
     flown = (
         ""
@@ -181,7 +181,7 @@ def _progress() -> Iterator[Advance]:
 
 
 def bench_picture(result: BenchResult, name: str) -> RenderableType:
-    """The figures as tables."""
+    """Return the figures as tables."""
     axes = "1 independent axis" if result.components == 1 else f"{result.components} independent axes"
     head = (
         f"{name}: {axes}; {result.states} states, half uniform over the feasible {result.feasible_share:.0%} of the "

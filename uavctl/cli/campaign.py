@@ -1,4 +1,4 @@
-"""Uavctl campaign."""
+"""Command `uavctl campaign`."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ S = TypeVar("S", CellSummary, TrialSummary)
 
 
 class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
-    """What a campaign came to."""
+    """Result of a campaign; the fields are the keys of `--json`."""
 
     name: str
     runs_file: str
@@ -59,7 +59,7 @@ class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
 
 
 def _closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Sequence[str]) -> Iterator[str]:
-    """What stands below the tables: who was refused, remarks, and where the files are."""
+    """Return the lines below the tables: refused cells, remarks, and paths of the files."""
     yield from (f"Refused: {escape(text)}" for text in dict.fromkeys(refused))
     yield from remarks
     yield f"{escape(result.runs_file)}\n{escape(result.report)}\n{result.wall_s:.1f} s"
@@ -69,7 +69,7 @@ _TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
 
 
 def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
-    """A table for each scenario."""
+    """Return a table for each scenario."""
     # What is the same in all cells needs no column, and of what only tells of ours the page has more.
     lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
     tables: list[RenderableType] = []
@@ -162,7 +162,7 @@ def campaign(
 
 @dataclass(frozen=True)
 class _Given(Generic[S]):
-    """A campaign of either world."""
+    """A campaign of either world, ready to fly."""
 
     name: str  # its name
     text: str  # of its file
@@ -174,7 +174,7 @@ class _Given(Generic[S]):
     picture: Callable[[CampaignResult[S]], RenderableType]
 
     def conclude(self, store: Store, runs_file: Path, report: Path, wall_s: float, json: bool) -> int:
-        """Show what came of it; the exit code."""
+        """Show the result; return the exit code."""
         result = CampaignResult(
             name=self.name,
             runs_file=str(runs_file),
@@ -187,7 +187,7 @@ class _Given(Generic[S]):
 
 
 def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
-    """A campaign in the linear world."""
+    """Make a campaign in the linear world."""
     read, text = read_campaign(spec, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
@@ -198,7 +198,7 @@ def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
 
 
 def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
-    """A campaign in the world of the quadrotor."""
+    """Make a campaign in the world of the quadrotor."""
     spec, text = read_trial(path, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
@@ -217,7 +217,7 @@ def _new_folder(name: str) -> Path:
 
 
 def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:
-    """Fly the tasks that are not there; False if it was interrupted."""
+    """Fly the tasks that are not done yet; return False if it was interrupted."""
     kept = store.kept(tasks)
     left = [task for task in tasks if task.name not in kept]
     if not left:
@@ -243,7 +243,7 @@ def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work]
 
 
 def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
-    """What is there after an interruption, and how to go on."""
+    """Say after an interruption what is done, and how to go on."""
     if not store.begun():
         return "interrupted before the first run; policy libraries that were finished are kept"
     number = () if runs is None else ("--runs", str(runs))

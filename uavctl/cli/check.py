@@ -1,4 +1,4 @@
-"""Uavctl check, and the check before arming."""
+"""Command `uavctl check`, and the check before arming."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def run_preflight(
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
 ) -> tuple[Item, ...]:
-    """Listen, ask, and tell what was found. Arms nothing, changes no mode and no parameter.
+    """Listen, ask, and report what was found. Arms nothing, changes no mode and no parameter.
 
     Args:
         seconds: how long to listen [s].
         move: go on until a person has moved the body as asked, for `MOVE_LIMIT_S` at most.
         take_off_m: height of the climb that is planned [m]; None if none is.
-        prompt: told every new thing that is asked of that person; empty to wait.
+        prompt: called with every new thing that is asked of that person; empty means to wait.
         stop: asked once a tick; ends the listening.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
@@ -97,7 +97,7 @@ def _receive(flight: Preflight, name: str, connection: Connection) -> None:
 def checked_before_arming(
     config: Config, connections: Mapping[str, Connection], stop: Callable[[], bool], take_off_m: float
 ) -> tuple[Item, ...]:
-    """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m`; tells what is not good.
+    """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m` [m]; report what is not good.
 
     Returns:
         All items; none of them forbids arming.
@@ -117,7 +117,7 @@ def checked_before_arming(
 
 
 def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
-    """Put what was found into the recording."""
+    """Record the items of a check."""
     for one in items:
         found = Checked(at_ns=at_ns, name=one.name, state=str(one.state), value=one.value, want=one.want, hint=one.hint)
         sink.put("/uavctl/check", at_ns, found)
@@ -142,7 +142,7 @@ _PERMISSIONS = "see to cable, port, permissions (serial ports: group dialout), o
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """What a check found."""
+    """Result of a check; the fields are the keys of `--json`."""
 
     ok: bool  # nothing speaks against arming
     items: tuple[Item, ...]  # one for each thing that was looked at
@@ -190,7 +190,7 @@ def check(
 
 
 def disk_items(folder: Path, free_bytes: int) -> list[Item]:
-    """Items of the folder that recordings go to; nothing is made."""
+    """Check the folder that recordings go to; create nothing."""
     there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
     writable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
     free = shutil.disk_usage(there).free

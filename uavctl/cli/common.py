@@ -1,4 +1,4 @@
-"""Options, output, wide tables."""
+"""Common parts of commands: options, output, wide tables."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Common:
     ] = False
 
     def load(self) -> LoadedConfig:
-        """The configuration that the options ask for.
+        """Load the configuration that the options ask for.
 
         Raises:
             ConfigError: With all problems found.
@@ -66,11 +66,11 @@ class Common:
         return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:
-        """The same with further overrides, from a command's own options; they win."""
+        """Return the options with further overrides of a command's own, which win."""
         return replace(self, overrides=(*self.overrides, *more))
 
     def show(self, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]) -> None:
-        """Put the result on standard output: as JSON, or as a picture of it for people."""
+        """Write the result to standard output, as JSON or as a picture for people."""
         if self.json:
             sys.stdout.write(msgspec.json.encode(document).decode() + "\n")
         else:
@@ -79,7 +79,7 @@ class Common:
 
 
 def can_be_read(type_: object, path: object) -> None:
-    """Refuse a path that a recording cannot be at: a pipe would be waited for, a device has no end.
+    """Refuse a path that cannot be read as a recording: reading a pipe would wait, a device has no end.
 
     Raises:
         ValueError: It is one, or a name that the system does not take.
@@ -108,7 +108,7 @@ FREE_PORT = validators.Number(gte=0, lte=65535)
 
 
 def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
-    """A table of names and values; nothing in it is markup."""
+    """Return a table of names and values; nothing in it is markup."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in rows:
         table.add_row(escape(name), escape(str(value)))
@@ -116,7 +116,7 @@ def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
 
 
 def messages() -> Console:
-    """Where messages and progress go: standard error.
+    """Return the console for messages and progress: standard error.
 
     Called interactive also where it is a file or a pipe: there rich shows no progress, but else would leave an empty
     line where the bar would have been.
@@ -125,13 +125,13 @@ def messages() -> Console:
 
 
 def warn(text: str) -> None:
-    """Say what one should know, on a line of its own; nothing in it is markup."""
+    """Write a warning on a line of its own; nothing in it is markup."""
     messages().print(text, style="yellow", markup=False, soft_wrap=True)
 
 
 @contextmanager
 def located(loaded: LoadedConfig) -> Iterator[None]:
-    """Tell a refused design with the file and line of the key that is to blame.
+    """Turn the error of a refused design into one with the file and line of the key to blame.
 
     Raises:
         ConfigError: In place of the DesignError.
@@ -150,7 +150,7 @@ _BETWEEN = 3  # a border and a blank on either side
 
 @dataclass(frozen=True)
 class Column:
-    """A heading, and what stands below it row by row."""
+    """A column of a table: heading, cells, alignment."""
 
     heading: str
     cells: Sequence[str]
@@ -158,13 +158,13 @@ class Column:
 
     @property
     def width(self) -> int:
-        """Characters that it takes, with its border."""
+        """Width of the column with its border [characters]."""
         return max(map(cell_len, (self.heading, *self.cells))) + _BETWEEN
 
 
 @dataclass(frozen=True)
 class WideTable:
-    """Columns that are cut into as many tables as the width asks for, each beginning with the same one."""
+    """Table that is cut into as many as the width asks for, each beginning with the first column."""
 
     first: Column  # column that names the rows, in every table
     groups: Sequence[Sequence[Column]]  # columns that stay together where there is room for them
@@ -182,7 +182,7 @@ class WideTable:
             yield table
 
     def _cut(self, room: int) -> list[list[Column]]:
-        """The columns table by table, of `room` characters each beside the first column."""
+        """Return the columns of each table, of `room` characters beside the first column."""
         tables: list[list[Column]] = [[]]
         for group in self.groups:
             together = _width(group) <= room

@@ -1,4 +1,4 @@
-"""`uavctl ctl`: orders and questions to a daemon that is flying."""
+"""Command `uavctl ctl`: orders and questions to a daemon that is flying."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _order(request: ControlRequest, which: Which) -> int:
 
 
 def _ask(request: ControlRequest, which: Which) -> Reply:
-    """The answer of the daemon that is meant.
+    """Return the daemon's answer to a request.
 
     Raises:
         NotReachedError: none, or more than one, or no answer.
@@ -130,7 +130,7 @@ def _ask(request: ControlRequest, which: Which) -> Reply:
 
 
 def _reach(folder: Path, wanted: str | None) -> socket.socket:
-    """A connection to the daemon that is meant."""
+    """Return a connection to the daemon that is meant."""
     found = {path.name.removesuffix(SUFFIX): path for path in _sockets(folder)}
     names = [name for name in found if wanted is None or wanted in name]
     if wanted in found:
@@ -165,7 +165,7 @@ def _sockets(folder: Path) -> list[Path]:
 
 
 def _connect(path: Path) -> socket.socket | None:
-    """A connection; None if nobody listens there any more."""
+    """Return a connection to a daemon's socket; None if nobody listens there any more."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(ANSWER_LIMIT_S)
     try:
@@ -199,7 +199,7 @@ def _table(health: Health) -> Table:
 
 
 def _relay(relay: RelayHealth) -> str:
-    """How the vehicle gets its positions; control may have ended before."""
+    """Return in words how the vehicle gets its positions; control may have ended before."""
     if relay.last_s is None:
         return "no position has been passed on yet"
     alone = "; control has ended, positions go on" if relay.alone else ""
@@ -207,7 +207,7 @@ def _relay(relay: RelayHealth) -> str:
 
 
 def _trouble(recorder: RecorderHealth) -> str:
-    """What a person has to know of the recording."""
+    """Return in words what is wrong with the recording."""
     return f"{'' if recorder.ok else 'in trouble, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
 
 

@@ -1,4 +1,4 @@
-"""Uavctl design."""
+"""Command `uavctl design`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SEED = 0
 
 
 def gains_report(common: Common, states: int) -> int:
-    """Synthesise the terminal gain and compare; 1 if no complete design can be made with it."""
+    """Synthesise the terminal gain and compare; return 1 if no complete design can be made with it."""
     loaded = common.load()
     begin = time.perf_counter()
     with located(loaded):
@@ -143,12 +143,12 @@ def design(
 
 
 def conditioned_document(made: ConditionedDesign, wall_s: float) -> dict[str, object]:
-    """The figures of scheme `age-conditioned`, for --json."""
+    """Return the figures of scheme `age-conditioned`, for --json."""
     return {**conditioned_record(made), "wall_s": wall_s}
 
 
 def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
-    """Ages and their risk, and where a plan may rest, as tables."""
+    """Return tables of ages with their risk, and of where a plan may rest."""
     ages = Table(title=f"Risk by the age of information, design {made.design_id} of {name}", title_justify="left")
     for heading in ("age [steps]", "probability", "may be outside", "far from limits"):
         ages.add_column(heading, justify="right")
@@ -175,7 +175,7 @@ def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
 
 
 def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
-    """The figures of a design and its policy library, for --json; without a library these are 0 and null."""
+    """Return the figures of a design and its policy library, for --json; without a library these are 0 and null."""
     return {
         **design_record(made),
         "library_size": 0 if stored is None else sum(stored.sizes),
@@ -186,7 +186,7 @@ def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -
 
 
 def library_document(stored: StoredLibrary) -> dict[str, object]:
-    """The figures of a policy library, for --json."""
+    """Return the figures of a policy library, for --json."""
     return {
         "library_id": stored.library_id,
         "bytes": len(stored.data),
@@ -199,7 +199,7 @@ def library_document(stored: StoredLibrary) -> dict[str, object]:
 
 
 def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
-    """Assumption 4, the schedule and the policy library, as tables."""
+    """Return Assumption 4, the schedule and the policy library as tables."""
     checks = Table(title=f"Assumption 4, design {made.design_id} of {name}", title_justify="left")
     for heading in ("item", "holds", "value", "limit", "of what"):
         checks.add_column(heading)

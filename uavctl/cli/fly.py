@@ -1,4 +1,4 @@
-"""Uavctl fly."""
+"""Command `uavctl fly`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _UNREAD_LINES = 10  # health lines that wait for a slow terminal or log
 def operation(
     loop: ControlLoop, config: Config, path: Path, status: Callable[[], RecorderStatus], listener: socket.socket
 ) -> Iterator[Sequence[AfterTick]]:
-    """What the daemon calls after each tick; closed at the end.
+    """Yield the function that the daemon calls after each tick; close its parts at the end.
 
     Raises:
         UsageError: the service manager's variables cannot be understood.
@@ -93,7 +93,7 @@ def operation(
 
 @contextmanager
 def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
-    """Real-time scheduling and memory if wanted, with what was not permitted told; what to call after each tick."""
+    """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
     with ExitStack() as stack:
         for outcome in stack.enter_context(realtime()) if wanted else ():
             style = "" if outcome.ok else "[bold yellow]warning:[/] "
@@ -103,7 +103,7 @@ def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
 
 @contextmanager
 def _health_lines() -> Iterator[Callable[[str], None]]:
-    """Write lines to standard error from a thread of its own, where no terminal shows the live line instead."""
+    """Write lines to standard error from a thread of its own, unless a terminal shows the live line instead."""
     lines: deque[str] = deque(maxlen=_UNREAD_LINES)
     if sys.stderr.isatty():
         yield lines.append
@@ -133,7 +133,7 @@ def _health_lines() -> Iterator[Callable[[str], None]]:
 
 
 def recorder_health(status: RecorderStatus, path: Path) -> RecorderHealth:
-    """How a recording is doing, for those who look at the flight."""
+    """Return the state of a recording, for the flight's status."""
     reason = status.warning if status.ok else status.reason or status.refusal
     return RecorderHealth(
         ok=status.ok,

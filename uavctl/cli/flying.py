@@ -1,4 +1,4 @@
-"""Shared by fly and loopback: recording, signals, live line, engagement."""
+"""Common parts of flights, of fly and loopback: recording, signals, live line, engagement."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ DOWN = 2
 
 
 def goto_overrides(goto: str | None) -> tuple[str, ...]:
-    """Configuration keys for `--goto x,y,z`: the place is the mission, so it is checked, and recorded, as one.
+    """Return configuration keys for `--goto x,y,z`: the place becomes the mission, checked and recorded as one.
 
     Raises:
         UsageError: it is not three numbers.
@@ -67,7 +67,7 @@ def goto_overrides(goto: str | None) -> tuple[str, ...]:
 
 
 class Engagement:
-    """From the command line's words to the order, and back to what became of it.
+    """Order of the command line (take-off, place to go to), and what became of it.
 
     Attributes:
         goal: the place of `--goto`, local NED [m].
@@ -117,7 +117,7 @@ class Engagement:
 
 
 def stand_by(loop: ControlLoop, flown_ns: int) -> None:
-    """Leave a vehicle alone that is found armed, and say so: the daemon before this one left it in flight.
+    """Leave a vehicle alone that is found armed, and say so: an earlier daemon left it in flight.
 
     Args:
         flown_ns: when that flight began; a vehicle that has started since is another one.
@@ -131,7 +131,7 @@ def stand_by(loop: ControlLoop, flown_ns: int) -> None:
 
 
 def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
-    """Refuse what the room has no place for, before anything is made for the flight, or sent.
+    """Refuse places outside the room, before anything is made for the flight, or sent.
 
     Raises:
         UsageError: the plant may not rest at the goal, or the climb would end above the room.
@@ -155,7 +155,7 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
 
 
 def checked_take_off(arm: bool, takeoff: float | None) -> float | None:
-    """The height of the climb, if the command line asks for one; neither word stands alone.
+    """Return the height of the climb [m], if the command line asks for one; --arm and --takeoff go together.
 
     Raises:
         UsageError: one of the two is missing.
@@ -195,18 +195,18 @@ _WAITS_FOR = {
 
 
 def waits_for(state: HandoverState) -> str:
-    """What the hand-over waits for; empty where it waits for nothing of the vehicle's."""
+    """Return what the hand-over waits for; empty if it waits for nothing of the vehicle."""
     return _WAITS_FOR.get(state, "")
 
 
 class Said:
-    """Says each different text once, at once, and again only after a while if it goes on."""
+    """Filter for messages: each different text passes once, and again only after a while if it goes on."""
 
     def __init__(self) -> None:
         self._said_ns: dict[str, int] = {}
 
     def line(self, event: Event, state: HandoverState) -> str | None:
-        """What to say of an event now, if anything."""
+        """Return the line to print for an event now; None for nothing."""
         if event.code == VEHICLE_TEXT and event.severity is Severity.INFO:
             return None
         said_ns = self._said_ns.get(event.text)
@@ -236,7 +236,7 @@ SWITCH_INTERVAL_S = 0.0005
 
 
 class Recording(Protocol):
-    """A recorder of either kind."""
+    """Interface of a recorder."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Record one value."""
@@ -247,12 +247,12 @@ class Recording(Protocol):
         ...
 
     def status(self) -> RecorderStatus:
-        """How it is doing."""
+        """Return the state of the recorder."""
         ...
 
 
 def live_view_port(*, live: bool, port: int | None) -> int | None:
-    """Port of the live view; None if there is none.
+    """Return the port of the live view; None if there is none.
 
     Raises:
         UsageError: A port, and no view.
@@ -264,7 +264,7 @@ def live_view_port(*, live: bool, port: int | None) -> int | None:
 
 @contextmanager
 def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
-    """Those who look at a flight: viewers of its recording, and with a port a live view.
+    """Make what looks on at a flight: views in its recording and, with a port, a live view.
 
     Raises:
         UsageError: there can be no live view.
@@ -278,7 +278,7 @@ def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
 
 
 def recording_path(out: Path | None, name: str) -> Path:
-    """File of a new recording: in `out`, or in a folder of its own below `flights/`."""
+    """Return the path of a new recording: in `out`, or in a folder of its own below `flights/`."""
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
     folder = out if out is not None else Path("flights") / f"{stamp}-{name}"
     return folder / "flight.mcap"
@@ -286,7 +286,7 @@ def recording_path(out: Path | None, name: str) -> Path:
 
 @contextmanager
 def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
-    """File of a new recording, with room for it; folders that are made for it and stay empty are gone in the end.
+    """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
 
     Raises:
         RecordingError: as `check_room` does.
@@ -298,7 +298,7 @@ def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path
 
 
 def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None:
-    """Begin a recording with what is needed to decide alike."""
+    """Begin a recording with its header and library: everything needed to decide alike in a replay."""
     config, design, library = prepared.config, prepared.design, prepared.library
     header = Header(
         started_ns=started_ns,
@@ -319,13 +319,13 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
 
 
 def stop_limit_s(config: Config, *, takes_off: bool) -> float:
-    """How long a hand-over may take [s]; a flight that we began, or that lands by our positions, ends on the ground."""
+    """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
     lands = takes_off or config.relay.enabled
     return config.fallback.brake_s + LANDING_S + (config.hand_over.land_s if lands else 0.0)
 
 
 def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
-    """Read the recording back, sum it up and have the page drawn beside it; one that cannot be is told, and no more.
+    """Read the recording back, summarise it and have its page drawn; a page that fails is only reported.
 
     Args:
         path: of the recording, which is closed.
@@ -357,7 +357,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
 
 
 def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
-    """Write the page of a recording in a process of its own: what draws has no place in one that flies.
+    """Write the page of a recording in a process of its own, so that matplotlib is not loaded where it flies.
 
     Args:
         path: of the recording.
@@ -378,7 +378,7 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
 
 @contextmanager
 def ending_noted(loop: ControlLoop) -> Iterator[None]:
-    """Note what ends a flight otherwise than in order; the link's end is told with the flight's, and raises no more."""
+    """Record an error that ends a flight; a lost link is reported with the flight's end instead of raised."""
     try:
         yield
     except ConnectionClosedError:
@@ -392,14 +392,14 @@ def ending_noted(loop: ControlLoop) -> Iterator[None]:
 
 
 def final(ending: Ending, status: RecorderStatus) -> Ending:
-    """How a flight ended, with how its recording did."""
+    """Return how a flight ended, with the state of its recording."""
     why = status.reason or status.refusal or "the disk was too slow"
     return ending if status.ok else lacking(ending, max(_lacking(status), 1), why)
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and SIGTERM into a question that the loop asks; a second signal ends at once."""
+    """Yield a function that says whether Ctrl-C or SIGTERM has come; a second signal ends the process at once."""
     asked = threading.Event()
 
     def ask(number: int, frame: object) -> None:
@@ -418,7 +418,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[None]:
-    """Show what the loop does while it flies, from a thread of its own, on standard error."""
+    """Show the state of the loop while it flies, from a thread of its own, on standard error."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
@@ -458,7 +458,7 @@ def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, 
 
 
 def tell_notices(loop: ControlLoop, console: Console) -> None:
-    """Say what the hand-over has to tell a person, as far as it is not said yet: each transition that is a warning."""
+    """Print the hand-over's notices that are not printed yet: each transition that is a warning."""
     while loop.notices:
         event = loop.notices.popleft()
         style = "bold red" if event.severity is Severity.ERROR else "bold yellow"
@@ -478,19 +478,19 @@ def _line(loop: ControlLoop) -> str:
 
 
 def _alarm(status: RecorderStatus) -> str:
-    """What a person has to know of the recording while it is being made."""
+    """Return a warning on the recording while it is being made; empty if there is none."""
     if status.ok:
         return f"  [yellow]disk gets low: {escape(status.warning)}[/]" if status.warning else ""
     return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
 
 
 def _lacking(status: RecorderStatus) -> int:
-    """Records that are not in the recording."""
+    """Return the number of records that are not in the recording."""
     return status.dropped + status.refused + status.gone + status.waiting
 
 
 def tell_losses(status: RecorderStatus) -> None:
-    """Say after a flight what the recording lacks, and why."""
+    """Print after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
         messages().print(
             f"[bold red]warning:[/] the recording lacks {_lacking(status)} records "

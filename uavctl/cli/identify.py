@@ -59,7 +59,7 @@ def identify_command(
 
 
 def _history(flight: Path, common: Common) -> tuple[FlightHistory, Config]:
-    """The flight, and the configuration that its result goes into."""
+    """Return the flight, and the configuration that its result goes into."""
     if flight.suffix == ".tlog":
         config = common.load().config
         one_link = msgspec.structs.replace(config.daemon, vehicle="tlog", mocap="tlog")
@@ -77,7 +77,7 @@ def _history(flight: Path, common: Common) -> tuple[FlightHistory, Config]:
 
 
 def design_doubts(config: Config) -> tuple[str, ...]:
-    """Why the identified configuration makes no design as it stands, if it does not."""
+    """Return why the identified configuration makes no design as it stands; empty if it does."""
     try:
         design_of(config)
     except DesignError as error:

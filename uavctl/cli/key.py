@@ -1,4 +1,4 @@
-"""`uavctl key`: files of signing keys."""
+"""Command `uavctl key`: files of signing keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uavctl log: info, recover, export."""
+"""Commands `uavctl log`: info, recover, export, layout."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _tlog_picture(exported: ExportedTlog) -> RenderableType:
 
 
 def info_table(found: RecordingInfo) -> RenderableType:
-    """Topics with rates and gaps, and below what else is worth knowing."""
+    """Return a table of topics with rates and gaps, and below it further facts."""
     title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
     if len(found.files) > 1:
         title += f" in {len(found.files)} files"
@@ -165,7 +165,7 @@ def _loss(loss: PositionLoss) -> Iterator[str]:
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """Counts in words, as in "3 checksum, 1 length"."""
+    """Return counts in words, as in "3 checksum, 1 length"."""
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 

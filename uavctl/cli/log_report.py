@@ -1,4 +1,4 @@
-"""Uavctl log report and compare: what draws pages."""
+"""Commands `uavctl log report` and `uavctl log compare`, which draw pages."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def compare_command(
 
 
 def comparison_picture(found: FlightComparison) -> RenderableType:
-    """What is compared, how far it is the same, parameters, figures, and what to mind."""
+    """Return the comparison for a terminal: flights, how far they agree, parameters, figures, notes."""
     parts: list[RenderableType] = [_sides(found.recordings)]
     parts += [Text(text) for text in map(likeness, found.likenesses)]
     parts.append(_parameters(found) if found.parameters else Text("No parameter differs."))

@@ -1,4 +1,4 @@
-"""`uavctl loopback`: simulated vehicle, cameras, lossy channel and the controller together."""
+"""Command `uavctl loopback`: simulated vehicle, cameras, lossy channel and the controller together."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def fly_simulated(
 
 
 class _Timed:
-    """A loop in virtual time: nothing is ever late, and the time in the core is recorded."""
+    """Loop in virtual time: no tick is ever late, and the computing time in the core is recorded."""
 
     def __init__(self, loop: ControlLoop, engagement: Engagement) -> None:
         self._loop = loop
@@ -154,7 +154,7 @@ class _Timed:
 
 
 class _InterruptedError(Exception):
-    """The operator asked for the end of a flight in virtual time."""
+    """The operator has asked for the end of a flight in virtual time."""
 
 
 def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
@@ -242,7 +242,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
 
 
 def _on_loopback(config: Config) -> Config:
-    """The same configuration with connections on free ports of this machine."""
+    """Return the configuration with connections on free ports of this machine."""
     with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
         one.bind(("127.0.0.1", 0))
         other.bind(("127.0.0.1", 0))
@@ -252,7 +252,7 @@ def _on_loopback(config: Config) -> Config:
 
 @contextmanager
 def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
-    """The simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
+    """Run the simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
 
     Raises:
         UavctlError: they do not start.
@@ -282,7 +282,7 @@ def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
 
 
 def _ready(pipe: Pipe) -> bool:
-    """Wait for the simulator's ports; False if it ended or took too long."""
+    """Wait for the simulator's ports; return False if it ended or took too long."""
     try:
         return pipe.poll(START_LIMIT_S) and isinstance(pipe.recv(), Ready)
     except EOFError:
@@ -290,7 +290,7 @@ def _ready(pipe: Pipe) -> bool:
 
 
 def _listen(pipe: Pipe, sink: Sink) -> None:
-    """Hand the simulator's truth on until it hangs up."""
+    """Pass the simulator's truth on until it hangs up."""
     try:
         while True:
             told = pipe.recv()

@@ -1,4 +1,4 @@
-"""`uavctl paper`: Section 5 of the paper, reproduced, with every claim beside what was measured."""
+"""Command `uavctl paper`: Section 5 of the paper, reproduced, with each claim beside what was measured."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _make(out: Path) -> None:
 
 
 def _setup(variant: Variant) -> Setup:
-    """Design and policy library of a variant, from the cache or made now."""
+    """Return design and policy library of a variant, from the cache or made now."""
     loaded = Common(config=PRESET, overrides=variant.overrides).load()
     with located(loaded):
         design = build_design(loaded.config)
@@ -136,7 +136,7 @@ def _measure_depth(seed: int) -> Depth:
 
 
 def _draw(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
-    """Fig. 3 of every design; Fig. 4 once: all have the same link."""
+    """Draw Fig. 3 of every design, and Fig. 4 once: all designs have the same link."""
     # matplotlib, when all is flown
     from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
 
@@ -154,7 +154,7 @@ def _draw(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
 def paper_picture(
     results: list[VariantResult], claims: list[Claim], depth: Depth | None, figures: list[Path]
 ) -> RenderableType:
-    """The claims beside what each design came to; `claims` are those of the first one, and what was measured beyond."""
+    """Return the claims beside each design's result; `claims` are those of the first, and what was measured beyond."""
     first = results[0]
     table = Table(
         title=f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}",

@@ -1,4 +1,4 @@
-"""A controller ready to decide; provenance."""
+"""Preparation of a controller ready to decide, and its provenance: versions and processor."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What flies."""
+    """Controller that is ready to fly, and what it is made from."""
 
     config: Config  # the configuration
     design: AnyDesign  # its design
@@ -50,7 +50,7 @@ def prepare(config: Config, design: AnyDesign) -> Prepared:
 
 
 def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
-    """The policy library of a design that asks for one: from the cache, or made under a progress bar."""
+    """Return the policy library of a design that asks for one: from the cache, or made under a progress bar."""
     if isinstance(design, ConditionedDesign) or not config.uses_library:
         return None
     from uavctl.build.library import library_for
@@ -72,7 +72,7 @@ def _silent(text: str) -> None:
 
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[str], None]]:
-    """A bar of unknown length; where standard error is no terminal, its title alone."""
+    """Show a progress bar of unknown length; where standard error is no terminal, its title alone."""
     console = messages()
     if not console.is_terminal:
         console.print(escape(title), soft_wrap=True)
@@ -91,13 +91,13 @@ _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mca
 
 
 def versions() -> dict[str, str]:
-    """What decides alike must be of the same versions."""
+    """Return the versions of code and libraries that decisions depend on."""
     found = {name: metadata.version(name) for name in _LIBRARIES}
     return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
 
 
 def cpu() -> str:
-    """The CPU type: linear algebra kernels, and so the last bits, depend on it."""
+    """Return the CPU type: linear algebra kernels, and so the last bits of decisions, depend on it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Uavctl log replay."""
+"""Command `uavctl log replay`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 
 
 def recorded_flyer(flight: Path, config: Config) -> Prepared:
-    """What flew.
+    """Return the controller that flew in a recording.
 
     Raises:
         RecordingError: It carries no policy library though it flew with one, or one that does not fit.
@@ -62,7 +62,7 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
 
 
 def changed_flyer(flight: Path, before: Config, loaded: LoadedConfig) -> Prepared:
-    """What flies with a changed configuration: the recorded policy library where that fits, else one of its own.
+    """Return a controller of a changed configuration, with the recorded policy library if that fits, else its own.
 
     Raises:
         ConfigError: The configuration leaves no design.
@@ -87,7 +87,7 @@ def _with_library(flight: Path, config: Config, design: Design) -> Prepared:
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
-    """A key of the configuration that is another one in the replay."""
+    """Key of the configuration whose value differs in the replay."""
 
     key: str
     recorded: str
@@ -96,7 +96,7 @@ class Changed(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Replayed:
-    """A replay and what has to be known of its recording."""
+    """Result of a replay, with facts on its recording."""
 
     result: ReplayResult  # what it found
     lacks_end: str  # why the recording's end is not there, in words; nothing if it is
@@ -151,7 +151,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
 
 
 def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
-    """What another program has recorded, and None if the recording is one of ours; says what was left out.
+    """Return the packets of another program's recording, None if it is one of ours; say what was left out.
 
     Args:
         topics: Of an MCAP: those to take; all that hold MAVLink if none is named.
@@ -178,7 +178,7 @@ def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ..
 
 
 def check_first(flight: Path) -> None:
-    """A later file alone has neither the first ticks nor what they left behind."""
+    """Refuse a later file of a recording: it lacks the first ticks, and the state that they left."""
     note = next(records(flight, RecorderNote), None)
     if note is None or note.segment == 1:
         return
@@ -192,7 +192,7 @@ def check_first(flight: Path) -> None:
 
 
 def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
-    """Keys of two configurations that differ."""
+    """Return the keys in which two configurations differ."""
     if isinstance(before, dict) and isinstance(now, dict):
         for name in dict.fromkeys([*before, *now]):
             yield from _changes(before.get(name), now.get(name), f"{key}.{name}" if key else str(name))
@@ -201,7 +201,7 @@ def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
 
 
 def other_versions(recorded: Header) -> Iterator[str]:
-    """What decides a flight's last bits and is not what the recording was made with: code, libraries, CPU type."""
+    """Return which code, libraries and CPU type, on which the last bits depend, differ from the recording's."""
     here = {**versions(), "cpu": cpu()}
     there = {**recorded.versions, "cpu": recorded.cpu}
     for name in sorted(here.keys() | there.keys()):
@@ -217,7 +217,7 @@ _LONGEST = 60
 
 
 def replay_table(replayed: Replayed) -> RenderableType:
-    """The whole outcome."""
+    """Return the whole result for a terminal."""
     result = replayed.result
     rows: list[tuple[str, object]] = [
         *(("changed", f"{one.key}: {_cut(one.recorded)} -> {_cut(one.replayed)}") for one in replayed.changed),
@@ -287,7 +287,7 @@ def _chosen(one: Chosen | None) -> str:
 
 
 def _course(course: tuple[FieldDivergence, ...]) -> Table:
-    """What becomes of the difference, on the recorded inputs."""
+    """Return a table of how the difference goes on, on the recorded inputs."""
     title = "What becomes of it, on the recorded inputs"
     if len(course) > MOST_FIELDS:
         title += f" ({MOST_FIELDS} of {len(course)} fields, all with --json)"
@@ -380,12 +380,12 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """Counts in words, as in "126 track, 20 hold"."""
+    """Return counts in words, as in "126 track, 20 hold"."""
     return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
 
 
 def _ages(ages: Mapping[str, int], horizon: int) -> str:
-    """Ages at decisions, in a few classes."""
+    """Return the ages at decisions, in a few classes."""
     classes: dict[str, int] = {}
     for age, decisions in ages.items():
         steps = int(age)

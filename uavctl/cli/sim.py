@@ -1,4 +1,4 @@
-"""Uavctl sim."""
+"""Command `uavctl sim`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LINK_ID = 100  # of the simulated vehicle; its cameras' is one more
 
 
 class SignedPort:
-    """A port whose frames are signed both ways; implements `sim.server.Port`."""
+    """Port whose frames are signed both ways; implements `sim.server.Port`."""
 
     def __init__(self, inner: Port, gate: Gate) -> None:
         self._inner, self._gate = inner, gate
@@ -54,7 +54,7 @@ class SignedPort:
         return self._inner.sockets()
 
     def read(self) -> list[bytes]:
-        """See `Port`; what holds no verified frame is dropped."""
+        """See `Port`; bytes without a verified frame are dropped."""
         at_ns = monotonic_ns()
         admitted = (self._gate.admit(data, at_ns) for data in self._inner.read())
         return [data for data in admitted if data]
@@ -73,7 +73,7 @@ class SignedPort:
 
 
 def make_door(security: SecurityConfig) -> Door | None:
-    """What puts ports behind doors as `[security]` asks of the daemon; None if it asks for nothing.
+    """Return a function that signs ports as `[security]` asks of the daemon; None if it asks for nothing.
 
     Raises:
         KeyFileError: the key cannot be used.
@@ -119,7 +119,7 @@ Looks = Sequence[VehicleSnapshot]
 
 
 def view(looks: Looks) -> RenderableType:
-    """A table, one row a vehicle and one column a quantity; several below each other where the terminal is narrow."""
+    """Return a table with a row for each vehicle; cut into several where the terminal is narrow."""
     rows = zip(*(_cells(one) for one in looks), strict=True)
     # What vehicles say, and units in brackets, are no markup.
     columns = [
@@ -158,7 +158,7 @@ def _setpoint(one: VehicleSnapshot) -> str:
 
 
 def line(one: VehicleSnapshot) -> str:
-    """The same of one vehicle in a line of plain text."""
+    """Return the state of one vehicle as a line of plain text."""
     names = ("mode", "armed", "landed", "position", "velocity", "battery", "setpoint", "sent", "lost", "faults", "text")
     told = "  ".join(f"{name} {cell}" for name, cell in zip(names, _cells(one)[1:], strict=True))
     return f"{one.time_s:.1f} s  vehicle {one.system_id}  {told}"
@@ -166,7 +166,7 @@ def line(one: VehicleSnapshot) -> str:
 
 @contextmanager
 def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]], None]]:
-    """Show what the yielded function is told: a live table, or a line a second and vehicle where there is no terminal.
+    """Show snapshots of vehicles given to the yielded function: a live table, or a line each second without a terminal.
 
     A thread of its own draws, so whoever tells never waits, not even for a terminal that has stopped.
     """

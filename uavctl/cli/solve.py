@@ -1,4 +1,4 @@
-"""`uavctl solve`: one decision."""
+"""Command `uavctl solve`: one decision."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def solve(
 
 
 def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
-    """The state (n_x,) that a person typed.
+    """Parse a state (n_x,) that a person typed.
 
     Raises:
         UsageError: It is not n_x finite numbers.
@@ -68,7 +68,7 @@ def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
 
 
 def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
-    """The answer, for --json; what is infinite (no plan, no lower bound) is null."""
+    """Return the answer for --json; infinite values (no plan, no lower bound) are null."""
     return {
         "status": answer.status.value,
         "cost": answer.cost,
@@ -90,7 +90,7 @@ def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
 
 
 def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: float) -> RenderableType:
-    """The plan as a table, stage by stage, with its largest back-offs."""
+    """Return the plan as a table, stage by stage, with its largest back-offs."""
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
         hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
@@ -112,7 +112,7 @@ def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: f
 
 
 def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
-    """The plan, stage by stage: the columns of an axis stay together, and so do the back-offs."""
+    """Return the plan as a table, stage by stage; the columns of an axis stay together, and so do back-offs."""
     axes, count = design.plant.axes, len(answer.states)
     names = [*state_names(design.plant.n_x, axes), *(f"u_{axis[0]}" for axis in axes)]
     values = [*answer.states.T, *answer.inputs.T]
@@ -127,7 +127,7 @@ def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
 
 
 def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
-    """Names of the states, axis by axis: position, velocity, acceleration; plain numbers for other plants."""
+    """Return the names of the states, axis by axis: position, velocity, acceleration; numbers for other plants."""
     each, rest = divmod(n_x, len(axes))
     if rest or each > len("pva"):
         return [f"x{i}" for i in range(n_x)]
@@ -135,6 +135,6 @@ def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
 
 
 def _column(heading: str, values: Iterable[float], rows: int) -> Column:
-    """A column of figures, blank where there are fewer of them than `rows`."""
+    """Return a column of figures, blank where there are fewer of them than `rows`."""
     cells = [f"{value:.3f}" for value in values]
     return Column(heading, [*cells, *([""] * (rows - len(cells)))])

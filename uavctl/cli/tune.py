@@ -1,4 +1,4 @@
-"""Uavctl tune."""
+"""Command `uavctl tune`."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ _ROUNDING_S = 0.5
 
 
 class TuneEnd(StrEnum):
-    """What became of a flight, as far as the run goes on or not."""
+    """How a flight of a tuning run ended: whether the run can go on."""
 
     WHOLE = "whole"
     PILOT = "pilot"  # has taken over, and keeps the vehicle
@@ -98,7 +98,7 @@ class TuneEnd(StrEnum):
 
 @dataclass(frozen=True)
 class TuneFlown:
-    """A flight that was flown."""
+    """Recording, ending and figures of a flight that was flown."""
 
     summary: FlightSummary  # its figures
     recording: Path  # where it is
@@ -106,7 +106,7 @@ class TuneFlown:
 
 
 def fly_once(config: Config, out: Path, *, simulated: bool, take_off_m: float | None) -> TuneFlown:
-    """Fly a configuration's mission; the pilot's stick and Ctrl-C end it as any flight.
+    """Fly a configuration's mission once; the pilot's stick and Ctrl-C end it as any flight.
 
     Args:
         config: The configuration, mission in it.
@@ -126,7 +126,7 @@ def fly_once(config: Config, out: Path, *, simulated: bool, take_off_m: float | 
 
 
 def left_whole(config: Config, out: Path) -> Path | None:
-    """The recording in a folder, if it is of a whole flight of this very configuration; else None.
+    """Return the recording in a folder, if it is of a whole flight of this configuration; else None.
 
     One that was killed between the end of a flight and its note has left such a one.
     """
@@ -153,7 +153,7 @@ def _end(config: Config, summary: FlightSummary, recording: Path) -> TuneEnd:
 
 
 def _whole(config: Config, flight: FlightData) -> bool:
-    """Whether a flight came to its last place, and stayed there as long as it was to."""
+    """Return whether a flight reached its last place, and stayed there as long as it was to."""
     mission = config.mission
     if not mission.waypoints:
         return True  # it had no end to come to
@@ -170,7 +170,7 @@ def _whole(config: Config, flight: FlightData) -> bool:
 
 
 def where_it_stands(config: Config) -> Vec3:
-    """Listen to the cameras: where the vehicle is, the median of some positions, local NED [m].
+    """Return where the vehicle is by the cameras: the median of some positions, local NED [m].
 
     Heartbeats, TIMESYNC and requests for streams are sent, as before any flight: some sources speak to nobody else, and
     the clock of some is not known before they have answered. Nothing that moves is.
@@ -207,7 +207,7 @@ def where_it_stands(config: Config) -> Vec3:
 
 
 def _heard(link: MavlinkConnection, connection: Connection) -> Iterator[PositionSample]:
-    """The positions that have arrived; who sent them, or is the vehicle, is answered."""
+    """Return the positions that have arrived; answer the sources and the vehicle as a flight does."""
     for index, (data, at_ns) in enumerate(connection.receive()):
         found = link.receive(data, at_ns)
         if any(isinstance(one, VehicleStatus) for one in found):
@@ -228,7 +228,7 @@ def _enough(samples: list[PositionSample]) -> bool:
 
 
 def changes_picture(told: TunedResult) -> RenderableType:
-    """Old and new values, and how well both models predict what they were not fitted to."""
+    """Return tables of old and new values, and of both models' prediction errors on data they were not fitted to."""
     columns = error_columns(told.old_errors)
     return Group(
         _table("Configuration", CHANGE_COLUMNS, change_rows(told), frozenset({1, 2, 3})),
@@ -243,7 +243,7 @@ def changes_picture(told: TunedResult) -> RenderableType:
 
 
 def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
-    """How far the run has come."""
+    """Return tables of what the run has found so far."""
     parts: list[RenderableType] = []
     if progress.tuned is not None:
         parts += [Text(one) for one in story(progress.tuned, progress.comparison)]
@@ -356,7 +356,7 @@ def tune(
 
 
 def _says_plant(common: Common) -> bool:
-    """Whether somebody chose the simulated vehicle: a file or an override that names it."""
+    """Return whether a file or an override chose the simulated vehicle."""
     if any(one.replace(" ", "").startswith("sim.plant=") for one in common.overrides):
         return True
     path = Path(common.config)
@@ -370,7 +370,7 @@ def _names_plant(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Flights:
-    """What is flown."""
+    """Settings of both flights of a tuning run."""
 
     mission: Config  # the configuration with the mission of both flights
     box: SafeBox | None  # where they stay; None with a recording
@@ -413,7 +413,7 @@ class _Flights:
 
 
 class _TuneRun:
-    """The steps of a run, each of which is skipped where it is done."""
+    """Steps of a tuning run; a step that is done is skipped."""
 
     def __init__(self, folder: TuneFolder, config: Config, made: _Flights, *, yes: bool) -> None:
         self.folder = folder
@@ -422,7 +422,7 @@ class _TuneRun:
         self._yes = yes
 
     def go(self) -> tuple[int, str]:
-        """Take the steps that are left; returns the exit code, and why it stopped before the end."""
+        """Take the remaining steps; return the exit code, and why it stopped before the end."""
         for step in (self._excite, self._identify, self._refly, self._compare):
             code, why = step()
             if code:
@@ -498,7 +498,7 @@ class _TuneRun:
         return 0, ""
 
     def _errors(self, recording: Path) -> tuple[PredictionErrors, PredictionErrors]:
-        """What the old and the new configuration's plant predict of the second flight."""
+        """Return the prediction errors of the old and the new plant on the second flight."""
         history = from_records(read(recording))
         new = self._tuned()
         flown = flown_stretches(history, new)
@@ -517,7 +517,7 @@ class _TuneRun:
         return read_tuned(self.folder.path / TUNED)
 
     def _flown_before(self, config: Config, name: str) -> tuple[int, str] | None:
-        """Take up a flight that came to its end when nobody was left to note it; None if there is none."""
+        """Take up a flight that ended while nobody was left to note it; None if there is none."""
         newest = self.folder.newest(name)
         recording = None if newest is None else left_whole(config, newest)
         if recording is None:
@@ -566,7 +566,7 @@ def _stopped(flown: TuneFlown) -> tuple[int, str]:
 
 
 def agreed() -> bool:
-    """Ask the operator for Enter; without anybody there it is a no."""
+    """Ask the operator to press Enter; without anybody there the answer is no."""
     messages().print("Press Enter to fly, Ctrl-C to stop here.", soft_wrap=True)
     return bool(sys.stdin.readline())
 

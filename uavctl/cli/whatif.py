@@ -1,4 +1,4 @@
-"""Uavctl log whatif."""
+"""Command `uavctl log whatif`."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ _RATE = "source.rate_hz"
 
 
 def changed(before: Config, toml: str, flight: Path, config: str | None, overrides: Sequence[str]) -> LoadedConfig:
-    """The configuration that flies: the recording's, or another one in the recorded surroundings.
+    """Return the configuration that flies: the recording's, or another one in the recorded surroundings.
 
     Args:
         overrides: `key=value` each.
@@ -106,7 +106,7 @@ def changed(before: Config, toml: str, flight: Path, config: str | None, overrid
 
 
 def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
-    """Refuse a plant whose state is not that of the recording.
+    """Refuse a plant whose state differs in kind from that of the recording.
 
     Raises:
         UsageError: It is another one.
@@ -121,7 +121,7 @@ def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
 
 
 def plant_of(path: Path | None, before: Config) -> tuple[PlantConfig, str]:
-    """The plant that answers to other setpoints, and what it is called.
+    """Return the plant that responds to other setpoints, and its name.
 
     Raises:
         ConfigError: The file is no configuration.
@@ -135,7 +135,7 @@ def plant_of(path: Path | None, before: Config) -> tuple[PlantConfig, str]:
 
 
 def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
-    """A baseline in the place of the solver.
+    """Make a controller with a baseline in the place of the solver.
 
     Args:
         start: State (n_x,) that a PID is tuned from.
@@ -163,7 +163,7 @@ def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
 
 
 def _place(axes: Sequence[str], prepared: Prepared, target: Array) -> tuple[float, float, float]:
-    """Position of a target state, in local NED [m]."""
+    """Return the position of a target state, local NED [m]."""
     place = [0.0, 0.0, 0.0]
     for axis, index in zip(axes, prepared.controller.plant.position_index, strict=True):
         place[AXES.index(axis)] = float(target[index])
@@ -280,7 +280,7 @@ def whatif(
 
 
 def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
-    """Say why the reproduction may not be exact."""
+    """Warn why the reproduction may not be exact."""
     texts = [f"{text}: decisions may differ" for text in other_versions(recorded)]
     lost = max((one.dropped + one.refused for _, _, one in history.entries if isinstance(one, RecorderNote)), default=0)
     if lost:
@@ -299,7 +299,7 @@ def _progress() -> Iterator[Progress]:
 
 
 def _watch(progress: Progress, what: str) -> Watch:
-    """A bar for a flight through a recording's entries."""
+    """Show a progress bar of a flight through a recording's entries."""
 
     def watch(entries: Iterable[Entry]) -> Iterable[Entry]:
         return progress.track(entries, description=what)
@@ -308,13 +308,13 @@ def _watch(progress: Progress, what: str) -> Watch:
 
 
 def _start(history: RecordedFlight) -> NDArray[np.float64]:
-    """State (n_x,) in which the recorded flight began, as far as it is known."""
+    """Return the state (n_x,) in which the recorded flight began, as far as it is known."""
     flight = history.flight
     return np.array(flight.truths[0].state if flight.truths else flight.estimates[0].mean)
 
 
 def _link(given: tuple[str, ...], overrides: tuple[str, ...]) -> str:
-    """What the link is called that positions come over."""
+    """Return the name of the link that positions come over."""
     words = [text for text in given if "=" not in text]
     if not given:
         return CONFIGURED if any(text.strip().startswith("link.") for text in overrides) else RECORDED
@@ -325,14 +325,14 @@ def _link(given: tuple[str, ...], overrides: tuple[str, ...]) -> str:
 
 
 def _relinked(history: RecordedFlight, link: LinkConfig, seed: int | None) -> Relinked:
-    """Another link for the positions of a recording."""
+    """Make another link for the positions of a recording."""
     simulated, before = bool(history.flight.truths), history.config
     noise_m = before.sim.camera.noise_std_m if simulated else before.estimator.position_std_m
     return Relinked(history, link, before.sim.seed if seed is None else seed, noise_m)
 
 
 class _Memory:
-    """A sink that keeps everything, in order."""
+    """Sink that keeps all records, in order."""
 
     def __init__(self) -> None:
         self.entries: list[Entry] = []
@@ -342,7 +342,7 @@ class _Memory:
 
 
 def _reproduced(history: RecordedFlight, was: Prepared, response: Response, watch: Watch) -> tuple[Entry, ...]:
-    """The recorded flight again, nothing changed."""
+    """Fly the recorded flight again, with nothing changed."""
     memory = _Memory()
     memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
     fly(history, was.config, was.controller, response, memory, lambda: 0, watch=watch)
@@ -358,7 +358,7 @@ def _recorded(
     recorded: Header,
     watch: Watch,
 ) -> tuple[FlownCourse, RecorderStatus]:
-    """Fly what was changed, and record it; half of it would look like a shorter flight, so it is removed."""
+    """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
     recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(Views()))
     try:
         put_header(recorder, now, recorded.started_ns)

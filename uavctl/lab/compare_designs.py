@@ -68,7 +68,7 @@ def compare_gains(
         spec: What is asked for; its own gain may be one that no design can be made with.
         start: State (n_x,) whose cost is told.
         states: Number of seeded states in each set.
-        advance: Told what is done next: twice, and once for each of both sets' states and each design.
+        advance: Called with what is done next: twice, and once for each of both sets' states and each design.
 
     Raises:
         DesignError: No gain was found (see `synthesize`), or the target or the likelihoods are out of reach.
