@@ -247,5 +247,5 @@ def test_the_page_of_a_torn_recording_that_lost_records_comes_with_a_warning(
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(path.read_bytes()[:-3000])
     assert run(["log", "report", str(torn)]) == 0
-    told = capsys.readouterr().err
-    assert "torn" in told and told.count("\n") == 1
+    warning = capsys.readouterr().err
+    assert "torn" in warning and warning.count("\n") == 1

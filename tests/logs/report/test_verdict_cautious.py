@@ -136,7 +136,7 @@ def test_the_summary_says_in_words_which_it_is() -> None:
     def row(model: ModelVerdict) -> str:
         return dict(verdict_rows(msgspec.structs.replace(others, model=model)))["Model of the vehicle"]
 
-    said = (
+    said: tuple[tuple[str, set[str], float, float], ...] = (
         ("cautious", {"smaller"}, 0.8, 0.0),
         ("nothing", set(), 1.0, 0.0),
         ("refuted", {"larger"}, 1.3, 0.0),
