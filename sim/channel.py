@@ -72,7 +72,7 @@ class Channel:
     of `held` is kept until its end.
 
     Attributes:
-        counters: What happened so far.
+        counters: Counts of the packets so far.
 
     Args:
         link: The section `[link]`.

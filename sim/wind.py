@@ -100,7 +100,7 @@ class Wind:
         mean_mps: steady wind, the velocity of the air in NED.
         gust_wind_mps: wind speed at 20 ft that sets the gusts' intensity; 0 is none.
         height_m: height for which the gusts' scales are taken.
-        seed: of the gusts, which begin in their stationary distribution.
+        seed: seed of the gusts, which begin in their stationary distribution.
     """
 
     def __init__(

@@ -80,7 +80,7 @@ def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> boo
     """Return whether a file is still where it was made, and no shorter than what was written to it.
 
     Args:
-        opened: what it is, while it is open. Of a closed one some file systems (FAT) change the number.
+        opened: status of the file while it is open; of a closed file some file systems (FAT) change the number.
     """
     try:
         found = path.stat()
@@ -103,12 +103,12 @@ class RoomWatch:
     """Watch of the free space: tells when it gets low, when recording must pause, and when it may go on.
 
     Attributes:
-        low: less than `low_bytes` are free.
-        resting: there was less than `stop_bytes`, and has not been `low_bytes` since.
-        text: what is known, in words.
+        low: whether less than `low_bytes` are free.
+        resting: whether less than `stop_bytes` were free, and `low_bytes` have not been since.
+        text: the free space and what follows from it, in words.
 
     Args:
-        free: gives its free space [bytes]; None, which changes nothing, if that cannot be told.
+        free: gives a folder's free space [bytes]; None, which changes nothing, if that cannot be told.
     """
 
     def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:

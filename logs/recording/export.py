@@ -95,7 +95,7 @@ class _Parts:
     Args:
         mark: between the value's name and the part's key.
         parts: a value's parts by key.
-        forms: of the parts that each value has.
+        forms: forms of the parts that every value has.
         item: type of the parts that only some values have: as many as the longest list, the keys of any mapping.
     """
 

@@ -304,7 +304,7 @@ class _ChannelStream:
     """One channel as a stream of bytes.
 
     Args:
-        schema: Of its messages, if they have one.
+        schema: Schema of the channel's messages, if they have one.
         wanted: It was asked for, so it is read however little MAVLink is in it.
     """
 

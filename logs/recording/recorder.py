@@ -60,8 +60,8 @@ class DerivedTopics:
             returns at once and raises nothing.
 
     Attributes:
-        unseen: records of which no messages could be made; they are in the recording.
-        reason: of the newest one.
+        unseen: number of records that no messages for viewers could be made of; the recording has them.
+        reason: why, for the newest of them.
     """
 
     def __init__(self, views: ViewMaker | None = None, watch: Watcher | None = None) -> None:
@@ -126,7 +126,7 @@ class WriteQueue:
 
     Attributes:
         queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
-        views_due: the same, with the record's message, of records whose messages for viewers are not made yet.
+        views_due: records, with their messages, whose messages for viewers are not made yet.
         closed: no more records will come.
         finished: all that could be done is done.
 

@@ -132,7 +132,7 @@ class FieldNames:
     """Names and units of recorded fields, as far as they are known.
 
     Args:
-        plant: of the controller; its states and inputs have names.
+        plant: plant of the controller, whose states and inputs have names.
     """
 
     def __init__(self, plant: Plant) -> None:

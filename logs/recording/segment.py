@@ -312,13 +312,13 @@ class Rotation:
     Attributes:
         unwritten: topic, log time [ns] and message of what goes first into the next file.
         because: why the next file is begun.
-        number: of the file that is open, or comes next.
+        number: number of the file that is open, or comes next.
         written: messages so far, repeated ones included.
         at_ns: log time of the newest record.
         failures: failed writes.
-        reason: of the newest one, or why recording rests.
+        reason: reason of the newest failed write, or why recording pauses.
         gone: names of files that were written and are no longer there.
-        gone_records: that were in them.
+        gone_records: number of records in those files.
     """
 
     def __init__(

@@ -265,7 +265,7 @@ def decode(topic: str, data: bytes, at_ns: int) -> Record:
     """Decode the record of a message.
 
     Args:
-        at_ns: its log time, which is a datagram's time [ns].
+        at_ns: log time of the message, which is a datagram's time [ns].
 
     Raises:
         RecordingError: no such topic, or the bytes are no record of its type.

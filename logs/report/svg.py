@@ -199,7 +199,7 @@ def compact(path: str) -> str:
     """Return a path's straight lines in relative tenths of a point, a third of the bytes; curves stay as they are.
 
     Args:
-        path: As Matplotlib writes it: commands M, L and z with absolute places.
+        path: Path as Matplotlib writes it: commands M, L and z with absolute coordinates.
     """
     if _CURVES.search(path):
         return _shorten(path)

@@ -38,7 +38,7 @@ class Checks:
     """Pre-flight checks that change at random times, and spans in which the position is not valid.
 
     Args:
-        seed: of the times at which checks change.
+        seed: seed of the times at which checks change.
 
     Attributes:
         passing: whether what flickers passes, which counts while disarmed.
@@ -278,16 +278,16 @@ class Autopilot:
     """Simulated vehicle with the profile named by `config.sim.autopilot`; see `Pilot` for `airborne`.
 
     Args:
-        vehicle: what flies: the linear plant, or a vehicle with loops of its own.
-        seed: of the errors of inertial data.
+        vehicle: linear plant, or a vehicle with loops of its own.
+        seed: seed of the errors of inertial data.
 
     Attributes:
-        craft: what flies.
-        parameters: its parameters.
-        estimator: its estimate.
-        inertial: its inertial sensors.
-        pilot: its state machine.
-        telemetry: its streams.
+        craft: the vehicle that flies.
+        parameters: parameters of the autopilot.
+        estimator: estimator of position and velocity.
+        inertial: inertial sensors.
+        pilot: state machine of modes and phases.
+        telemetry: telemetry streams.
         text: the last STATUSTEXT that it sent, empty before the first.
         steered_by: (system, component) id of whom the last setpoint that counts came from, None before the first.
     """

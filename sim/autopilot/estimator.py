@@ -40,7 +40,7 @@ class Estimator:
 
     Args:
         kind: PX4 or ArduCopter.
-        age_ns: how old PX4 takes a stamp to be, by the clock of who sent it; of (stamp, time) [ns].
+        age_ns: function of (stamp, time) [ns]: the age that PX4 takes a stamp to have, by the sender's clock [ns].
 
     Attributes:
         valid: whether its position may count as valid, whatever is known of it.

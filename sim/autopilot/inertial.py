@@ -90,7 +90,7 @@ class GaussMarkov:
     """First-order Gauss-Markov process, moved on exactly by any time.
 
     Attributes:
-        value: its present value.
+        value: present value of the process.
     """
 
     def __init__(self, time_s: float) -> None:

@@ -53,7 +53,7 @@ def interpret(kind: SimulatedProfile, msg: Any, place_m: Vec3, attitude: Quatern
 
     Args:
         place_m: where the vehicle believes to be; offsets count from there.
-        attitude: of the vehicle; body axes are turned by it.
+        attitude: attitude of the vehicle, by which setpoints in body axes are turned.
     """
     return _px4(kind, msg, attitude) if kind.name == "px4" else _ardupilot(kind, msg, place_m, attitude)
 

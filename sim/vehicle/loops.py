@@ -354,7 +354,7 @@ class Cascade:
         """Take a step in the air; return the lean to take now.
 
         Args:
-            motion: of the vehicle, as its loops see it.
+            motion: motion of the vehicle, as its loops see it.
             thrust_limited: whether the rotors could not give the thrust of the last step.
             fall_mps2: downward acceleration in the last step, as accelerometers feel it.
         """

@@ -90,7 +90,7 @@ class BatteryModel:
 
     Attributes:
         voltage_v: at the terminals, under the last load.
-        current_a: of the last load.
+        current_a: current of the last load [A].
         used_c: charge used.
     """
 
@@ -284,7 +284,7 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
     need them pushed back to unit norm in every step, which is an error of the method's own size.
 
     Args:
-        wrenches: of the rotors, at the start, the middle and the end of the step.
+        wrenches: wrenches of the rotors at the start, the middle and the end of the step.
         wind: velocity of the air in NED, held over the step [m/s].
         h: length of the step [s].
     """
@@ -344,7 +344,7 @@ class Rotors:
         speeds_rps: present speeds.
         commands_rps: speeds that they tend to.
         thrust_limited: whether the last command gave more or less thrust than was wanted.
-        torque_limited: the same of the torque.
+        torque_limited: whether the last command gave more or less torque than was wanted.
     """
 
     def __init__(self, airframe: Airframe, step_s: float) -> None:

@@ -328,7 +328,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
     """Read the recording back, summarise it and have its page drawn; a page that fails is only reported.
 
     Args:
-        path: of the recording, which is closed.
+        path: path of the recording, which is closed.
         wall_s: how long the flight took [s].
         ending: how the flight ended, in the words of those who flew; None where nobody did.
 
@@ -360,8 +360,8 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
     """Write the page of a recording in a process of its own, so that matplotlib is not loaded where it flies.
 
     Args:
-        path: of the recording.
-        summary: of the flight, as the console tells it.
+        path: path of the recording.
+        summary: summary of the flight, as the console shows it.
         page: where it is written.
 
     Raises:

@@ -154,7 +154,7 @@ def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ..
     """Return the packets of another program's recording, None if it is one of ours; say what was left out.
 
     Args:
-        topics: Of an MCAP: those to take; all that hold MAVLink if none is named.
+        topics: Topics of an MCAP to take; all that hold MAVLink if none is named.
 
     Raises:
         RecordingError: It cannot be read, or holds no MAVLink.

@@ -65,7 +65,7 @@ def compare_gains(
     """Synthesise the terminal gain, make a design with it, and compare it with the configured one.
 
     Args:
-        spec: What is asked for; its own gain may be one that no design can be made with.
+        spec: Specification of the design; its own gain may be one that no design can be made with.
         start: State (n_x,) whose cost is told.
         states: Number of seeded states in each set.
         advance: Called with what is done next: twice, and once for each of both sets' states and each design.

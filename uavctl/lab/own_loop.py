@@ -93,7 +93,7 @@ class OwnLoop:
     """Lets a vehicle fly by its own position loop; implements `uavctl.records.Flyer`.
 
     Attributes:
-        relay: What of them was passed on, and why others were not.
+        relay: Relay that passes the positions on; it counts them, and the others with the reason.
     """
 
     config: Config

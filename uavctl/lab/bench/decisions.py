@@ -132,7 +132,7 @@ def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tupl
     """Yield state (n_x,), target (n_x,) and outlook, drawn within the limits of position and input.
 
     Args:
-        solver: Who is asked; all its axes have limits of position and input.
+        solver: Solver to ask; all its axes have limits of position and input.
     """
     problem, rng = solver.problem, np.random.default_rng(seed)
     plant, noise = problem.plant, solver.seen.e @ solver.seen.w @ solver.seen.e.T

@@ -218,7 +218,7 @@ def run_loop_bench(
 
     Args:
         options: the command line that gives this configuration: --config and --set.
-        told: what is done, how many runs are, of how many.
+        told: called with what is measured, the number of runs done, and of how many.
 
     Raises:
         UavctlError: a daemon did not fly.

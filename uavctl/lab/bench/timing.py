@@ -150,8 +150,8 @@ def timed(cases: Sequence[Case], runs: int, told: Callable[[int], None] = lambda
     """Time several solvers, run by run in turns, so that the machine's other load affects all of them alike.
 
     Args:
-        cases: What is timed; a few states of each are asked before.
-        runs: How often; a state's time is the median.
+        cases: Solvers with their questions; a few states of each are asked before.
+        runs: Number of runs; a state's time is their median.
         told: Called with the number of decisions done, after each.
     """
     for case in cases:

@@ -307,7 +307,7 @@ class BaselineSolver:
     """Baseline in the form of a solver; implements `uavctl.smpc.answer.Solver`.
 
     Args:
-        name: What plans say that they were found by.
+        name: Method that plans name.
         make: Makes the problem and the controller that fly to a target (n_x,).
     """
 

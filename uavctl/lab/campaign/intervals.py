@@ -76,7 +76,7 @@ def bootstrap_mean(values: Array, level: float = LEVEL, seed: int = 0) -> Pair:
 
     Args:
         values: Independent values (N,).
-        seed: Of the resampling; the same values give the same interval.
+        seed: Seed of the resampling; the same values give the same interval.
 
     Raises:
         UsageError: There are no values.

@@ -45,8 +45,8 @@ def legend(entries: Iterable[tuple[MarkerStyle, str]], limit: str = "", cross: s
     """Return a legend as HTML.
 
     Args:
-        limit: What a dashed line is; none where it is empty.
-        cross: What a cross instead of a marker is; none where it is empty.
+        limit: Meaning of a dashed line; empty without one.
+        cross: Meaning of a cross instead of a marker; empty without one.
     """
     items = [(_swatch(look), text) for look, text in entries]
     if limit:

@@ -176,7 +176,7 @@ class PositionFilter:
     since its capture are filtered again: the numbers are the same as if all had come in order.
 
     Args:
-        sight: What is believed of the positions.
+        sight: Plant and noise assumed of the positions.
         known: Step (N, T) that knows the position of each step first, T or more where none does; the first position of
             all is known at once.
     """
@@ -298,7 +298,7 @@ def fly(
     Args:
         newest: Capture step of the newest position known in each step (N, T), see `links.newest`.
         disturbances: w (N, T, n_w).
-        seen: What the controller is told; None: the state, exactly.
+        seen: Filter and noise of measured positions; None: the controller knows the exact state.
     """
     plant, (runs, steps) = scene.plant, newest.shape
     states, inputs = np.zeros((runs, steps + 1, plant.n_x)), np.zeros((runs, steps, plant.n_u))

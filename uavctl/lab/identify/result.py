@@ -205,7 +205,7 @@ def identify(history: FlightHistory, config: Config, advance: Callable[[], None]
     """Identify plant and link of a flight.
 
     Args:
-        config: What the result is put into; its kind of plant, axes and Δt are kept.
+        config: Configuration that the result goes into; its kind of plant, axes and Δt are kept.
         advance: Called as often as `fits_of` says.
 
     Raises:

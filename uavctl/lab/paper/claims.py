@@ -151,7 +151,7 @@ def claims_of(result: VariantResult, loss: float, horizon: int, delta_x: float, 
     """Return all claims about the runs.
 
     Args:
-        result: What the runs came to; its own claims are not read.
+        result: Result of the runs; its own claims are not read.
         loss: q = 1 - p.
     """
     return [

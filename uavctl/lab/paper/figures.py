@@ -44,7 +44,7 @@ def trajectories_svg(states: Array, design: Design) -> str:
 
     Args:
         states: Trajectories (N, T+1, n_x).
-        design: What flew: its limits, and the terminal set.
+        design: Design that flew, for its limits and its terminal set.
     """
     plant, tau = design.plant, design.terminal.tau
     names = dict(zip(plant.axes, _NAMES, strict=False))
@@ -104,7 +104,7 @@ def ages_svg(ages: Counts, link: AgeReference) -> str:
 
     Args:
         ages: Runs of each age in each step (T, T).
-        link: What the link and the design are.
+        link: Link and design that the ages are compared with.
     """
     runs = int(ages[0].sum())
     with canvas("ages", _HEIGHT_IN, _WIDTH_IN) as one:

@@ -123,7 +123,7 @@ def held_out_errors(
     Args:
         places: 0 north, 1 east, 2 down.
         models: The plant of each; what is pinned is not fitted.
-        dead_time_s: As a fit has it [s].
+        dead_time_s: Dead time as fitted [s].
         dt_s: One step [s].
     """
     times, both = (dt_s, *AHEAD_S), halves(flown)
@@ -220,7 +220,7 @@ def tuned(config: Config, found: Identification) -> Tuned:
     """Return the configuration with what a flight shows well.
 
     Args:
-        found: What was identified from the flight.
+        found: Identification from the flight.
     """
     ramp_s, names = found.result.ramp_s, config.plant.axes
     where, dt_s = [AXES.index(name) for name in names], config.plant.dt_s

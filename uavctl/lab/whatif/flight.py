@@ -61,7 +61,7 @@ class Departure:
     """Difference δ of state and input from the recorded flight, from the first difference of the setpoints on.
 
     Args:
-        response: How the vehicle answers to a difference of the setpoints.
+        response: Response of the vehicle to a difference of the setpoints.
     """
 
     def __init__(self, response: Response) -> None:
@@ -283,8 +283,8 @@ def fly(
     """Fly a recorded flight again, with something changed.
 
     Args:
-        config: What flies in it now; connections, frame and source are those of the recording.
-        response: How the vehicle answers to setpoints that differ from the recorded ones.
+        config: Configuration that flies; connections, frame and source are those of the recording.
+        response: Response of the vehicle to setpoints that differ from the recorded ones.
         sink: Gets what a recording of this flight holds, but for its header.
         stopwatch: Time for the timing records [ns].
         other: The link that positions come over; else they come when they came.
@@ -457,7 +457,7 @@ class Relinked:
     """Positions of a recording over a simulated link; implements `OtherLink`.
 
     Args:
-        seed: Of what it loses, and of the noise of positions that the recording lacks.
+        seed: Seed of the losses, and of the noise of positions that the recording lacks.
         noise_m: Standard deviation of that noise, each axis [m].
 
     Raises:

@@ -139,7 +139,7 @@ class InertialFrames:
         """Take a frame of the vehicle's connection; return its replacement: itself, another one, or none.
 
         Args:
-            at_ns: Its arrival [ns].
+            at_ns: Arrival of the frame [ns].
             by_mps2: How much more the vehicle accelerates then, local NED; None before the courses part.
         """
         samples = [
