@@ -54,7 +54,7 @@ class _Fate(NamedTuple):
     """Fate of a packet: lost, delayed, doubled, damaged."""
 
     lost: bool
-    delays_s: tuple[float, ...]  # of it, and of its duplicate
+    delays_s: tuple[float, ...]  # delay of the packet, and of its duplicate
     data: bytes
     corrupted: bool
     truncated: bool

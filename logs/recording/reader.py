@@ -53,7 +53,7 @@ class RecordedMessage(NamedTuple):
     sequence: int
     at_ns: int
     data: bytes
-    offset: int  # of its chunk in the file
+    offset: int  # offset of its chunk in the file
     repeated: bool = False  # header or library, once more, at the start of a later segment
 
 

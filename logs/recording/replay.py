@@ -122,7 +122,7 @@ class FieldDivergence(msgspec.Struct, frozen=True, kw_only=True):
     entry: str  # of a vector: the one that differs most, in words
     unit: str  # of that
     differing: int  # records in which it differs
-    records: int  # of its topic, from the first difference on
+    records: int  # records of the field's topic, from the first difference on
     first_s: float  # of the flight
     largest: float | None  # difference; None of what is no number
     largest_s: float | None

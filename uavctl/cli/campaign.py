@@ -165,8 +165,8 @@ class _Given(Generic[S]):
     """A campaign of either world, ready to fly."""
 
     name: str  # its name
-    text: str  # of its file
-    schema: pyarrow.Schema  # of its table of runs
+    text: str  # text of the campaign's file
+    schema: pyarrow.Schema  # schema of the table of runs
     # Makes what `campaign.json` holds, and all tasks
     prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
     write: Callable[[Path], Path]  # writes the page into a folder

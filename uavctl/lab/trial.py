@@ -138,7 +138,7 @@ class TrialPilot:
 
     name: str  # what it is called
     config: str = "room"  # preset or file that it is made from; what messages call it, where there is a text
-    overrides: tuple[str, ...] = ()  # of it
+    overrides: tuple[str, ...] = ()  # overrides of that configuration
     own: OwnTuning | None = None  # how the vehicle is set up that flies by its own position loop; None where ours flies
     knows_link: bool = False  # whether it is designed for the link that it meets; else for that of its configuration
     text: str = ""  # TOML text that it is made from instead, for who has not the file; empty for none
@@ -428,11 +428,11 @@ class FlightTally:
 
     begun_ns: int | None = None  # time of the first decision with somewhere to go to; None before
     setpoints: int = 0  # that were sent
-    limited: int = 0  # of them, that the last gate changed
+    limited: int = 0  # setpoints that the last gate changed
     plans: int = 0  # that were made
-    gave_way: int = 0  # of them, that a constraint gave way in
+    gave_way: int = 0  # plans in which a constraint gave way
     ticks: int = 0  # from the first such decision on
-    fallen: int = 0  # of them, in which no plan was flown
+    fallen: int = 0  # ticks in which no plan was flown
     positions: int = 0  # that ticks were given
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:

@@ -48,7 +48,7 @@ class CampaignView:
 
     results: Results  # the campaign
     cells: list[CellSummary]  # the figures of its cells
-    groups: dict[Group, list[CellSummary]]  # they by link, disturbance and plant
+    groups: dict[Group, list[CellSummary]]  # cells by link, disturbance and plant
     verdicts: list[CampaignVerdict]  # each SMPC against the baselines of its group
     looks: Looks  # how controllers are drawn
 

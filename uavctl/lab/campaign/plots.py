@@ -179,7 +179,7 @@ class Quantity:
 
     key: str  # in the figure's id
     title: str  # of the figure
-    label: str  # of its axis
+    label: str  # label of its axis
     # The figure of a cell and its interval; None where it has none
     value: Callable[[CellSummary], tuple[float | None, Pair | None]]
     # The share that a cell's design allows; None where that is no matter

@@ -36,8 +36,8 @@ class Cell:
     index: int  # its number
     names: tuple[str, str, str, str]  # of controller, link, disturbance and plant
     kind: str  # kind of the controller
-    setting: Setting  # what its runs meet
-    recipe: Recipe | None  # who flies them; None if there is no such controller
+    setting: Setting  # plant, link and disturbance of its runs
+    recipe: Recipe | None  # recipe of its controller; None if there is no such controller
     refused: str  # why not
 
 

@@ -164,7 +164,7 @@ class FilterBelief:
 
     plant: Plant  # the plant that it believes in
     position_std_m: float  # standard deviation of a position, each axis [m]
-    initial_std: float  # the same of the states that the first position does not show
+    initial_std: float  # standard deviation of the states that the first position does not show
 
 
 class PositionFilter:
@@ -282,8 +282,8 @@ class Flown:
 class MeasuredPositions:
     """Filter and noise of N runs in which positions alone are measured."""
 
-    filter: PositionFilter  # makes states of them
-    noise: Array  # theirs (N, T, n_axes) [m]
+    filter: PositionFilter  # estimates states from the positions
+    noise: Array  # noise of the positions (N, T, n_axes) [m]
 
 
 def fly(

@@ -490,7 +490,7 @@ class Variant:
 
     tau: int  # τ
     overrides: tuple[str, ...]  # what is changed in preset `paper`
-    note: str  # what it is, and why it is made so
+    note: str  # the reading in words, with its reason
 
 
 PRINTED = Variant(4, (), "τ = 4 as printed, d_t = τ + 1 = 5, likelihoods by (6)")
