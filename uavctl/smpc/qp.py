@@ -46,6 +46,7 @@ class QuadraticProgram:
         curve: Quadratic price (m,): leaving by s costs price·s + curve·s².
         tolerance: Of feasibility, primal and dual.
         most: Iterations after which a solve gives up.
+        linear: Whether questions bring an f. Where none ever does, f is zero and new sides are no product with it.
     """
 
     def __init__(
@@ -57,12 +58,14 @@ class QuadraticProgram:
         curve: Array,
         tolerance: float = TOLERANCE,
         most: int = _MOST_ITERATIONS,
+        linear: bool = True,
     ) -> None:
         self.sense = sense  # DAQP's state of each row (m,)
         self.iterations = 0  # of the last solve
         model = daqp.Model()
         sides = np.full(a.shape[0], OPEN)
-        model.setup(h, np.zeros(h.shape[0]), a, sides, -sides, sense)  # the soft rows fix the workspace
+        f = np.zeros(h.shape[0]) if linear else None
+        model.setup(h, f, a, sides, -sides, sense)  # the soft rows fix the workspace
         model.settings = {"primal_tol": tolerance, "dual_tol": tolerance, "eps_prox": 0.0, "iter_limit": most}
         rho = 0.5 / np.maximum(curve, LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
         model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)

@@ -153,6 +153,7 @@ class PartProgram:
             np.where(soft, problem.slack_linear, 0.0),
             np.where(soft, problem.slack_quadratic, 0.0),
             most=MOST_ITERATIONS,
+            linear=False,
         )
         suits = FirstRows.suits(*by_stage, len(d))
         self._first = FirstRows(*by_stage, self._program.sense).of if suits else self._ramps
