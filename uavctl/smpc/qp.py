@@ -139,8 +139,12 @@ class FirstRows:
         # From the unit of the rows of the input set to that of the slew row.
         self._inputs = slice(last, None, width) if width > 1 else None
         self._unit = of_u[0, -1, 0] / of_u[0, 0, 0]
-        self._of_z = np.asfortranarray(of_x[:, direction])
+        of_z = np.asfortranarray(of_x[:, direction])
         self._z, self._reach = inverse, np.ascontiguousarray(by_slew[direction])
+        # Their first columns, by how many: a product with a part of a matrix would begin with a copy of it.
+        counts = range(len(of_x) + 1)
+        self._of_z = [np.ascontiguousarray(of_z[:, :count]) for count in counts[:-1]] + [of_z]
+        self._reached = [np.ascontiguousarray(self._reach[:, :count]) for count in counts]
 
     @staticmethod
     def suits(of_x: Array, of_u: Array, slews: int) -> bool:
@@ -153,41 +157,36 @@ class FirstRows:
     def of(self, upper: Array, lower: Array) -> Sense | None:
         """`sense` with the rows to begin with, by the sides (m,) of all rows; None: with none."""
         fast, slow = upper[self._slews], lower[self._slews]
-        high, low = upper[self._states], lower[self._states]
-        braked, pushed = self._reach.dot(slow), self._reach.dot(fast)
-        over, under = braked > high, pushed < low
-        if np.count_nonzero(over) or (fast[0] < 0.0 and not np.count_nonzero(under)):
-            cap = None if self._inputs is None else upper[self._inputs]
-            return self._begin(fast, slow, high, cap, braked, over, ACTIVE, BELOW)
-        if np.count_nonzero(under) or slow[0] > 0.0:
-            cap = None if self._inputs is None else -lower[self._inputs]
-            return self._begin(-slow, -fast, -low, cap, -pushed, under, BELOW, ACTIVE)
+        braked = self._reach.dot(slow)
+        over = braked > upper[self._states]
+        if np.count_nonzero(over):
+            return self._begin(upper, lower, braked, over, ACTIVE, BELOW)
+        pushed = self._reach.dot(fast)
+        under = pushed < lower[self._states]
+        if np.count_nonzero(under):
+            return self._begin(-lower, -upper, -pushed, under, BELOW, ACTIVE)
+        if fast[0] < 0.0:
+            return self._begin(upper, lower, braked, None, ACTIVE, BELOW)
+        if slow[0] > 0.0:
+            return self._begin(-lower, -upper, -pushed, None, BELOW, ACTIVE)
         return None
 
     def _begin(
-        self,
-        fast: Array,
-        slow: Array,
-        high: Array,
-        cap: Array | None,
-        braked: Array,
-        over: Flags,
-        towards: int,
-        against: int,
+        self, upper: Array, lower: Array, braked: Array, over: Flags | None, towards: int, against: int
     ) -> Sense:
         """Rows of a plan that goes upwards, after it has braked while state rows give way.
 
         Args:
-            fast: Upper sides of the slew rows (H,).
-            high: Upper sides of the state rows (H,).
-            cap: Upper sides of the input rows (H,); None: there are none.
-            braked: State rows by `slow` (H,).
-            over: Those that give way (H,).
+            upper: Upper sides of all rows (m,).
+            lower: Lower sides (m,).
+            braked: State rows (H,) by the lower sides of the slew rows.
+            over: Those that give way (H,); None: none does.
             towards: DAQP's state of a row at its upper side.
         """
+        fast, slow, high = upper[self._slews], lower[self._slews], upper[self._states]
         begin, since = self._sense.copy(), 0
         slews, states = begin[self._slews], begin[self._states]
-        if np.count_nonzero(over):
+        if over is not None:
             since = _last(over) + 1
             states[over] += towards
             slews[:since] += against
@@ -200,27 +199,30 @@ class FirstRows:
         if there[0]:
             return begin
         count = since + (int(there.argmax()) or there.size)
-        left = self._of_z[since:, :count].dot(z[:count]) > high[since:]
+        left = self._of_z[count][since:].dot(z[:count]) > high[since:]
         if not np.count_nonzero(left):
             slews[since:count] += towards
             return begin
         # That leaves a state row: as long as it can still be kept, and back.
         ramp = fast.cumsum()
-        top = ramp if cap is None else np.minimum(ramp, cap * self._unit)
+        top = ramp if self._inputs is None else np.minimum(ramp, upper[self._inputs] * self._unit)
         gain = top - slow
         gain[1:] -= top[:-1]
-        room, reach = (high - braked)[since:], self._reach[since:]
+        room, taken = (high - braked)[since:], None
         # Where the regulator asks for no more is a good first try.
         middle, count, beyond = count, since, self._steps + 1
         while beyond - count > 1:
-            if np.count_nonzero(reach[:, :middle].dot(gain[:middle]) > room):
+            tried = self._reached[middle][since:].dot(gain[:middle])
+            if np.count_nonzero(tried > room):
                 beyond = middle
             else:
-                count = middle
+                count, taken = middle, tried
             middle = (count + beyond) // 2
-        nearest = since + int((room - reach[:, :count].dot(gain[:count])).argmin())
+        if taken is None:
+            taken = self._reached[since][since:].dot(gain[:since])
+        nearest = since + int((room - taken).argmin())
         slews[since:count] += towards
-        if cap is not None:
+        if self._inputs is not None:
             capped = ramp[since:count] > top[since:count]
             if np.count_nonzero(capped):
                 slews[since:count][capped] -= towards
