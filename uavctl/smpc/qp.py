@@ -125,7 +125,7 @@ class FirstRows:
     Args:
         of_x: State rows (H, d, n) by z.
         of_u: Rows (H, k, n) of a stage by z: those of the input set, then the slew row.
-        sense: DAQP's state of all rows: those of `of_x`, stage after stage, then those of `of_u`.
+        sense: DAQP's state of all rows: those of `of_x`, stage after stage, all alike, then those of `of_u`, all alike.
     """
 
     def __init__(self, of_x: Array, of_u: Array, sense: Sense) -> None:
@@ -139,6 +139,7 @@ class FirstRows:
         # From the unit of the rows of the input set to that of the slew row.
         self._inputs = slice(last, None, width) if width > 1 else None
         self._unit = of_u[0, -1, 0] / of_u[0, 0, 0]
+        self._soft, self._hard = int(sense[0]), int(sense[last])
         of_z = np.asfortranarray(of_x[:, direction])
         self._z, self._reach = inverse, np.ascontiguousarray(by_slew[direction])
         # Their first columns, by how many: a product with a part of a matrix would begin with a copy of it.
@@ -188,8 +189,8 @@ class FirstRows:
         slews, states = begin[self._slews], begin[self._states]
         if over is not None:
             since = _last(over) + 1
-            states[over] += towards
-            slews[:since] += against
+            states[over] = self._soft + towards
+            slews[:since] = self._hard + against
             if since == self._steps:
                 return begin
             fast = np.concatenate([slow[:since], fast[since:]])
@@ -201,13 +202,13 @@ class FirstRows:
         count = since + (int(there.argmax()) or there.size)
         left = self._of_z[count][since:].dot(z[:count]) > high[since:]
         if not np.count_nonzero(left):
-            slews[since:count] += towards
+            slews[since:count] = self._hard + towards
             return begin
         # That leaves a state row: as long as it can still be kept, and back.
-        ramp = fast.cumsum()
+        ramp = np.add.accumulate(fast)
         top = ramp if self._inputs is None else np.minimum(ramp, upper[self._inputs] * self._unit)
         gain = top - slow
-        gain[1:] -= top[:-1]
+        np.subtract(gain[1:], top[:-1], out=gain[1:])
         room, taken = (high - braked)[since:], None
         # Where the regulator asks for no more is a good first try.
         middle, count, beyond = count, since, self._steps + 1
@@ -221,17 +222,17 @@ class FirstRows:
         if taken is None:
             taken = self._reached[since][since:].dot(gain[:since])
         nearest = since + int((room - taken).argmin())
-        slews[since:count] += towards
+        slews[since:count] = self._hard + towards
         if self._inputs is not None:
             capped = ramp[since:count] > top[since:count]
             if np.count_nonzero(capped):
-                slews[since:count][capped] -= towards
-                begin[self._inputs][since:count][capped] += towards
-        slews[count + 1 : nearest + 1] += against
+                slews[since:count][capped] = self._hard
+                begin[self._inputs][since:count][capped] = self._hard + towards
+        slews[count + 1 : nearest + 1] = self._hard + against
         # Along the row it takes longer than past it.
         end = since + _last(left) + 1
         end += int(_LONGER * (end - nearest))
-        states[nearest + 1 : end : _EVERY] += towards + KEEPS
+        states[nearest + 1 : end : _EVERY] = self._soft + towards + KEEPS
         return begin
 
 

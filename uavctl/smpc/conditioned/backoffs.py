@@ -161,14 +161,16 @@ def shifted(
     kept *= _KEEPS
     kept += backoff
     np.minimum(kept, np.maximum(backoff, away * sigma), out=kept)
-    kept *= np.isfinite(budgets)[:, None]
+    asked = np.isfinite(budgets)
+    if np.count_nonzero(asked) < asked.size:
+        kept *= asked[:, None]
     risk = spent(kept, sigma)
-    risk *= ~binds
-    count = np.add.reduce(binds, axis=1)
+    np.putmask(risk, binds, 0.0)
+    count = binds.dot(np.ones(binds.shape[1]))
     left = budgets - np.add.reduce(risk, axis=1)
-    share = quantile(left / np.maximum(count, 1))
-    np.copyto(kept, share[:, None] * sigma, where=binds)
-    return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0, kept, backoff)
+    share = quantile(left / np.maximum(count, 1.0))
+    np.putmask(kept, binds, share[:, None] * sigma)
+    return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0.0, kept, backoff)
 
 
 # Distances that plans with risk conditioned on the age keep from a limit that they rest at.

@@ -38,6 +38,7 @@ from uavctl.smpc.conditioned.backoffs import (
     PRICE,
     AgeRisk,
     Deviations,
+    Flags,
     age_risk,
     binding,
     equal_risk,
@@ -65,7 +66,6 @@ MOST_ROUNDS = (
     3  # of one whose plan does not keep its back-offs: between two walls of a narrow room half of them need it
 )
 MOST_SHIFTING = 300  # iterations of all programs so far, above which no more risk is shifted
-_OPEN = np.array([OPEN])
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +159,10 @@ class ConditionedSolver:
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
+        # Rooms of all rows less their back-offs, as programs take them, and which of them are of state rows (H, m).
+        self._rooms = np.full(width * steps + hard + 1, OPEN)
+        self._rooms_x = self._rooms[: width * steps].reshape(steps, width)
+        self._taken = np.zeros((steps, width))  # of the room of state rows, by the plans of all parts so far
         many = len(self._parts)
 
         def spread(risk: AgeRisk) -> _Spread:
@@ -194,7 +198,7 @@ class ConditionedSolver:
 
     def risk_towards(self, target: Array, outlook: Preview = NOMINAL) -> AgeRisk:
         """The spread of a plan towards `target` (n_x,): by the target, the limits and whether there is a motion."""
-        return self._towards(target, self._limits(outlook), outlook).risk
+        return self._towards(self._placed.dot(target[self._rests.held]), self._limits(outlook), outlook).risk
 
     def rests(self) -> Array:
         """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do."""
@@ -207,8 +211,9 @@ class ConditionedSolver:
         if not finite(x, target, outlook):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         limits = self._limits(outlook)
-        margins = self._margins(self._towards(target, limits, outlook), outlook)
-        reference = self._reference(target, limits)
+        placed = self._placed.dot(target[self._rests.held])
+        margins = self._margins(self._towards(placed, limits, outlook), outlook)
+        reference = self._reference(target, placed, limits)
         hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
         first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
         dx = x - reference
@@ -263,14 +268,18 @@ class ConditionedSolver:
             limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
         return limits
 
-    def _towards(self, target: Array, limits: Array, outlook: Preview) -> _Spread:
-        """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides."""
+    def _towards(self, placed: Array, limits: Array, outlook: Preview) -> _Spread:
+        """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides.
+
+        Args:
+            placed: The rows that places of rest are in, at the target.
+        """
         if outlook.path is not None:
             return self._near
         kept = self._plain_far
         if limits is not self._b:
             kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._resting]
-        return self._transit if (self._placed.dot(target[self._rests.held]) <= kept).all() else self._near
+        return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
 
     def _margins(self, spread: _Spread, outlook: Preview) -> _Margins:
         """Return the margins of an outlook; the last ones are cached, by the exact bits that they are made of."""
@@ -280,14 +289,13 @@ class ConditionedSolver:
             self._last = key, _Margins(sigma, spread.budgets[late], spread.shared[late] * sigma, spread.distant[late])
         return self._last[1]
 
-    def _reference(self, target: Array, limits: Array) -> Array:
+    def _reference(self, target: Array, placed: Array, limits: Array) -> Array:
         """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
         sides, kept = limits, self._plain_near
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
             kept = (sides - self._near.rest[0])[self._resting]
-        short = self._placed.dot(target[self._rests.held]) > kept
-        count = np.count_nonzero(short)
+        count = np.count_nonzero(placed > kept)
         if not count:
             return target
         reference, rest = np.array(target), self._near.rest[min(int(count), len(self._parts)) - 1]
@@ -329,6 +337,8 @@ class ConditionedSolver:
         todo = [
             one for one in self._parts if np.count_nonzero(tight[one.hard]) or np.count_nonzero(over[:, one.columns])
         ]
+        self._rooms[room.size : -1] = hard
+        self._taken.fill(0.0)
         left: dict[PartProgram, Array] = {}
         found, now = None, room
         iterations = 0
@@ -340,19 +350,19 @@ class ConditionedSolver:
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
                 if not todo or iterations > MOST_SHIFTING:
                     break
-                stages = np.logical_or.reduce(binds, axis=1).nonzero()[0]
-                span = slice(int(stages[0]), int(stages[-1]) + 1)
+                span = _stages(binds)
                 backoff = backoff.copy()
                 backoff[span] = shifted(backoff[span], now[span], sigma[span], budgets[span], binds[span])
-            rooms = np.concatenate([(room - backoff).ravel(), hard, _OPEN])
-            left, now = dict(left), now.copy()
+            np.subtract(room, backoff, out=self._rooms_x)
+            left = dict(left)
             for one in todo:
-                z = one.solve(rooms, again=number > 0)
+                z = one.solve(self._rooms, again=number > 0)
                 iterations += one.iterations
                 if z is None:
                     return found
                 left[one] = z
-                one.leave(z, room, now)
+                one.leave(z, self._taken)
+            now = room - self._taken
             found = _Found(tuple(left.items()), backoff, now, iterations)
         return found
 
@@ -394,6 +404,12 @@ class ConditionedSolver:
             return inside(inputs, self.problem.input_set.c, self.problem.input_set.b)
         cut: Array = np.minimum(np.maximum(inputs, self._low), self._high)
         return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
+
+
+def _stages(flags: Flags) -> slice:
+    """From the first stage in which a row has its flag (H, m) to the last one; there is one."""
+    rows, each = flags.ravel(), flags.shape[1]
+    return slice(int(rows.argmax()) // each, (rows.size - 1 - int(rows[::-1].argmax())) // each + 1)
 
 
 class ConditionedDecider:

@@ -170,10 +170,9 @@ class PartProgram:
         room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
         room_u[self.hard] -= self._u_of_z @ z
 
-    def leave(self, z: Array, room_x: Array, left: Array) -> None:
-        """Write what z leaves of the room of the part's state rows into `left` (H, m), of the whole plant both."""
-        taken = self._x_of_z.dot(z).reshape(self._steps, -1)
-        np.subtract(room_x[:, self.columns], taken, out=left[:, self.columns])
+    def leave(self, z: Array, taken: Array) -> None:
+        """Write what z takes of the room of the part's state rows into `taken` (H, m), of the whole plant."""
+        taken[:, self.columns] = self._x_of_z.dot(z).reshape(self._steps, -1)
 
     @property
     def iterations(self) -> int:
@@ -329,8 +328,10 @@ class RegulatedRows:
         self.hard = _after_another([one.size for one in sides])  # of each part, which of the hard rows are its own
         self._hard_sides, self._of_hold = np.concatenate(sides), np.vstack(of_hold)
         # Where the rows of u_0 - u_(-1) are, and behind those of their part the ones of u_(-1) - u_0.
-        self._owner, self._above = np.hstack(first)
-        self._below = self._above + np.concatenate([np.full(one.shape[1], one.shape[1]) for one in first])
+        owner, above = np.hstack(first)
+        below = above + np.concatenate([np.full(one.shape[1], one.shape[1]) for one in first])
+        self._first, self._owner = np.concatenate([above, below]), np.concatenate([owner, owner])
+        self._sign = np.repeat([1.0, -1.0], owner.size)
         of_x = problem.state_set.c[self.rows] @ states[1:]
         self._room = np.asfortranarray(-np.vstack([of_x.reshape(-1, n_x), *hard]))
 
@@ -352,11 +353,10 @@ class RegulatedRows:
         if hold is not None:
             hard -= self._of_hold @ hold
         if first is None:
-            hard[self._above] = hard[self._below] = OPEN
+            hard[self._first] = OPEN
         else:
-            at, side = (values[self._owner] for values in first)
-            hard[self._above] += side + at
-            hard[self._below] += side - at
+            at, side = first
+            hard[self._first] += side.take(self._owner) + self._sign * at.take(self._owner)
         return of_x, hard
 
     def plan(self, dx: Array) -> tuple[Array, Array]:
