@@ -140,6 +140,8 @@ class FirstRows:
         self._inputs = slice(last, None, width) if width > 1 else None
         self._unit = of_u[0, -1, 0] / of_u[0, 0, 0]
         self._soft, self._hard = int(sense[0]), int(sense[last])
+        tops = np.zeros(self._steps + 1)
+        self._top, self._before = tops[1:], tops[:-1]  # how far inputs get in each stage, and in the one before
         of_z = np.asfortranarray(of_x[:, direction])
         self._z, self._reach = inverse, np.ascontiguousarray(by_slew[direction])
         # Their first columns, by how many: a product with a part of a matrix would begin with a copy of it.
@@ -206,9 +208,13 @@ class FirstRows:
             return begin
         # That leaves a state row: as long as it can still be kept, and back.
         ramp = np.add.accumulate(fast)
-        top = ramp if self._inputs is None else np.minimum(ramp, upper[self._inputs] * self._unit)
+        top = self._top
+        if self._inputs is None:
+            top[:] = ramp
+        else:
+            np.minimum(ramp, upper[self._inputs] * self._unit, out=top)
         gain = top - slow
-        np.subtract(gain[1:], top[:-1], out=gain[1:])
+        gain -= self._before
         room, taken = (high - braked)[since:], None
         # Where the regulator asks for no more is a good first try.
         middle, count, beyond = count, since, self._steps + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,11 +167,17 @@ def shifted(
         kept *= asked[:, None]
     risk = spent(kept, sigma)
     np.putmask(risk, binds, 0.0)
-    count = binds.dot(np.ones(binds.shape[1]))
+    count = binds.dot(_ones(binds.shape[1]))
     left = budgets - np.add.reduce(risk, axis=1)
     share = quantile(left / np.maximum(count, 1.0))
     np.putmask(kept, binds, share[:, None] * sigma)
     return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0.0, kept, backoff)
+
+
+@cache
+def _ones(count: int) -> Array:
+    """A product with them is a quicker sum than that of flags."""
+    return np.ones(count)
 
 
 # Distances that plans with risk conditioned on the age keep from a limit that they rest at.
