@@ -67,10 +67,7 @@ def finite(x: Array, target: Array, outlook: Preview) -> bool:
 def all_finite(given: Iterable[Array]) -> bool:
     """Whether arrays are made of finite numbers."""
     # A sum of squares is finite where all of them are, unless it overflows: then each is looked at.
-    for values in given:
-        if not math.isfinite(np.vdot(values, values)) and not np.isfinite(values).all():
-            return False
-    return True
+    return all(math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all()) for values in given)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -153,7 +154,7 @@ def shifted(
         backoff: Back-offs so far (S, m) of some stages.
         room: Room that the plan at hand leaves (S, m).
         sigma: Standard deviations (S, m).
-        budgets: ε̄ of the stages (S,); where it is infinite there are no back-offs.
+        budgets: ε̄ of the stages (S,), growing; where it is infinite there are no back-offs.
         binds: Which rows bind (S, m).
         away: Standard deviations (S, 1) beyond which a row that does not bind keeps no more.
     """
@@ -162,9 +163,8 @@ def shifted(
     kept *= _KEEPS
     kept += backoff
     np.minimum(kept, np.maximum(backoff, away * sigma), out=kept)
-    asked = np.isfinite(budgets)
-    if np.count_nonzero(asked) < asked.size:
-        kept *= asked[:, None]
+    if budgets[-1] == math.inf:
+        kept *= np.isfinite(budgets)[:, None]
     risk = spent(kept, sigma)
     np.putmask(risk, binds, 0.0)
     count = binds.dot(_ones(binds.shape[1]))

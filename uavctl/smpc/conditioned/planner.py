@@ -371,7 +371,7 @@ class ConditionedSolver:
         problem = self.problem
         if outlook.path is None:
             # The regulator's own cost, and the square of the deviation from it.
-            cost = dx[0] @ self._tail @ dx[0] + sum([np.vdot(z, z) for _, z in found.left])
+            cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in found.left])
         else:
             last, dx, du = dx[-1], dx[:-1] - outlook.path.states, du - outlook.path.inputs
             cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
