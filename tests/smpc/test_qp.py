@@ -145,6 +145,18 @@ def test_same_question_same_bits_whatever_came_before(seed: int) -> None:
     assert [part.tobytes() for part in anew] == [part.tobytes() for part in fresh]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_without_a_linear_term_it_is_zero_to_the_last_bit(seed: int) -> None:
+    drawn = Drawn(seed)
+    without = QuadraticProgram(drawn.h, drawn.a, drawn.sense, drawn.price, drawn.curve, linear=False)
+    z = without.solve_sides(drawn.upper, drawn.lower)
+    zero = drawn.program().solve(np.zeros(drawn.f.size), drawn.upper, drawn.lower)
+    assert z is not None
+    assert zero is not None
+    assert z.tobytes() == zero[0].tobytes()
+    assert without.solve_sides(np.full_like(drawn.upper, np.nan), drawn.lower) is None
+
+
 def test_new_matrices_are_a_new_program() -> None:
     rng = np.random.default_rng(8)
     drawn = Drawn(8)

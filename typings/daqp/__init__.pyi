@@ -9,7 +9,7 @@ class Model:
     def setup(
         self,
         H: NDArray[np.float64] | None,
-        f: NDArray[np.float64],
+        f: NDArray[np.float64] | None,
         A: NDArray[np.float64],
         bupper: NDArray[np.float64],
         blower: NDArray[np.float64] | None = None,

@@ -118,7 +118,7 @@ _LONGER = 1.0 / 3.0  # of the stages in which a plan without state rows is beyon
 
 
 class FirstRows:
-    """Guesses for a part with one input and one slew row.
+    """Guesses for a part with one input and one slew row. Not for concurrent use.
 
     It looks at the direction of the state rows that the input moves the soonest (a speed, before a position).
 
@@ -219,7 +219,8 @@ class FirstRows:
         # Where the regulator asks for no more is a good first try.
         middle, count, beyond = count, since, self._steps + 1
         while beyond - count > 1:
-            tried = self._reached[middle][since:].dot(gain[:middle])
+            of_gain = self._reached[middle]
+            tried = (of_gain[since:] if since else of_gain).dot(gain[:middle])
             if np.count_nonzero(tried > room):
                 beyond = middle
             else:

@@ -169,9 +169,10 @@ def shifted(
     np.putmask(risk, binds, 0.0)
     count = binds.dot(_ones(binds.shape[1]))
     left = budgets - np.add.reduce(risk, axis=1)
-    share = quantile(left / np.maximum(count, 1.0))
+    everywhere = np.count_nonzero(count) == count.size
+    share = quantile(left / (count if everywhere else np.maximum(count, 1.0)))
     np.putmask(kept, binds, share[:, None] * sigma)
-    return kept if np.count_nonzero(count) == count.size else np.where(count[:, None] > 0.0, kept, backoff)
+    return kept if everywhere else np.where(count[:, None] > 0.0, kept, backoff)
 
 
 @cache

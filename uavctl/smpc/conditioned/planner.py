@@ -103,7 +103,7 @@ class ConditionedSolver:
     """Answers from one strictly convex program for each independent part; never raises on numbers.
 
     The reference is the equilibrium nearest to the target at which a plan may rest, see `rest_backoffs`. An answer
-    depends on its question alone, bit for bit.
+    depends on its question alone, bit for bit. Not for concurrent use.
 
     Args:
         problem: The problem; every question brings a target of its own.
