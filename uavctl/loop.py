@@ -121,6 +121,7 @@ class ControlLoop:
             maxlen=MAX_NOTICES
         )  # of the hand-over, for a person; whoever shows them takes
         self._orders: deque[Command] = deque()
+        self._misled = False  # positions jumped under a vehicle on its way up or down: none is passed on any more
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
         self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands = config.fallback.land or config.relay.enabled
@@ -241,8 +242,9 @@ class ControlLoop:
         self.course.see(at_ns, self.vehicle)
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
         autopilot = "" if self.vehicle is None else self.vehicle.autopilot
-        # A vehicle that lands must not do so by positions that have just been found to be wrong.
-        if self._relays and not disbelieves(self._state):
+        # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
+        self._misled = self._misled or (out.astray and self._hand_over.has_begun)
+        if self._relays and not self._misled and not disbelieves(self._state):
             for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
                 yield self._send(VEHICLE, data, at_ns)
         if self._adrift:
@@ -456,6 +458,7 @@ class ControlLoop:
             land=out.land,
             stop=inp.stop,
             unfit=unfit,
+            unsafe=out.unsafe,
             up_m=up_m,
             up_mps=up_mps,
             heard=self._heard,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from uavctl.flight.decision import MISSION_OVER
 from uavctl.mavlink.handover import Passage
-from uavctl.mavlink.handover_guards import fails, silent
+from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
@@ -39,6 +39,7 @@ class Cause(StrEnum):
     NOT_ARMED = "arming was refused"
     NO_TAKE_OFF = "the take-off was refused"
     NO_CLIMB = "the climb took too long"
+    BROKEN_OFF = "the climb was broken off"
     NOT_GRANTED = "the mode that takes setpoints was refused"
     NOT_ENGAGED = "ended before the controller was in charge"
     NOT_REACHED = "the place was not reached"
@@ -51,6 +52,7 @@ class Cause(StrEnum):
     RESTARTED = "the vehicle has started anew"
     SILENT = "the vehicle fell silent"
     DISARMED = "the vehicle disarmed in flight"
+    NOT_RISEN = "the vehicle disarmed before it had left the ground"
     LANDING_FAILED = "landing has failed"
     CUT_OFF = "ended before the vehicle was down"
     CONNECTION = "the vehicle's connection was closed by the other side"
@@ -72,6 +74,7 @@ _REFUSED = {
     HandoverState.LANDING: Cause.LANDING_FAILED,
     HandoverState.SETTLING: Cause.LANDING_FAILED,
 }
+_COMES_DOWN = frozenset({HandoverState.LANDING, HandoverState.SETTLING})
 _FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
 _FALLING = frozenset({ControlMode.BRAKE, ControlMode.HOLD})
 
@@ -115,7 +118,9 @@ class FlightCourse:
     _closed: str = ""
     _signal: int = 0
     _failsafes: int = 0  # number of failsafes that have ended by themselves
-    _airborne: bool = False  # it has been armed
+    _armed: bool = False  # it has been armed
+    _aloft: bool = False  # it has been in the air, as far as it tells
+    _fails: bool = False  # it landed by a failsafe of its own while, or after, it was asked to
     _vehicle: VehicleStatus | None = None
     _positions: bool = False  # there has been an estimate
     _fell: str = ""  # why the fallback took over last
@@ -137,7 +142,11 @@ class FlightCourse:
     def see(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
         """Note the vehicle's state at a tick."""
         self._now_ns, self._vehicle = at_ns, vehicle
-        self._airborne = self._airborne or (vehicle is not None and vehicle.armed)
+        if vehicle is None:
+            return
+        self._armed = self._armed or vehicle.armed
+        self._aloft = self._aloft or (vehicle.armed and not vehicle.landed)
+        self._fails = self._fails or (self._state in _COMES_DOWN and vehicle.armed and fails(vehicle))
 
     def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
         """Note what the controller decided in a tick."""
@@ -171,6 +180,8 @@ class FlightCourse:
             self._find(Cause.RESTARTED, "")
         elif one.seen is HandoverEvent.REFUSED:
             self._refuse(one, vehicle)
+        elif one.seen is HandoverEvent.UNSAFE:
+            self._find(Cause.BROKEN_OFF, _reason(one))
         elif one.seen is HandoverEvent.LEFT:
             self._find(Cause.LEFT, "")
         elif one.after is HandoverState.FAILSAFE:
@@ -200,6 +211,8 @@ class FlightCourse:
             what += f"; landing has failed: {self._failed}"
         if self._failsafes and cause is not Cause.FAILSAFE:
             what += "; a failsafe of the vehicle's own had acted and ended"
+        elif self._fails and cause in WANTED:
+            what += "; a failsafe of the vehicle's own acted in the landing"
         text = f"{what}{f', {_BEFORE}' if early else ''}{f'; {where}' if where else ''}"
         good = cause in WANTED and not (early or missed or self._failed)
         return make_ending(cause, text, as_ordered=good, exit_code=128 + self._signal if self._signal else None)
@@ -245,7 +258,7 @@ class FlightCourse:
 
     def _disarm(self, one: Passage) -> None:
         if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
-            self._find(Cause.DISARMED, "")
+            self._find(Cause.DISARMED if self._aloft else Cause.NOT_RISEN, "")
         elif one.before is HandoverState.RELEASED and self._found is Cause.PILOT:
             self._found, self._why = Cause.PILOT_LANDED, ""
         elif one.before in (HandoverState.FAILSAFE, HandoverState.RELEASED) and self._found is Cause.FAILSAFE:
@@ -300,8 +313,10 @@ class FlightCourse:
             return ""
         mode = f"in mode {vehicle.mode}"
         if not vehicle.armed:
-            down = "it is disarmed" if self._found is Cause.DISARMED else "it has landed and disarmed"
-            return down if self._airborne else "it was not armed"
+            down = (
+                "it is disarmed" if self._found in (Cause.DISARMED, Cause.NOT_RISEN) else "it has landed and disarmed"
+            )
+            return down if self._armed else "it was not armed"
         heard = ""
         if silent(self._now_ns, vehicle):
             heard = f", not heard for {(self._now_ns - vehicle.at_ns) / SECOND_NS:.0f} s"
@@ -314,7 +329,13 @@ def _reason(one: Passage) -> str:
     """Return why something was refused, without what the cause says already."""
     asked = "" if one.ask is None else f"{one.ask.value}: "
     text = one.why
-    for said in (asked, "take-off: ", "another vehicle is heard on this link: ", "the vehicle's own failsafe "):
+    for said in (
+        asked,
+        "take-off: ",
+        BROKEN_OFF,
+        "another vehicle is heard on this link: ",
+        "the vehicle's own failsafe ",
+    ):
         text = text.removeprefix(said)
     if one.ask is None and text.startswith("("):  # the failsafe's mode
         text = text.replace("(", "", 1).replace(")", "", 1)

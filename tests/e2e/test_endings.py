@@ -266,9 +266,30 @@ def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, 
 
 @pytest.mark.slow
 def test_landing_fails(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, "hand_over.land_s=6.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
+    rig = Endings(tmp_path, "hand_over.land_s=2.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
     assert "in the air" in told.ending["sentence"]
+
+
+@pytest.mark.slow
+@pytest.mark.fault(63)
+def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path, "hand_over.land_s=4.0", "link.uplink_blackout=[[8.0, 35.0]]")
+    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
+    assert "landed and disarmed" in told.ending["sentence"] and "asked on" in told.console
+
+
+@pytest.mark.slow
+def test_positions_that_jump_in_the_climb_break_it_off(tmp_path: Path, typed: Type) -> None:
+    swapped = ("sim.camera.swapped=[[4.6, 60.0]]", "sim.camera.other_body_m=[2.0, 1.5, -0.5]")
+    told = typed(Endings(tmp_path, *swapped), Cause.BROKEN_OFF, *TAKE_OFF)
+    assert "jumped" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+
+
+@pytest.mark.slow
+def test_it_disarms_before_it_has_left_the_ground(tmp_path: Path, typed: Type) -> None:
+    rig = Endings(tmp_path).at(HandoverState.CLIMBING, lambda one: one.peers.autopilot.pilot._disarm(), after_s=0.0)
+    typed(rig, Cause.NOT_RISEN, *TAKE_OFF)
 
 
 @pytest.mark.slow

@@ -163,7 +163,7 @@ def test_a_stop_before_the_mode_is_given_asks_for_nothing_more(autopilot: str) -
 
 @pytest.mark.fault(26)
 def test_a_climb_that_never_ends_is_ended_by_landing() -> None:
-    flight = Flight("ardupilot", "hand_over.climb_s=3.0", "link.blackout=[[2.5, 100.0]]").take_off()
+    flight = Flight("ardupilot", "hand_over.climb_s=1.0").take_off()
     flight.run(8.0, until=HandoverState.LANDING)
     flight.run(20.0, until=HandoverState.DONE)
     assert "take-off" in flight.loop.failure and not flight.peers.autopilot.pilot.armed

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover import HandOver
+from uavctl.mavlink.handover_guards import MUST_LAND
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import Text
 from uavctl.mavlink.requests import RequestKind
@@ -191,13 +192,35 @@ def over_a_relay(state: HandoverState) -> Rig:
 def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -> None:
     rig = over_a_relay(HandoverState.CLIMBING)
     rig.tick(stop=True)
-    rig.run(12.0, until=HandoverState.FAILED)  # it does not land
+    rig.run(MUST_LAND * 10.0 + 2.0, until=HandoverState.FAILED)  # it does not land
     assert not rig.hand_over.finished
     rig.run(30.0)
     assert not rig.hand_over.finished  # it would be blind, and nobody else has it
     rig.be(armed=False)
     rig.tick()
     assert rig.hand_over.finished
+
+
+@pytest.mark.fault(63)
+def test_what_we_took_off_is_asked_to_land_until_it_does() -> None:
+    rig = Rig(config=HandOverConfig(land_s=5.0)).to(HandoverState.CLIMBING)
+    rig.be(landed=False)
+    rig.tick(stop=True)
+    rig.run(30.0)  # it hears nothing
+    assert rig.is_in(HandoverState.LANDING) and len(rig.asked) > 25
+    assert len([text for text in rig.codes("refused") if "asked on" in text]) == 1
+    rig.be(mode="AUTO.LAND")
+    rig.run(1.0)
+    assert rig.is_in(HandoverState.SETTLING) and not rig.hand_over.failure
+
+
+def test_a_vehicle_that_falls_silent_is_not_asked_to_land_for_longer() -> None:
+    rig = Rig(config=HandOverConfig(land_s=5.0)).to(HandoverState.CLIMBING)
+    rig.be(landed=False)
+    rig.tick(stop=True)
+    rig.mute = True
+    rig.run(9.0)
+    assert rig.is_in(HandoverState.FAILED)
 
 
 @pytest.mark.fault(63)

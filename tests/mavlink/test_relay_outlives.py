@@ -11,7 +11,7 @@ from uavctl import loop as control
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.step import StepOutput, step
 from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.handover_guards import MUST_LAND, HandoverView
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Event, RelayStats, StepInput
@@ -136,7 +136,7 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
 def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
-    flight.run(40.0, stop=True)
+    flight.run(MUST_LAND * 5.0 + 15.0, stop=True)
     assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED

@@ -37,6 +37,7 @@ from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
 from uavctl.loop import ControlLoop
+from uavctl.mavlink.handover_guards import MUST_LAND
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import lacking
 from uavctl.records import Command, ControlMode, Ending, Event, Header, Order, PolicyLibrary, Record, Severity, Vec3
@@ -320,8 +321,8 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
 
 def stop_limit_s(config: Config, *, takes_off: bool) -> float:
     """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
-    lands = takes_off or config.relay.enabled
-    return config.fallback.brake_s + LANDING_S + (config.hand_over.land_s if lands else 0.0)
+    landings = 1 + MUST_LAND if takes_off else int(config.relay.enabled)
+    return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s
 
 
 def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:

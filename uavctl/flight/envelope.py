@@ -550,7 +550,13 @@ def is_outside(seen: Observation, parameters: EnvelopeParameters) -> bool:
     return _outside(seen, parameters) is not None
 
 
-def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
+def beyond(seen: Observation, parameters: EnvelopeParameters) -> str:
+    """Return which limit the estimate is beyond by more than the margin, and not on its way back; empty if none."""
+    return _outside(seen, parameters, brakes=False) or ""
+
+
+def _outside(seen: Observation, parameters: EnvelopeParameters, *, brakes: bool = True) -> str | None:
+    """Return how the estimate is outside, or about to be (`brakes`: it must be able to stop before); None if not."""
     if seen.position_m is None:
         return None
     rows = zip(
@@ -567,10 +573,11 @@ def _outside(seen: Observation, parameters: EnvelopeParameters) -> str | None:
     for axis, has, position, velocity, lower, upper, margin, brake in rows:
         if has and not math.isfinite(position + velocity):
             return f"the estimate of {axis} is no number"
-        for beyond, outward in ((lower - position, -velocity), (position - upper, velocity)):
-            if beyond > margin and outward > -RETURNS_MPS:
-                return f"the estimate is {beyond:.1f} m beyond the limit of {axis}"
-            if outward > 0.0 and beyond + outward * REACTION_S + outward * outward / (2.0 * brake) > margin:
+        for out_m, outward in ((lower - position, -velocity), (position - upper, velocity)):
+            if out_m > margin and outward > -RETURNS_MPS:
+                return f"the estimate is {out_m:.1f} m beyond the limit of {axis}"
+            stop_m = outward * REACTION_S + outward * outward / (2.0 * brake)
+            if brakes and outward > 0.0 and out_m + stop_m > margin:
                 return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
     return None
 

@@ -7,6 +7,7 @@ Tick n is at n * tick on the grid, step k = n // (Δt / tick). What a boundary d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -28,7 +29,19 @@ from uavctl.flight.decision import (
     take_orders,
     unready,
 )
-from uavctl.flight.envelope import ABSURD, NOT_WATCHING, OF_POSITIONS, Breach, Watching, contradicts, is_outside, watch
+from uavctl.flight.envelope import (
+    ABSURD,
+    MOTION_NS,
+    NOT_WATCHING,
+    OF_POSITIONS,
+    VELOCITY,
+    Breach,
+    Watching,
+    beyond,
+    contradicts,
+    is_outside,
+    watch,
+)
 from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
 from uavctl.flight.fallback import FallbackEnd
 from uavctl.flight.gating import MeasurementUpdate, forget, take
@@ -109,6 +122,7 @@ _SOURCES = {
 
 
 AFRESH_STEPS = 3  # for which a plan is made anew once positions were taken back
+STANDS_M = 0.3  # that positions may be off while a vehicle stands on the ground, or has just left it
 _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
@@ -123,6 +137,8 @@ class StepOutput(msgspec.Struct, frozen=True):
     land: bool  # ask for the vehicle's own landing, once
     refused: tuple[PositionSample, ...] = ()  # samples that were not believed
     link: LinkEstimate | None = None  # link estimate; at boundaries that were not missed
+    unsafe: str = ""  # why a vehicle in the air that others fly must not climb on by its positions; empty if it may
+    astray: bool = False  # that is because positions cannot be its own
 
 
 def initial_state() -> ControlState:
@@ -153,6 +169,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     history, coming = act(controller.kalman, history, state.coming, inp.at_ns)
     intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
     before = mode_of(state)
+    armed = inp.vehicle is not None and inp.vehicle.armed
+    in_the_air = armed and inp.vehicle is not None and not inp.vehicle.landed
     lost = intake.moved and before in _NOT_FLOWN
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
@@ -205,6 +223,16 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         history, coming = intake.history, (*coming, (inp.at_ns + controller.dead_ns, acting))
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
+    aloft, felt, strange, unsafe = NOT_WATCHING, state.felt, None, ""
+    stands = _stands(state, tick, controller) if armed and not in_the_air else None
+    strayed = stands is not None and _strayed(stands, tick, controller)
+    if armed and lost:
+        unsafe = "positions have jumped further than the vehicle can have come"
+    elif strayed:
+        unsafe = "positions move while the vehicle stands on the ground"
+    elif in_the_air and before in _NOT_FLOWN:
+        aloft, felt, strange = _aloft(state, tick, intake, inp, controller)
+        unsafe = _unsafe(tick, inp, controller) if strange is None else strange.text
     inertial = _inertial(state, tick, inp, controller)
     bias = _flown_against(state, tick, inp)
     at_bounds = at_bound(bias, controller.kalman.bias_bounds, state.at_bounds) if bias else state.at_bounds
@@ -216,6 +244,9 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         link_alarms=alarms,
         history=history,
         coming=coming,
+        aloft=aloft,
+        felt=felt,
+        stands=stands,
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
     plan, mission = choice.state.plan, choice.state.mission
@@ -259,7 +290,56 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         refused=tuple(sample for sample, _ in intake.refused),
         link=link,
         land=mode is ControlMode.LAND and before is not ControlMode.LAND,
+        unsafe=unsafe,
+        astray=(armed and lost) or strayed or strange is not None,
     )
+
+
+def _stands(state: ControlState, tick: Tick, controller: Controller) -> Array | None:
+    """Where a vehicle that is armed on the ground was (n_axes,) [m] when it was first seen so; None if not known."""
+    if state.stands is not None or tick.estimate is None:
+        return state.stands
+    return np.array(tick.estimate.mean)[list(controller.plant.position_index)]
+
+
+def _strayed(stands: Array, tick: Tick, controller: Controller) -> bool:
+    """Whether positions have left that place."""
+    if tick.estimate is None:
+        return False
+    now = np.array(tick.estimate.mean)[list(controller.plant.position_index)]
+    return bool((np.abs(now - stands) > STANDS_M).any())
+
+
+def _aloft(
+    state: ControlState, tick: Tick, intake: MeasurementUpdate, inp: StepInput, controller: Controller
+) -> tuple[Watching, tuple[Vec3, int], Breach | None]:
+    """Hold the positions of a vehicle in the air that others fly against its own senses.
+
+    What its inertial sensors feel takes the place of what was sent. Without them its own velocity is all there is.
+    """
+    if controller.envelope is None:
+        return NOT_WATCHING, state.felt, None
+    felt = [one.accel_mps2 for one in inp.inertial if all(map(math.isfinite, one.accel_mps2))]
+    feels, felt_ns = (_mean(felt), inp.at_ns) if felt else state.felt
+    known = inp.at_ns - felt_ns <= MOTION_NS
+    seen = seen_of(tick, inp, feels if known else ZERO, controller.plant, intake.accepted)
+    watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
+    counts = breach is not None and (known or breach.code == VELOCITY)
+    return watching, (feels, felt_ns), breach if counts else None
+
+
+def _mean(vectors: Sequence[Vec3]) -> Vec3:
+    north, east, down = (sum(values) / len(vectors) for values in zip(*vectors, strict=True))
+    return north, east, down
+
+
+def _unsafe(tick: Tick, inp: StepInput, controller: Controller) -> str:
+    """Return why a vehicle in the air that others fly must not climb on by what is known of its position."""
+    if tick.age_steps is not None and tick.age_steps >= controller.horizon:
+        return f"no position has come for {controller.horizon * controller.plant.dt_s:.1f} s"
+    if controller.envelope is None:
+        return ""
+    return beyond(seen_of(tick, inp, ZERO, controller.plant), controller.envelope)
 
 
 def _is_ours(vehicle: VehicleStatus | None) -> bool:

@@ -8,11 +8,13 @@ from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import (
     ASKING,
     LEAVING,
+    MUST_LAND,
     GuardResult,
     HandoverView,
     Progress,
     against_engaging,
     evaluate,
+    fails,
     profile_of,
     silent,
 )
@@ -26,12 +28,23 @@ MISSED_NS = 1_500_000_000  # one that was due is missing
 FOREVER_NS = 2**62
 _OVER = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
+_BEGUN = frozenset(
+    {
+        HandoverState.CLIMBING,
+        HandoverState.ENGAGING,
+        HandoverState.FAILSAFE,
+        HandoverState.LANDING,
+        HandoverState.SETTLING,
+    }
+)
 _PLAIN = frozenset(HandoverState) - {
     HandoverState.FAILSAFE,
     HandoverState.RELEASED,
     HandoverState.LANDING,
     HandoverState.FAILED,
 }
+# In these it counts which mode the vehicle was in as they were entered.
+_NOTES_MODE = frozenset({HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING})
 _PROMISES = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
@@ -78,6 +91,7 @@ class HandOver:
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
         self._disarms = False
         self._silent = False
+        self._overdue = False  # a landing that is asked for has not begun in the time for it
         self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
         self.failure = ""
 
@@ -95,6 +109,11 @@ class HandOver:
     def height_m(self) -> float:
         """Height of the climb that was ordered [m]."""
         return self._now.height_m
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether the vehicle is on its way up or down at our request, or by a failsafe on a flight that we began."""
+        return self.state in _BEGUN
 
     @property
     def finished(self) -> bool:
@@ -141,6 +160,8 @@ class HandOver:
             now.heard_ns = view.at_ns
         self.look_up(view.at_ns, view.vehicle)
         sight = evaluate(now, view)
+        if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing:
+            now.lands_failing = fails(view.vehicle)
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
         now.state, sending = TRANSITIONS[before, sight.seen]
         passage = None
@@ -221,7 +242,7 @@ class HandOver:
         if now.state is HandoverState.ARMING:
             now.ground_up_m = view.up_m
         takes_back = now.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
-        if (takes_back or now.state in (HandoverState.RETURNING, HandoverState.FAILSAFE)) and view.vehicle is not None:
+        if (takes_back or now.state in _NOTES_MODE) and view.vehicle is not None:
             now.left_mode = view.vehicle.mode
         if sight.granted_ns is not None:
             now.granted_ns = sight.granted_ns
@@ -259,8 +280,8 @@ class HandOver:
         }
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
-            # What we took off is asked as long as it has time for a landing: nobody else would.
-            tries = max(LAND_TRIES, round(c.land_s / c.answer_s)) if self.ours else LAND_TRIES
+            # What we took off is asked on: nobody else would.
+            tries = max(LAND_TRIES, round(MUST_LAND * c.land_s / c.answer_s)) if self.ours else LAND_TRIES
             return Patience(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
         # In the air there is no time for long pauses.
         retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
@@ -286,6 +307,11 @@ class HandOver:
             self._silent = silence
             text = "heartbeat lost: braking and holding" if silence else "heartbeat is back"
             events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
+        overdue = self._now.request.given_up(view.at_ns) if self.state is HandoverState.LANDING else ""
+        if overdue and not self._overdue:
+            text = f"{overdue}; it is asked on, as it is heard in the air"
+            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=text))
+        self._overdue = bool(overdue)
         if self.state is not before:
             vehicle = view.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"

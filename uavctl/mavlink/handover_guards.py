@@ -22,12 +22,14 @@ HEARTBEAT_TIMEOUT_NS = 3_000_000_000
 GRACE_NS = 300_000_000
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
 SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
+MUST_LAND = 10  # times `land_s` for which landing is asked for: as long as a battery lasts
 LOW = 0.3  # share of the take-off height below which a climb that has ended was none
 LEAVING = frozenset({HandoverState.MODE, HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
 _UNDER_WAY = LEAVING | {
     HandoverState.RETURNING,
     HandoverState.FAILSAFE,
 }  # here the operator's end of the flight asks for landing, too
+_CLIMBS = frozenset({HandoverState.CLIMBING, HandoverState.ENGAGING})
 ASKING = _UNDER_WAY | {HandoverState.LANDING}
 CLOCK_NS = 5_000_000_000  # in which a vehicle that is found armed tells how long ago it started
 # A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
@@ -38,6 +40,7 @@ _ARMED = (
     "--takeoff to fly it from where it is"
 )
 _OR_ENGAGE = ", and ask for that with `uavctl ctl engage`"
+BROKEN_OFF = "the climb is broken off: "
 _DISARMED = "the vehicle has disarmed itself"
 _LEFT = "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
 
@@ -52,6 +55,7 @@ class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
     land: bool = False  # the controller asks for landing
     stop: bool = False  # the operator asks for the end
     unfit: str = ""  # why nothing may be armed now; empty if it may
+    unsafe: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
     up_m: float | None = None  # height of the estimate in local NED [m]; None without one
     up_mps: float = 0.0  # its rate of climb [m/s]
     heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
@@ -69,10 +73,11 @@ class Progress:
     ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
     height_m: float = 0.0  # height of the climb that was ordered [m]
     ground_up_m: float | None = None  # height of the estimate before it was armed [m]
-    left_mode: str = ""  # the mode that is to be left for the external one, after a release; or that a failsafe chose
+    left_mode: str = ""  # the mode that a request is to end; or, in a failsafe, that it chose
     climb_ns: int | None = None  # time at which the climb first began [ns]; None before
     resumes: bool = False  # the failsafe that acts ended the climb, not the flight
     words: str = ""  # texts of the vehicle from before its failsafe acted
+    lands_failing: bool = False  # the landing that is waited for was last seen as a failsafe's
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # times that the vehicle had started anew by the last tick
     stands_by: bool = False  # A vehicle that is found armed is left alone
@@ -152,6 +157,8 @@ def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
         return GuardResult(
             HandoverEvent.LAND
         )  # the controller has ended without a landing, and nobody else has what we took off
+    if state in _CLIMBS and view.unsafe:
+        return GuardResult(HandoverEvent.UNSAFE, f"{BROKEN_OFF}{view.unsafe}")
     there = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not silent(view.at_ns, vehicle):
         there = _LOOKS.get(state, _around)(progress, view, vehicle)
@@ -172,8 +179,17 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
         return _ANOTHER
     if state is HandoverState.FAILSAFE:
         return _failsafe_stays(progress, view)
-    waits = state in ASKING or state is HandoverState.SETTLING
+    waits = (state in ASKING or state is HandoverState.SETTLING) and not _must_land(progress, view)
     return progress.request.given_up(view.at_ns) if waits else ""
+
+
+def _must_land(progress: Progress, view: HandoverView) -> bool:
+    """Whether it is asked to land, whatever it answers: what we took off and hear in the air has nobody else."""
+    vehicle = view.vehicle
+    if progress.state is not HandoverState.LANDING or progress.ordered_ns is None or vehicle is None:
+        return False
+    heard = vehicle.armed and not vehicle.landed and not silent(view.at_ns, vehicle)
+    return heard and view.at_ns - progress.since_ns < round(MUST_LAND * progress.config.land_s * 1e9)
 
 
 def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
@@ -239,16 +255,27 @@ def _has_started_since(progress: Progress, view: HandoverView) -> bool:
     return view.up_s / SLOWEST + LATEST_S < (view.at_ns - progress.flown_ns) / 1e9
 
 
-def _for_mode(_progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+def _for_mode(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    profile = profile_of(vehicle)
     if vehicle.armed:
         return GuardResult(HandoverEvent.OTHER)
-    there = vehicle.alone and vehicle.mode == profile_of(vehicle).take_off
-    return GuardResult(HandoverEvent.GRANTED if there else HandoverEvent.PENDING)
+    if vehicle.alone and vehicle.mode == profile.take_off:
+        return GuardResult(HandoverEvent.GRANTED)
+    # A mode that nobody here asked for is the pilot's; the one of before may be that of a vehicle that is slow.
+    taken = vehicle.alone and vehicle.mode not in (profile.take_off, progress.left_mode)
+    return GuardResult(HandoverEvent.OTHER if taken else HandoverEvent.PENDING)
+
+
+def _shows_granted(progress: Progress, vehicle: VehicleStatus) -> bool:
+    """Whether the last heartbeat is from after the request was granted, and so shows what became of it."""
+    granted_ns = progress.request.granted_ns
+    return granted_ns is not None and vehicle.at_ns > granted_ns + GRACE_NS
 
 
 def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
-    if vehicle.mode not in profile.climbing:
+    # Disarmed it has not climbed, so it is not where PX4's climb ends.
+    if vehicle.mode != profile.take_off and not (vehicle.armed and vehicle.mode in profile.climbing):
         return GuardResult(HandoverEvent.FAILSAFE if vehicle.armed and fails(vehicle) else HandoverEvent.OTHER)
     if profile.climbs_on_arming and granted_ns is not None:  # it climbs already
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
@@ -304,22 +331,27 @@ def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus)
 
 
 def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
-    news = vehicle.at_ns > progress.since_ns
+    """Return the event seen while the vehicle is asked to land (LANDING), and once it has shown that it does."""
+    news, asking = vehicle.at_ns > progress.since_ns, progress.state is HandoverState.LANDING
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED if news else HandoverEvent.PENDING)
-    profile, asking = profile_of(vehicle), progress.state is HandoverState.LANDING
-    ours = progress.ordered_ns is not None
+    profile, ours = profile_of(vehicle), progress.ordered_ns is not None
     if vehicle.mode in profile.landing:
         # A failsafe lands only until it ends: what we took off is to land whatever comes.
         for_us = not (ours and fails(vehicle)) or progress.request.granted_ns is not None
         return GuardResult(HandoverEvent.GRANTED if asking and for_us else HandoverEvent.PENDING)
-    if ours and not asking and profile.climbs_on_arming and vehicle.mode == profile.take_off:
-        return GuardResult(
-            HandoverEvent.FAILSAFE if vehicle.at_ns > progress.since_ns + SHOWN_NS else HandoverEvent.PENDING
-        )
-    # Asked for in the middle of a climb, any mode of the climb may still be shown.
-    passing = vehicle.external or vehicle.mode in profile.climbing or (ours and fails(vehicle))
-    return GuardResult(HandoverEvent.PENDING if passing or not news else HandoverEvent.OTHER)
+    if not news or (ours and fails(vehicle)):
+        return GuardResult(HandoverEvent.PENDING)
+    if asking:
+        # Asked for in the middle of a climb, any mode of the climb may still be shown; after it was granted, only the
+        # one of before may, by a vehicle that has not begun to land.
+        passing = vehicle.external or vehicle.mode in profile.climbing
+        changed = vehicle.mode != progress.left_mode and _shows_granted(progress, vehicle)
+        return GuardResult(HandoverEvent.PENDING if passing and not changed else HandoverEvent.OTHER)
+    if ours and progress.lands_failing and profile.climbs_on_arming and vehicle.mode == profile.take_off:
+        shown = vehicle.at_ns > progress.since_ns + SHOWN_NS
+        return GuardResult(HandoverEvent.FAILSAFE if shown else HandoverEvent.PENDING)
+    return GuardResult(HandoverEvent.OTHER)
 
 
 _LOOKS: dict[HandoverState, Callable[[Progress, HandoverView, VehicleStatus], GuardResult]] = {

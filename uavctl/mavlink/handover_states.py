@@ -35,6 +35,7 @@ class HandoverEvent(StrEnum):
 
     REBOOT = "reboot"  # the vehicle has started anew
     LAND = "land"  # the controller, or the operator, asks for landing
+    UNSAFE = "unsafe"  # it climbs by positions that cannot be, without any, or out of the room
     GRANTED = "granted"  # what was asked for is there
     REFUSED = "refused"  # what was asked for will not come
     SILENCE = "silence"  # no heartbeat, or the last one is too old
@@ -112,6 +113,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _C: {
         HandoverEvent.REBOOT: (_F, _NOTHING),
         HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.UNSAFE: (_L, _NOTHING),
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.DISARMED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
@@ -122,6 +124,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _G: {
         HandoverEvent.REBOOT: (_F, _NOTHING),
         HandoverEvent.LAND: (_L, _NOTHING),
+        HandoverEvent.UNSAFE: (_L, _NOTHING),
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.DISARMED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),

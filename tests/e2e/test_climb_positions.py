@@ -1,0 +1,75 @@
+"""A climb by positions that are not the vehicle's own, or by none: broken off, judged on the true vehicle."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+from take_off_rig import RELAYED, Flight
+
+from uavctl.mavlink.handover_states import HandoverState
+
+START_M = (0.0, 0.0, -0.7)  # the rig's, whose vehicle begins on the floor below
+SIDE_M, CEILING_M = 1.5, 2.5  # how far to the side, and how high, the vehicle may come
+CASES = pytest.mark.parametrize(
+    ("autopilot", "after_s"), [(name, after_s) for name in ("px4", "ardupilot") for after_s in (0.0, 0.6, 1.2, 1.8)]
+)
+
+
+@cache
+def climbs_at_s(autopilot: str) -> float:
+    """When the same flight without a fault begins its climb."""
+    flight = Flight(autopilot, *RELAYED).relayed().take_off().run(60.0, until=HandoverState.CLIMBING)
+    return flight.now_ns * 1e-9
+
+
+def furthest(flight: Flight) -> tuple[float, float]:
+    """Fly to the end; how far from its start the true vehicle came to the side, and how high [m]."""
+    flight.take_off()
+    side_m = height_m = 0.0
+    for _ in range(2400):
+        if flight.loop.finished:
+            break
+        # An engaged flight is landed, to end it.
+        flight.run(0.05, stop=flight.is_in(HandoverState.ENGAGED) and flight.now_ns > 60 * 10**9)
+        north, east, down = flight.peers.autopilot.craft.position_m
+        side_m = max(side_m, abs(north - START_M[0]), abs(east - START_M[1]))
+        height_m = max(height_m, -down)
+    assert flight.loop.finished and flight.peers.autopilot.craft.landed, (flight.state, flight.texts[-3:])
+    return side_m, height_m
+
+
+@pytest.mark.slow
+@pytest.mark.fault(63)
+@CASES
+@pytest.mark.parametrize("other_m", [(2.0, 1.5, -0.5), (0.15, 0.1, -0.6), (-1.5, 0.0, -1.2)], ids=["far", "near", "up"])
+def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
+    autopilot: str, after_s: float, other_m: tuple[float, float, float]
+) -> None:
+    begin_s = climbs_at_s(autopilot) + after_s
+    swapped = f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]"
+    side_m, height_m = furthest(
+        Flight(autopilot, *RELAYED, swapped, f"sim.camera.other_body_m={list(other_m)}").relayed()
+    )
+    assert side_m < SIDE_M and height_m < CEILING_M
+
+
+@pytest.mark.slow
+@pytest.mark.fault(63)
+@CASES
+@pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
+def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_s: float, silence: str) -> None:
+    begin_s = climbs_at_s(autopilot) + after_s
+    flight = Flight(autopilot, *RELAYED, f"{silence}=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]").relayed()
+    side_m, height_m = furthest(flight)
+    assert side_m < SIDE_M and height_m < CEILING_M
+
+
+@pytest.mark.slow
+@pytest.mark.fault(26)
+def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
+    flight = Flight("px4", "sim.plant=quadrotor").run(2.0)
+    assert flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 8.0)
+    flight.take_off(2.4)
+    _, height_m = furthest(flight)
+    assert height_m < CEILING_M + 0.5

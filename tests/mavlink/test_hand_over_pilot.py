@@ -1,0 +1,121 @@
+"""The pilot's switch at moments in which a mode of ours is asked for, or just shown: it is the pilot's all the same."""
+
+from __future__ import annotations
+
+import pytest
+from hand_over_rig import ACCEPTED, LAND, Rig
+
+from uavctl.mavlink.handover_states import HandoverState
+from uavctl.mavlink.requests import RequestKind
+
+LANDING_MODE = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
+
+
+def settling(autopilot: str, *, failing: bool = False) -> Rig:
+    """A flight of ours that lands, its landing shown."""
+    rig = Rig(autopilot).to(HandoverState.CLIMBING)
+    rig.be(landed=False)
+    rig.tick(commands=(LAND,))
+    rig.answer(ACCEPTED)
+    rig.be(mode=LANDING_MODE[autopilot], failsafe=failing)
+    rig.tick()
+    assert rig.is_in(HandoverState.SETTLING)
+    return rig
+
+
+@pytest.mark.fault(25)
+@pytest.mark.parametrize(
+    ("autopilot", "mode"),
+    [
+        ("px4", "AUTO.LOITER"),
+        ("px4", "AUTO.TAKEOFF"),
+        ("px4", "OFFBOARD"),
+        ("px4", "POSCTL"),
+        ("ardupilot", "GUIDED"),
+        ("ardupilot", "LOITER"),
+    ],
+)
+def test_once_a_landing_is_shown_any_other_mode_is_the_pilot_s(autopilot: str, mode: str) -> None:
+    rig = settling(autopilot)
+    asked = len(rig.asked)
+    rig.run(0.3)
+    rig.be(mode=mode)
+    rig.run(70.0)
+    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+
+
+def test_a_failsafe_that_only_seemed_to_land_for_us_is_asked_again() -> None:
+    rig = settling("px4", failing=True)
+    rig.be(mode="AUTO.TAKEOFF", failsafe=False)
+    rig.run(3.0)
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+
+
+def landing(autopilot: str) -> Rig:
+    """A flight of ours that is asked to land, from the mode that takes setpoints."""
+    rig = Rig(autopilot)
+    rig.to(HandoverState.CLIMBING).be(landed=False)
+    rig.tick(up_m=1.9)
+    rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+    rig.run(1.0, until=HandoverState.ENGAGED)
+    rig.tick(land=True)
+    rig.tick(land=False)
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    return rig
+
+
+@pytest.mark.fault(25)
+@pytest.mark.parametrize(("autopilot", "mode"), [("px4", "AUTO.LOITER"), ("px4", "POSCTL"), ("ardupilot", "LOITER")])
+def test_after_landing_was_granted_another_mode_is_the_pilot_s(autopilot: str, mode: str) -> None:
+    rig = landing(autopilot)
+    rig.answer(ACCEPTED)
+    asked = len(rig.asked)
+    rig.run(0.4)  # heartbeats of before may still be under way
+    assert rig.is_in(HandoverState.LANDING)
+    rig.be(mode=mode)
+    rig.run(10.0)
+    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+
+
+def test_a_vehicle_that_says_yes_and_stays_where_it_was_is_asked_to_land_again() -> None:
+    rig = landing("px4")
+    rig.answer(ACCEPTED)
+    asked = len(rig.asked)
+    rig.run(5.0)
+    assert rig.is_in(HandoverState.LANDING) and len(rig.asked) > asked
+
+
+@pytest.mark.fault(25)
+@pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
+def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilot: str, mode: str) -> None:
+    rig = Rig(autopilot).to(HandoverState.MODE)
+    rig.be(mode=mode)
+    rig.run(10.0)
+    assert rig.is_in(HandoverState.DONE) and "-> released" in rig.codes("hand-over")[-2]
+    assert {ask for _, ask in rig.asked} == {RequestKind.TAKE_OFF_MODE}
+
+
+@pytest.mark.fault(25)
+def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
+    rig = Rig().to(HandoverState.ARMING)
+    rig.be(mode="AUTO.LOITER")
+    rig.tick()
+    assert rig.is_in(HandoverState.RELEASED)
+    rig.be(armed=True)
+    rig.run(30.0)
+    assert rig.is_in(HandoverState.RELEASED)
+
+
+@pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
+def test_a_climb_by_positions_that_cannot_be_is_broken_off(state: HandoverState) -> None:
+    rig = Rig("ardupilot").to(state)
+    assert rig.is_in(state)
+    rig.tick(unsafe="it is 0.7 m beyond the limit of down")
+    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert rig.codes("refused") == ["the climb is broken off: it is 0.7 m beyond the limit of down"]
+
+
+def test_nothing_is_broken_off_while_nothing_climbs() -> None:
+    rig = Rig().to(HandoverState.ENGAGED)
+    rig.tick(unsafe="it is 0.7 m beyond the limit of down")
+    assert rig.is_in(HandoverState.ENGAGED) and not rig.codes("refused")
