@@ -40,7 +40,7 @@ def furthest(flight: Flight) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.fault(63)
+@pytest.mark.fault(66)
 @CASES
 @pytest.mark.parametrize("other_m", [(2.0, 1.5, -0.5), (0.15, 0.1, -0.6), (-1.5, 0.0, -1.2)], ids=["far", "near", "up"])
 def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
@@ -55,7 +55,7 @@ def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
 
 
 @pytest.mark.slow
-@pytest.mark.fault(63)
+@pytest.mark.fault(66)
 @CASES
 @pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
 def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_s: float, silence: str) -> None:
@@ -66,7 +66,7 @@ def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_
 
 
 @pytest.mark.slow
-@pytest.mark.fault(26)
+@pytest.mark.fault(66)
 def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
     flight = Flight("px4", "sim.plant=quadrotor").run(2.0)
     assert flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 8.0)

@@ -272,7 +272,7 @@ def test_landing_fails(tmp_path: Path, typed: Type) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.fault(63)
+@pytest.mark.fault(67)
 def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=4.0", "link.uplink_blackout=[[8.0, 35.0]]")
     told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)

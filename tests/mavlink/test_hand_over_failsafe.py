@@ -201,7 +201,7 @@ def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -
     assert rig.hand_over.finished
 
 
-@pytest.mark.fault(63)
+@pytest.mark.fault(67)
 def test_what_we_took_off_is_asked_to_land_until_it_does() -> None:
     rig = Rig(config=HandOverConfig(land_s=5.0)).to(HandoverState.CLIMBING)
     rig.be(landed=False)

@@ -23,7 +23,7 @@ def settling(autopilot: str, *, failing: bool = False) -> Rig:
     return rig
 
 
-@pytest.mark.fault(25)
+@pytest.mark.fault(68)
 @pytest.mark.parametrize(
     ("autopilot", "mode"),
     [
@@ -64,7 +64,7 @@ def landing(autopilot: str) -> Rig:
     return rig
 
 
-@pytest.mark.fault(25)
+@pytest.mark.fault(68)
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "AUTO.LOITER"), ("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_after_landing_was_granted_another_mode_is_the_pilot_s(autopilot: str, mode: str) -> None:
     rig = landing(autopilot)
@@ -85,7 +85,7 @@ def test_a_vehicle_that_says_yes_and_stays_where_it_was_is_asked_to_land_again()
     assert rig.is_in(HandoverState.LANDING) and len(rig.asked) > asked
 
 
-@pytest.mark.fault(25)
+@pytest.mark.fault(68)
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilot: str, mode: str) -> None:
     rig = Rig(autopilot).to(HandoverState.MODE)
@@ -95,7 +95,7 @@ def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilo
     assert {ask for _, ask in rig.asked} == {RequestKind.TAKE_OFF_MODE}
 
 
-@pytest.mark.fault(25)
+@pytest.mark.fault(68)
 def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
     rig = Rig().to(HandoverState.ARMING)
     rig.be(mode="AUTO.LOITER")
@@ -106,6 +106,7 @@ def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
     assert rig.is_in(HandoverState.RELEASED)
 
 
+@pytest.mark.fault(66)
 @pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
 def test_a_climb_by_positions_that_cannot_be_is_broken_off(state: HandoverState) -> None:
     rig = Rig("ardupilot").to(state)
