@@ -197,8 +197,8 @@ in `RETURNING`.
   for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
   has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
   `ctl engage` comes first. A flight that the pilot began is released.
-* `unsafe`: on the way up the positions cannot be the vehicle's own (they jump, they move while it stands on the ground,
-  they contradict what it feels or its own velocity), or are beyond the limits of `[sets]` by more than
+* `unsafe`: on the way up the positions cannot be the vehicle's own (they jump, or contradict what it feels or its own
+  velocity), or are beyond the limits of `[sets]` by more than
   `envelope.outside_m`, or none has come for a horizon. The climb is broken off and the vehicle asked to land; positions
   that cannot be its own are not relayed any more.
 * Landing: once the vehicle has shown that it lands, or has answered ACCEPTED, another mode is the pilot's. While it

@@ -10,7 +10,7 @@ from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Wat
 from uavctl.flight.estimator import Coming, FilterHistory
 from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
 from uavctl.flight.gating import SourceHealth
-from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, make_kalman
+from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
@@ -79,8 +79,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     inertial: str = ""
     at_bounds: tuple[int, ...] = ()  # inputs whose bias was told to be as large as what is flown against it
     watching: Watching = NOT_WATCHING  # state of the envelope check in this flight
-    aloft: Watching = NOT_WATCHING  # the same of positions while the vehicle is in the air and others fly it
-    stands: Array | None = None  # where it is armed on the ground (n_axes,) [m]; None where it is not
+    aloft: Watching = NOT_WATCHING  # the same of positions while the vehicle is armed and others fly it
     felt: tuple[Vec3, int] = (ZERO, 0)  # acceleration that the vehicle felt last [m/s²], and when [ns]
     breach: Breach | None = None  # the breach that it found; None for none
     # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since

@@ -122,7 +122,6 @@ _SOURCES = {
 
 
 AFRESH_STEPS = 3  # for which a plan is made anew once positions were taken back
-STANDS_M = 0.3  # that positions may be off while a vehicle stands on the ground, or has just left it
 _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # by us
 
 
@@ -169,8 +168,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     history, coming = act(controller.kalman, history, state.coming, inp.at_ns)
     intake = take(controller.kalman, controller.reach, history, state.trust, inp, controller.horizon, state.fresh)
     before = mode_of(state)
-    armed = inp.vehicle is not None and inp.vehicle.armed
-    in_the_air = armed and inp.vehicle is not None and not inp.vehicle.landed
+    vehicle = inp.vehicle
+    armed = vehicle is not None and vehicle.armed
     lost = intake.moved and before in _NOT_FLOWN
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
@@ -224,15 +223,14 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
     aloft, felt, strange, unsafe = NOT_WATCHING, state.felt, None, ""
-    stands = _stands(state, tick, controller) if armed and not in_the_air else None
-    strayed = stands is not None and _strayed(stands, tick, controller)
     if armed and lost:
         unsafe = "positions have jumped further than the vehicle can have come"
-    elif strayed:
-        unsafe = "positions move while the vehicle stands on the ground"
-    elif in_the_air and before in _NOT_FLOWN:
+    elif armed and before in _NOT_FLOWN:
         aloft, felt, strange = _aloft(state, tick, intake, inp, controller)
-        unsafe = _unsafe(tick, inp, controller) if strange is None else strange.text
+        if strange is not None:
+            unsafe = strange.text
+        elif vehicle is not None and not vehicle.landed:
+            unsafe = _unsafe(tick, inp, controller)
     inertial = _inertial(state, tick, inp, controller)
     bias = _flown_against(state, tick, inp)
     at_bounds = at_bound(bias, controller.kalman.bias_bounds, state.at_bounds) if bias else state.at_bounds
@@ -246,7 +244,6 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         coming=coming,
         aloft=aloft,
         felt=felt,
-        stands=stands,
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
     plan, mission = choice.state.plan, choice.state.mission
@@ -291,29 +288,14 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         link=link,
         land=mode is ControlMode.LAND and before is not ControlMode.LAND,
         unsafe=unsafe,
-        astray=(armed and lost) or strayed or strange is not None,
+        astray=(armed and lost) or strange is not None,
     )
-
-
-def _stands(state: ControlState, tick: Tick, controller: Controller) -> Array | None:
-    """Where a vehicle that is armed on the ground was (n_axes,) [m] when it was first seen so; None if not known."""
-    if state.stands is not None or tick.estimate is None:
-        return state.stands
-    return np.array(tick.estimate.mean)[list(controller.plant.position_index)]
-
-
-def _strayed(stands: Array, tick: Tick, controller: Controller) -> bool:
-    """Whether positions have left that place."""
-    if tick.estimate is None:
-        return False
-    now = np.array(tick.estimate.mean)[list(controller.plant.position_index)]
-    return bool((np.abs(now - stands) > STANDS_M).any())
 
 
 def _aloft(
     state: ControlState, tick: Tick, intake: MeasurementUpdate, inp: StepInput, controller: Controller
 ) -> tuple[Watching, tuple[Vec3, int], Breach | None]:
-    """Hold the positions of a vehicle in the air that others fly against its own senses.
+    """Hold the positions of an armed vehicle that others fly against its own senses.
 
     What its inertial sensors feel takes the place of what was sent. Without them its own velocity is all there is.
     """
