@@ -194,18 +194,18 @@ class ControlLoop:
         """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         from_vehicle = from_source = False
-        source = self._links[link]
-        for item in source.receive(data, at_ns):
+        understood = self._links[link].receive(data, at_ns)
+        for item in understood.items:
             from_vehicle = from_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._tell(item, at_ns)
             elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                from_source = source.settled
+                from_source = understood.settled
                 if self._relays:
-                    self._relay.take(item, source.attitude)
-        answers = tuple([self._send(link, answer, at_ns) for answer in source.answers()])
+                    self._relay.take(item, understood.attitude)
+        answers = tuple([self._send(link, answer, at_ns) for answer in understood.answers])
         return Received(answers, from_vehicle, from_source)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:

@@ -135,7 +135,7 @@ def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """What a link makes of the vehicle's words, with times since the first packet [s]."""
     whole = packets(name)
     link = make_links(config_of(name))[VEHICLE]
-    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns))
+    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns).items)
     return [((one.at_ns - whole[0].at_ns) * 1e-9, item) for one, item in heard if isinstance(item, VehicleStatus)]
 
 

@@ -171,18 +171,18 @@ class Preflight:
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
         from_vehicle = from_source = False
-        for one in self._links[link].receive(data, at_ns):
+        understood = self._links[link].receive(data, at_ns)
+        for one in understood.items:
             if isinstance(one, PositionSample):
-                from_source = self._links[link].settled
-                attitude = self._links[link].attitude
-                self._seen.add(one, attitude)
-                self._relay.take(one, attitude)
+                from_source = understood.settled
+                self._seen.add(one, understood.attitude)
+                self._relay.take(one, understood.attitude)
                 if self.guide is not None and self._is_safe:
                     angles_rad = self._seen.angles_rad
                     self.guide.take(at_ns, one.position_m, angles_rad[-1][1][2] if angles_rad else None)
             elif isinstance(one, VehicleStatus):
                 from_vehicle, self._autopilot = True, one.autopilot
-        answers = tuple(Outgoing(link=link, data=answer) for answer in self._links[link].answers())
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
         return Received(answers, from_vehicle, from_source)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:

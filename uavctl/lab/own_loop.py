@@ -129,12 +129,12 @@ class OwnLoop:
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram; its positions are relayed to the vehicle, at once or with the next tick."""
-        source = self._links[link]
-        for item in source.receive(data, at_ns):
+        understood = self._links[link].receive(data, at_ns)
+        for item in understood.items:
             if isinstance(item, PositionSample):
                 self.samples.append(item)
-                self.relay.take(item, source.attitude or LEVEL)  # of a body that is quite level no attitude is told
-        answers = tuple(Outgoing(link=link, data=answer) for answer in source.answers())
+                self.relay.take(item, understood.attitude or LEVEL)  # of a body that is quite level none is told
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
         return Received((*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers, True, True)
 
     def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
