@@ -197,7 +197,8 @@ class ControlLoop:
                 from_source = understood.settled
                 if self._relays:
                     self._relay.take(item, understood.attitude)
-        answers = tuple([self._outgoing(link, answer, at_ns) for answer in understood.answers])
+        asked = understood.answers
+        answers = tuple([self._outgoing(link, answer, at_ns) for answer in asked]) if asked else ()
         return Received(answers, from_vehicle, from_source, news)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
