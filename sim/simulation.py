@@ -139,7 +139,7 @@ class Peers:
             self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
     def receiver(self, at_ns: int) -> Send:
-        """Return what takes all that the controller sends at `at_ns`."""
+        """Return a function that takes the datagrams which the controller sends at `at_ns`."""
         return lambda outgoing: self.receive(outgoing.link, outgoing.data, at_ns)
 
     def truth(self) -> Truth:

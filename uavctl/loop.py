@@ -305,7 +305,7 @@ class ControlLoop:
         """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle.
 
         Returns:
-            What a person has to be told of it.
+            The event that tells it, for a person.
         """
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"

@@ -407,7 +407,7 @@ class Received(NamedTuple):
 
 
 class Ticked(msgspec.Struct, frozen=True, kw_only=True):
-    """What a tick knew, chose and has to tell, but for what was sent."""
+    """Result of a tick: its decision and messages; datagrams went to its `Send` already."""
 
     decision: Decision
     estimate: Estimate | None  # at the tick; None before the first sample

@@ -446,7 +446,7 @@ class LiveFeed:
         self.notices: deque[Event] = deque(maxlen=MAX_NOTICES)
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Take what a tick gave."""
+        """Keep a tick, and queue its messages."""
         del lateness_ns
         self.news.extend(ticked.news)
         self.notices.extend(ticked.notices)

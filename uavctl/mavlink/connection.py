@@ -176,7 +176,7 @@ Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event |
 
 
 class Understood(NamedTuple):
-    """What was understood of one datagram, and what was known of the newest sample by then, this one's or not."""
+    """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
 
     items: tuple[Item, ...]
     answers: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
