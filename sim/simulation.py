@@ -16,7 +16,7 @@ from sim.vehicle.linear import LinearVehicle, linear_model
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
 from uavctl.config.types import Config
-from uavctl.records import Flyer, Received, Truth, Vec3
+from uavctl.records import Flyer, Received, Send, Truth, Vec3
 
 # A simulated vehicle at one instant, for whoever watches.
 
@@ -137,6 +137,10 @@ class Peers:
         self._run(at_ns)
         if link == VEHICLE and not within(self._config.link.uplink_blackout, at_ns - self._start_ns):
             self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
+
+    def receiver(self, at_ns: int) -> Send:
+        """Return a function that takes the datagrams which the controller sends at `at_ns`."""
+        return lambda outgoing: self.receive(outgoing.link, outgoing.data, at_ns)
 
     def truth(self) -> Truth:
         """Return the true state now, and the input that acts from now on."""
@@ -286,5 +290,4 @@ class World:
     def _tick(self, tick: int) -> None:
         at_ns = self._start_ns + tick * self._tick_ns
         self.peers.converse(at_ns, self._flyer.receive)
-        for outgoing in self._flyer.tick(tick, at_ns):
-            self.peers.receive(outgoing.link, outgoing.data, at_ns)
+        self._flyer.tick(tick, at_ns, self.peers.receiver(at_ns))

@@ -16,6 +16,7 @@ from logs.recording.reader import read
 from logs.recording.summary import FlightSummary
 from logs.report.flight_page import write_report
 from uavctl.loop import ControlLoop
+from uavctl.records import Event
 
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
@@ -62,7 +63,7 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
 def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What fails in the controller fails the test too, though in flight the positions for the vehicle go on."""
 
-    def fail(loop: ControlLoop, error: Exception, at_ns: int) -> None:
+    def fail(loop: ControlLoop, error: Exception, at_ns: int) -> Event:
         raise error
 
     if "control_may_fail" not in request.fixturenames:

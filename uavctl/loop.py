@@ -16,7 +16,7 @@ from uavctl.config import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
 from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
-from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver
+from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
 from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
 from uavctl.mavlink.messages import Ack, Message, Text
@@ -30,10 +30,8 @@ from uavctl.records import (
     Datagram,
     Decision,
     Ending,
-    Estimate,
     Event,
     InertialSample,
-    LinkEstimate,
     Order,
     Outgoing,
     PositionSample,
@@ -41,9 +39,11 @@ from uavctl.records import (
     Record,
     Refused,
     RelayStats,
+    Send,
     Severity,
     Sink,
     StepInput,
+    Ticked,
     Timing,
     VehicleMotion,
     VehicleStatus,
@@ -58,10 +58,8 @@ MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
-MAX_NEWS = 64  # events that wait for a person
 FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
-MAX_NOTICES = 100  # that wait for the console
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
@@ -108,18 +106,10 @@ class ControlLoop:
         self._feels = config.estimator.inertial_std_mps2 > 0.0
         self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
-        self._last_step_ns = 0
         self._unsure_since_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
-        self.vehicle: VehicleStatus | None = None
+        self._vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
-        self.decision: Decision | None = None
-        self.estimate: Estimate | None = None
-        self.link: LinkEstimate | None = None
-        self.news: deque[Event] = deque(maxlen=MAX_NEWS)  # for a person; whoever tells them takes them
-        self.answers: tuple[tuple[Command, Event], ...] = ()  # the orders that the last tick took, each with its answer
-        self.notices: deque[Event] = deque(
-            maxlen=MAX_NOTICES
-        )  # of the hand-over, for a person; whoever shows them takes
+        self._decision: Decision | None = None
         self._orders: deque[Command] = deque()
         self._misled = False  # positions jumped under a vehicle on its way up or down: none is passed on any more
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
@@ -148,7 +138,7 @@ class ControlLoop:
         """Whether the vehicle has been handed over and nothing more will be sent."""
         if self._adrift:
             return not self._hand_over.carries
-        over = self.decision is not None and self.decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
+        over = self._decision is not None and self._decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
         return self._hand_over.finished or (over and not self._hand_over.busy)
 
     @property
@@ -162,7 +152,7 @@ class ControlLoop:
         if not self._relays:
             return None
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
-        at_ns = 0 if self.decision is None else self.decision.at_ns
+        at_ns = 0 if self._decision is None else self._decision.at_ns
         alone = bool(self.course.died) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
         return RelayStats(at_ns=at_ns, sent=self._relay.sent, kept=kept, last_ns=self._relay.last_ns, alone=alone)
 
@@ -195,19 +185,22 @@ class ControlLoop:
         """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         from_vehicle = from_source = False
-        source = self._links[link]
-        for item in source.receive(data, at_ns):
+        news: tuple[Event, ...] = ()
+        understood = self._links[link].receive(data, at_ns)
+        for item in understood.items:
             from_vehicle = from_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
-                self._tell(item, at_ns)
+                self._put("/uavctl/event", at_ns, item)
+                news = (*news, item) if item.code in FOR_A_PERSON else news
             elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                from_source = source.settled
+                from_source = understood.settled
                 if self._relays:
-                    self._relay.take(item, source.attitude)
-        answers = tuple([self._send(link, answer, at_ns) for answer in source.answers()])
-        return Received(answers, from_vehicle, from_source)
+                    self._relay.take(item, understood.attitude)
+        asked = understood.answers
+        answers = tuple([self._outgoing(link, answer, at_ns) for answer in asked]) if asked else ()
+        return Received(answers, from_vehicle, from_source, news)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
         """Take note that a connection has dropped datagrams unread.
@@ -221,50 +214,69 @@ class ControlLoop:
         for event in self._links[link].refused(counts, at_ns):
             self._put("/uavctl/event", at_ns, event)
 
-    def tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> Iterator[Outgoing]:
-        """Run the control tick of grid time `at_ns`; yields the bytes to send, each as soon as it is known.
+    def tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
+        """Run the control tick of grid time `at_ns`.
 
-        Heartbeats and TIMESYNC come before the decision, so that a solve does not delay a round trip.
+        Args:
+            send: is given the bytes to send, each as soon as it is known: heartbeats and TIMESYNC before the decision,
+                so that a solve does not delay a round trip.
         """
         inp = self._gather(tick, at_ns, missed_ticks, stop)
         if stop:
             self.course.stop(Cause.OPERATOR)  # unless who asks has said why
         for name, link in self._links.items():
             for data in link.due(at_ns):
-                yield self._send(name, data, at_ns)
+                send(self._outgoing(name, data, at_ns))
+        notices: list[Event] = []
         begun = self._stopwatch()
-        out = self._decide(inp)
-        self._last_step_ns = self._stopwatch() - begun
-        self.decision, self.estimate = out.decision, out.estimate
-        self.link = out.link or self.link
+        out = self._decide(inp, notices)
+        step_ns = self._stopwatch() - begun
+        self._decision = out.decision
         self._record(out, at_ns)
         self.course.let_go = self.let_go
-        self.course.see(at_ns, self.vehicle)
+        self.course.see(at_ns, self._vehicle)
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
-        autopilot = "" if self.vehicle is None else self.vehicle.autopilot
+        autopilot = "" if self._vehicle is None else self._vehicle.autopilot
         # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
         self._misled = self._misled or (out.astray and self._hand_over.has_begun)
         if self._relays and not self._misled and not disbelieves(self._state):
             for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
-                yield self._send(VEHICLE, data, at_ns)
+                send(self._outgoing(VEHICLE, data, at_ns))
+        answers: tuple[tuple[Command, Event], ...] = ()
         if self._adrift:
-            self._hand_over.look_up(at_ns, self.vehicle)
+            self._hand_over.look_up(at_ns, self._vehicle)
         else:
+            outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
             try:
-                yield from self._command(inp, out)
+                told = self._hand_over.update(self._view(inp, out))
+                answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
+                notices += self._noted(told, at_ns)
+                self._command(told, out, at_ns, outgoing.append)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
                 self._adrift = True
-                self._die(error, at_ns)
+                notices.append(self._die(error, at_ns))
+            for one in outgoing:
+                send(one)
         self.course.over = self.finished
         self._record_stats(at_ns)
+        return Ticked(
+            decision=out.decision,
+            estimate=out.estimate,
+            link=out.link,
+            vehicle=self._vehicle,
+            answers=answers,
+            news=tuple([event for event in out.events if event.code in FOR_A_PERSON]),
+            notices=tuple(notices),
+            step_ns=step_ns,
+        )
 
-    def _decide(self, inp: StepInput) -> StepOutput:
+    def _decide(self, inp: StepInput, notices: list[Event]) -> StepOutput:
         """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
         if not self.course.died:
             try:
                 self._state, out = step(self._state, inp, self._controller)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
-                self._die(error, inp.at_ns)
+                notices.append(self._die(error, inp.at_ns))
                 return self._without_core(inp, land=self._lands or self._hand_over.ours)
             return out
         return self._without_core(inp, land=False)
@@ -274,7 +286,7 @@ class ControlLoop:
         decision = Decision(
             tick=inp.tick,
             at_ns=inp.at_ns,
-            step=0 if self.decision is None else self.decision.step,
+            step=0 if self._decision is None else self._decision.step,
             boundary=False,
             mode=ControlMode.STOPPED,
             age_steps=None,
@@ -291,14 +303,18 @@ class ControlLoop:
         )
         return StepOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
-    def _die(self, error: Exception, at_ns: int) -> None:
-        """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle."""
+    def _die(self, error: Exception, at_ns: int) -> Event:
+        """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle.
+
+        Returns:
+            The event that tells it, for a person.
+        """
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
         self.course.died = self.course.died or f"{type(error).__name__}: {error}{where}"
         event = Event(at_ns=at_ns, severity=Severity.ERROR, code="control", text=f"{FAILED} {self.course.died}")
         self._put("/uavctl/event", at_ns, event)
-        self.notices.append(event)
+        return event
 
     def order(self, command: Command) -> bool:
         """Queue an order of the operator for the next tick; False if too many wait already."""
@@ -311,19 +327,19 @@ class ControlLoop:
     def against(self, order: Order) -> str:
         """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
-        return against_moving(self.who_flies, self.vehicle) if moves else ""
+        return against_moving(self.who_flies, self._vehicle) if moves else ""
 
-    def timing(self, tick: int, at_ns: int, lateness_ns: int, send_ns: int) -> None:
-        """Record what the shell measured around the last tick."""
-        estimate = self.estimate
+    def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
+        """Record what the shell measured around a tick."""
+        estimate, at_ns = ticked.estimate, ticked.decision.at_ns
         self._put(
             "/uavctl/timing",
             at_ns,
             Timing(
-                tick=tick,
+                tick=ticked.decision.tick,
                 at_ns=at_ns,
                 lateness_ns=lateness_ns,
-                step_ns=self._last_step_ns,
+                step_ns=ticked.step_ns,
                 send_ns=send_ns,
                 capture_to_send_ns=None if estimate is None else at_ns + send_ns - estimate.captured_ns,
             ),
@@ -336,7 +352,7 @@ class ControlLoop:
             tick=tick,
             at_ns=at_ns,
             samples=samples,
-            vehicle=self._hand_over.flown(at_ns, self.vehicle),
+            vehicle=self._hand_over.flown(at_ns, self._vehicle),
             motion=self._motion,
             inertial=self._inertial,
             missed_ticks=missed_ticks,
@@ -378,7 +394,7 @@ class ControlLoop:
         self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
         flown = self._hand_over.state is HandoverState.ENGAGED
         left = [status for status in heard if flown and self._hand_over.has_left(status)]
-        self.vehicle = next(iter(left or heard[::-1]), self.vehicle)
+        self._vehicle = next(iter(left or heard[::-1]), self._vehicle)
         if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
             self._unsure_since_ns = None
         return _newest_of_each(samples), tuple(heard), tuple(words)
@@ -392,40 +408,35 @@ class ControlLoop:
             self._put("/uavctl/plan", at_ns, out.plan)
         self._put("/uavctl/decision", at_ns, out.decision)
         for event in out.events:
-            self._tell(event, at_ns)
+            self._put("/uavctl/event", at_ns, event)
 
-    def _tell(self, event: Event, at_ns: int) -> None:
-        self._put("/uavctl/event", at_ns, event)
-        if event.code in FOR_A_PERSON:
-            self.news.append(event)
-
-    def _command(self, inp: StepInput, out: StepOutput) -> Iterator[Outgoing]:
-        """Yield what the vehicle is sent: a setpoint, a request, or nothing."""
-        at_ns = inp.at_ns
-        told = self._hand_over.update(self._view(inp, out))
+    def _noted(self, told: HandoverStep, at_ns: int) -> Iterator[Event]:
+        """Note what the hand-over did; yields what a person has to be told of it: whoever ordered gets the answer."""
         if told.passage is not None:
-            self.course.turn(told.passage, self.vehicle)
-        self.answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
+            self.course.turn(told.passage, self._vehicle)
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
-            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:  # whoever ordered gets the answer
-                self.notices.append(event)
+            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:
+                yield event
+
+    def _command(self, told: HandoverStep, out: StepOutput, at_ns: int, send: Send) -> None:
+        """Send the vehicle what the hand-over wants: a setpoint, a request, or nothing."""
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
         if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
             if told.sending is Sending.SETPOINTS:
                 self._controlled_ns = at_ns
-            yield self._send(VEHICLE, link.setpoint(out.setpoint), at_ns)
+            send(self._outgoing(VEHICLE, link.setpoint(out.setpoint), at_ns))
         if sure and told.ask is not None:
-            yield self._send(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns)
+            send(self._outgoing(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns))
         if self._hand_over.ours and self._hand_over.state in (
             HandoverState.READY,
             HandoverState.MODE,
             HandoverState.ARMING,
         ):
             for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
-                yield self._send(VEHICLE, data, at_ns)
+                send(self._outgoing(VEHICLE, data, at_ns))
 
     def _answers(
         self, commands: tuple[Command, ...], core: tuple[Event, ...], hand_over: tuple[Event, ...]
@@ -452,7 +463,7 @@ class ControlLoop:
             unfit = f"the newest position is {estimate.age_s:.1f} s old"
         return HandoverView(
             at_ns=inp.at_ns,
-            vehicle=self.vehicle,
+            vehicle=self._vehicle,
             up_s=self._links[VEHICLE].vehicle_up_s(inp.at_ns),
             ready=out.setpoint is not None,
             land=out.land,
@@ -465,7 +476,8 @@ class ControlLoop:
             commands=inp.commands,
         )
 
-    def _send(self, link: str, data: bytes, at_ns: int) -> Outgoing:
+    def _outgoing(self, link: str, data: bytes, at_ns: int) -> Outgoing:
+        """Bytes that are about to be sent, recorded as such."""
         self._put(raw_topic(link, outgoing=True), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=True, data=data))
         return Outgoing(link=link, data=data)
 

@@ -7,7 +7,7 @@ written to a recording and read back without loss.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from enum import StrEnum
 from functools import cache
 from typing import NamedTuple, Protocol
@@ -389,12 +389,34 @@ class Outgoing(Record, frozen=True, kw_only=True):
     data: bytes
 
 
+Send = Callable[[Outgoing], None]
+"""Takes bytes for a connection."""
+
+
+def to_nobody(outgoing: Outgoing) -> None:
+    """Take bytes of a loop that nobody listens to, as in a replay; a `Send`."""
+
+
 class Received(NamedTuple):
     """Origin of a datagram, and the answers to send at once: never anything that moves the vehicle."""
 
     answers: tuple[Outgoing, ...]  # to requests for our time
     from_vehicle: bool  # it came from the vehicle that is flown, not from others on the same port
     from_source: bool  # it held a position of a source that has spoken for a while
+    news: tuple[Event, ...] = ()  # that it brought, for a person
+
+
+class Ticked(msgspec.Struct, frozen=True, kw_only=True):
+    """Result of a tick: its decision and messages; datagrams went to its `Send` already."""
+
+    decision: Decision
+    estimate: Estimate | None  # at the tick; None before the first sample
+    link: LinkEstimate | None  # at boundaries that were not missed
+    vehicle: VehicleStatus | None  # newest state that the vehicle has told; None before the first
+    answers: tuple[tuple[Command, Event], ...]  # the orders that the tick took, each with its answer
+    news: tuple[Event, ...]  # of the core, for a person
+    notices: tuple[Event, ...]  # of the hand-over, for a person; and that the controller has failed
+    step_ns: int  # time that the core took, by the stopwatch
 
 
 class Flyer(Protocol):
@@ -404,6 +426,6 @@ class Flyer(Protocol):
         """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
         ...
 
-    def tick(self, tick: int, at_ns: int) -> Iterable[Outgoing]:
-        """Run the control tick of the grid time `at_ns`; gives the bytes to send, to be taken to the last one."""
+    def tick(self, tick: int, at_ns: int, send: Send) -> object:
+        """Run the control tick of the grid time `at_ns`; `send` is given the bytes to send, each once it is known."""
         ...

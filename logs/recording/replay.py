@@ -34,6 +34,7 @@ from uavctl.records import (
     Refused,
     Sink,
     StepInput,
+    to_nobody,
 )
 from uavctl.smpc.plant import Plant
 
@@ -489,7 +490,7 @@ def replay(
             found.begin(record)
             for command in record.commands:
                 loop.order(command)
-            deque(loop.tick(record.tick, record.at_ns, record.missed_ticks, record.stop), maxlen=0)
+            loop.tick(record.tick, record.at_ns, to_nobody, record.missed_ticks, record.stop)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import struct
 import tomllib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -23,7 +23,7 @@ from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import scan
-from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput
+from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
 
@@ -429,18 +429,18 @@ def replay_tlog(
     for at_ns, data in packets:
         start_ns = at_ns if start_ns is None else start_ns
         while start_ns + tick * tick_ns < at_ns:
-            deque(loop.tick(tick, start_ns + tick * tick_ns), maxlen=0)
+            loop.tick(tick, start_ns + tick * tick_ns, to_nobody)
             tick += 1
         loop.receive(link, data, at_ns)
         datagrams += 1
     if start_ns is None:
         return _figures(collector, link, datagrams, tick)
     end_ns = start_ns + tick * tick_ns
-    deque(loop.tick(tick, end_ns), maxlen=0)  # sees the last packets
+    loop.tick(tick, end_ns, to_nobody)  # sees the last packets
     tick += 1
     collector.over, later = True, tick
     while collector.stats[link].at_ns < end_ns:  # they are told once a second
-        deque(loop.tick(later, start_ns + later * tick_ns), maxlen=0)
+        loop.tick(later, start_ns + later * tick_ns, to_nobody)
         later += 1
     return _figures(collector, link, datagrams, tick)
 

@@ -19,6 +19,7 @@ from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
+from uavctl.records import Outgoing, to_nobody
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
@@ -137,7 +138,9 @@ class Answering(Hand):
             super().rest(0.05, armed=armed)
 
     def answer(self) -> None:
-        for one in self.flight.tick(0, self.at_ns):
+        outgoing: list[Outgoing] = []
+        self.flight.tick(0, self.at_ns, outgoing.append)
+        for one in outgoing:
             for message in decode(one.data):
                 if message.get_type() == "TIMESYNC" and one.link == "vehicle":
                     theirs = 10**12 + round(self.at_ns * (1.0 - self.drift))
@@ -259,7 +262,9 @@ def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
         at_ns = tick * 50 * MS
         for arrival_ns, link, data in peers.advance(at_ns):
             flight.receive(link, data, arrival_ns)
-        for one in flight.tick(tick, at_ns):
+        outgoing: list[Outgoing] = []
+        flight.tick(tick, at_ns, outgoing.append)
+        for one in outgoing:
             peers.receive(one.link, one.data, at_ns)
             for message in decode(one.data):
                 kinds.add(message.get_type())
@@ -301,7 +306,7 @@ def told_by_motive(*place: float) -> Preflight:
     )
     for n in range(60):
         flight.receive("mocap", peer.send("odometry", 10**9 + 50_000 * n, *level), n * 50 * MS)
-        list(flight.tick(n, n * 50 * MS))
+        flight.tick(n, n * 50 * MS, to_nobody)
     return flight
 
 
@@ -372,5 +377,5 @@ def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
     flight = Preflight(load_config("room-hahn-stursberg"), make_links, 0)
     for n, data in enumerate(chunks):
         flight.receive("vehicle" if n % 2 else "mocap", data, n * MS)
-        list(flight.tick(n, n * MS))
+        flight.tick(n, n * MS, to_nobody)
     assert flight.items(S)

@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 import pytest
+from ticked_rig import ticked
 
-from uavctl.clock import Due
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import (
     MAX_CLIENTS,
@@ -52,7 +52,6 @@ class Flight:
     """Takes orders and decides on them in the next tick: north of 1 m is refused."""
 
     def __init__(self, room: int = 16) -> None:
-        self.answers: tuple[tuple[Command, Event], ...] = ()
         self.orders: list[Command] = []
         self.taken: list[Command] = []
         self._room = room
@@ -67,10 +66,11 @@ class Flight:
     def against(self, order: Order) -> str:
         return f"{order} is for nothing" if order in self.idle else ""
 
-    def tick(self, at_ns: int) -> None:
-        self.answers = tuple((one, self._decide(one, at_ns)) for one in reversed(self.orders))  # in any order
+    def tick(self, at_ns: int) -> tuple[tuple[Command, Event], ...]:
+        answers = tuple((one, self._decide(one, at_ns)) for one in reversed(self.orders))  # in any order
         self.taken += self.orders
         self.orders.clear()
+        return answers
 
     def _decide(self, command: Command, at_ns: int) -> Event:
         good = command.position_m is None or command.position_m[0] <= 1.0
@@ -94,8 +94,7 @@ class Rig:
     def ticks(self, count: int = 1, step_ns: int = 50_000_000) -> None:
         for _ in range(count):
             self.now_ns += step_ns
-            self.flight.tick(self.now_ns)
-            self.server.after_tick(Due(0, self.now_ns, 0), 0)
+            self.server.after_tick(ticked(self.now_ns, answers=self.flight.tick(self.now_ns)), 0)
 
     def client(self) -> socket.socket:
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import pairwise
 
 import pytest
@@ -15,7 +15,7 @@ from sim_rig import decode
 from logs.recording.replay import replay
 from uavctl.errors import UavctlError
 from uavctl.io.base import Connection
-from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Outgoing, Refused, Timing
+from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Outgoing, Refused, Send, Ticked, Timing
 
 
 def test_it_flies_records_its_timing_and_hands_over_at_the_end() -> None:
@@ -68,6 +68,15 @@ def test_a_flood_of_such_questions_is_answered_in_part_and_costs_no_tick() -> No
     assert 100 < len(answers(flooded)) <= 8 * 21
     assert flooded.memory.of(Decision) == calm.memory.of(Decision)
     assert flooded.memory.of(LinkStats)[-2].bad["timesync-flood"] > 1500
+
+
+def test_words_of_the_vehicle_are_told_a_person_as_they_come_and_once() -> None:
+    bench = Bench('solver.method="exact"')
+    at_ns = SECOND + 17_000_123
+    bench.arrives = [(at_ns, Peer(1, 1).send("statustext", 2, b"PreArm: no"))]
+    bench.fly(duration_s=1.5, stop_limit_s=0.0)
+    ((text, told_ns),) = bench.told
+    assert "PreArm: no" in text and told_ns == at_ns
 
 
 @pytest.mark.fault(21)
@@ -140,11 +149,13 @@ class Stalled(Bench):
         if in_step:
             self._tick, self.loop.tick = self.loop.tick, self.stalling_tick  # type: ignore[method-assign]
 
-    def stalling_tick(self, tick: int, at_ns: int, missed_ticks: int = 0, stop: bool = False) -> Iterator[Outgoing]:
-        for message in self._tick(tick, at_ns, missed_ticks, stop):
+    def stalling_tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
+        def late(message: Outgoing) -> None:
             if not self.woke_ns and at_ns >= self.silent_from_ns and len(message.data) > 50:
                 self.stall()
-            yield message
+            send(message)
+
+        return self._tick(tick, at_ns, late, missed_ticks, stop)
 
     def stall(self) -> None:
         begun_ns = self.now_ns

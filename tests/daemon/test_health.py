@@ -8,10 +8,9 @@ from loopback_rig import Memory, make_loop
 
 from sim.simulation import Peers
 from uavctl.cli.ctl import _relay
-from uavctl.clock import Due
 from uavctl.config import load_config
 from uavctl.daemon.health import Health, HealthWatch, RecorderHealth, RelayHealth, line
-from uavctl.records import ControlMode
+from uavctl.records import ControlMode, Ticked
 
 TICK_NS = 50_000_000
 
@@ -28,6 +27,7 @@ class Flight:
         self.warning = ""
         self.watch = HealthWatch(self.loop, config, ("one", "udpin://x:1", 7), self._recorder, self.lines.append)
         self.tick = 0
+        self.ticked: Ticked | None = None  # the last one
 
     def _recorder(self) -> RecorderHealth:
         ok = not self.dropped
@@ -40,9 +40,8 @@ class Flight:
             at_ns = self.tick * TICK_NS
             for arrival_ns, link, data in self.peers.advance(at_ns):
                 self.loop.receive(link, data, arrival_ns)
-            for one in self.loop.tick(self.tick, at_ns, missed):
-                self.peers.receive(one.link, one.data, at_ns)
-            self.watch.after_tick(Due(self.tick, at_ns, missed), lateness_ns)
+            self.ticked = self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), missed)
+            self.watch.after_tick(self.ticked, lateness_ns)
             self.tick += 1
         return self.watch.look()
 
@@ -58,8 +57,9 @@ def test_a_flight_in_figures() -> None:
     flight = Flight("room-hahn-stursberg", "link.loss=0.0")
     health = flight.run(200, lateness_ns=700_000)
     assert health.mode is ControlMode.TRACK and health.running_s == 199 * TICK_NS * 1e-9
-    estimate, decision = flight.loop.estimate, flight.loop.decision
-    assert estimate is not None and decision is not None and decision.target is not None
+    assert flight.ticked is not None
+    estimate, decision = flight.ticked.estimate, flight.ticked.decision
+    assert estimate is not None and decision.target is not None
     # x = (position, velocity, acceleration) of north, east and down
     assert health.position_m == dict(zip(("north", "east", "down"), estimate.mean[0::3], strict=True))
     assert health.velocity_mps == dict(zip(("north", "east", "down"), estimate.mean[1::3], strict=True))

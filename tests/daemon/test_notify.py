@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from ticked_rig import ticked
 
-from uavctl.clock import Due
 from uavctl.daemon.health import Notifier
 from uavctl.errors import UsageError
 
@@ -46,7 +46,7 @@ def manager(tmp_path: Path) -> Iterator[tuple[Manager, dict[str, str]]]:
 
 def ticks(notifier: Notifier, first: int, last: int) -> None:
     for tick in range(first, last):
-        notifier.after_tick(Due(tick, tick * TICK_NS, 0), 0)
+        notifier.after_tick(ticked(tick * TICK_NS), 0)
 
 
 def test_ready_with_the_first_tick_then_four_signs_of_life_a_watchdog_time(

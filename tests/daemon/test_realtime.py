@@ -9,8 +9,8 @@ import weakref
 from collections.abc import Iterator
 
 import pytest
+from ticked_rig import ticked
 
-from uavctl.clock import Due
 from uavctl.daemon import realtime as module
 from uavctl.daemon.realtime import Collector, Outcome, collected_between_ticks, realtime
 
@@ -66,11 +66,11 @@ def test_garbage_goes_once_a_second_and_only_after_a_tick() -> None:
     collector = Collector()
     gc.disable()
     try:
-        collector.after_tick(Due(0, 0, 0), 0)
+        collector.after_tick(ticked(0), 0)
         seen = weakref.ref(_Ring())
-        collector.after_tick(Due(19, SECOND - 1, 0), 0)
+        collector.after_tick(ticked(SECOND - 1), 0)
         assert seen() is not None
-        collector.after_tick(Due(20, SECOND, 0), 0)
+        collector.after_tick(ticked(SECOND), 0)
         assert seen() is None
     finally:
         gc.enable()

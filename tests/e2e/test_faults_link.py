@@ -45,7 +45,7 @@ class Source:
         got = []
         for _ in range(count):
             self.us, self.at_ns = self.us + 40_000, self.at_ns + 40 * MS
-            got += samples(self.link.receive(CAMERA.vision(self.us), self.at_ns + delay_ns))
+            got += samples(self.link.receive(CAMERA.vision(self.us), self.at_ns + delay_ns).items)
         return got
 
 
@@ -56,8 +56,8 @@ class Source:
 @pytest.mark.parametrize("bit", range(len(GOOD) * 8))
 def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) -> None:
     link = make_link()
-    assert samples(link.receive(flip(GOOD, bit), NOW)) == []
-    assert len(samples(link.receive(GOOD, NOW + MS))) == 1
+    assert samples(link.receive(flip(GOOD, bit), NOW).items) == []
+    assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1
     assert sum(link.stats(NOW).bad.values()) == 1
 
 
@@ -65,23 +65,23 @@ def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) 
 @pytest.mark.parametrize("length", [0, 1, 5, 11, len(GOOD) - 1])
 def test_row_11_a_truncated_datagram_costs_nothing_else(length: int) -> None:
     link = make_link()
-    assert samples(link.receive(GOOD[:length], NOW)) == []
-    assert len(samples(link.receive(GOOD, NOW + MS))) == 1
+    assert samples(link.receive(GOOD[:length], NOW).items) == []
+    assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1
     assert link.stats(NOW).bad == ({"truncated": 1} if length else {})
 
 
 @pytest.mark.fault(11)
 def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
     link = make_link()
-    (event,) = events(link.receive(GOOD * 2000, NOW))
+    (event,) = events(link.receive(GOOD * 2000, NOW).items)
     assert event.text == "link vehicle: dropped 1 oversize"
-    assert len(samples(link.receive(GOOD, NOW + MS))) == 1
+    assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1
 
 
 @pytest.mark.fault(10, 11)
 def test_rows_10_and_11_are_reported_once_a_second() -> None:
     link = make_link()
-    told = [event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS))]
+    told = [event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS).items)]
     assert len(told) == 5
     assert {event.severity for event in told} == {Severity.WARNING}
     assert sum(event.count for event in told) == 1 + 4 * 200
@@ -97,7 +97,7 @@ def test_rows_10_and_11_are_reported_once_a_second() -> None:
 @pytest.mark.parametrize("make", [CAMERA.vision, Peer(1, 1).local_position])
 def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., bytes], axis: str, value: float) -> None:
     link = make_link(source=SourceConfig(messages=("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED")))
-    found = samples(link.receive(make(9, **{axis: value}), NOW))
+    found = samples(link.receive(make(9, **{axis: value}), NOW).items)
     assert [refusal(one, NOW, build_estimator(load_config("room-hahn-stursberg"))) for one in found] == [
         "sample-invalid"
     ] * len(found)
@@ -111,16 +111,16 @@ def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., by
 @pytest.mark.fault(16)
 def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
     link, ours, other = make_link(), Peer(1, 1), Peer(2, 1)
-    assert len(statuses(link.receive(ours.heartbeat(), NOW))) == 1
+    assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
     told = []
     for n in range(10):
-        items = link.receive(other.heartbeat(), NOW + n * 200 * MS)
+        items = link.receive(other.heartbeat(), NOW + n * 200 * MS).items
         assert statuses(items) == []
         told += events(items)
     assert [(event.code, event.severity) for event in told] == [("second-vehicle", Severity.ERROR)] * 2
     assert link.stats(NOW).bad == {"second-vehicle": 10}
     assert read(link.ask(RequestKind.LAND, 0.0))[0].target_system == 1
-    assert len(statuses(link.receive(ours.heartbeat(), NOW))) == 1
+    assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
 
 
 @pytest.mark.fault(16)
@@ -147,7 +147,7 @@ def test_row_17_the_wall_clock_is_never_asked(monkeypatch: pytest.MonkeyPatch) -
     with monkeypatch.context() as patched:
         patched.setattr(time, "time_ns", refuse)
         patched.setattr(time, "monotonic_ns", refuse)
-        (sample,) = samples(link.receive(CAMERA.vision(10**9 + 80_000), NOW + 80 * MS))
+        (sample,) = samples(link.receive(CAMERA.vision(10**9 + 80_000), NOW + 80 * MS).items)
     assert sample.received_ns == NOW + 80 * MS
 
 
@@ -157,7 +157,7 @@ def test_row_18_stamps_from_the_future_are_refused() -> None:
     source = Source(link)
     source.send(30)
     for ahead_us in (25_000, 10**6, 3_600 * 10**6, 2**63, 2**64 - 1 - source.us):
-        assert samples(link.receive(CAMERA.vision(source.us + ahead_us), source.at_ns + 30 * MS)) == []
+        assert samples(link.receive(CAMERA.vision(source.us + ahead_us), source.at_ns + 30 * MS).items) == []
     assert link.stats(NOW).bad == {"future-stamp": 5}
     (sample,) = source.send()
     assert sample.captured_ns == source.at_ns + 30 * MS
@@ -168,7 +168,7 @@ def test_row_18_the_boot_clock_wraps_after_49_7_days() -> None:
     link, vehicle = make_link(source=SourceConfig(messages=("LOCAL_POSITION_NED",))), Peer(1, 1)
     for n in range(200):
         at_ns = NOW + n * 40 * MS
-        (sample,) = samples(link.receive(vehicle.local_position((2**32 - 4_000 + 40 * n) % 2**32), at_ns))
+        (sample,) = samples(link.receive(vehicle.local_position((2**32 - 4_000 + 40 * n) % 2**32), at_ns).items)
         assert sample.captured_ns == at_ns
     assert link.stats(NOW).bad == {}
 
@@ -234,8 +234,10 @@ def told_while(link: MavlinkConnection, seconds: int, slow: Callable[[int], bool
         for raw in (mavlink.MAVLink(None).decode(bytearray(data)) for data in link.due(at_ns)):
             if raw.get_type() == "TIMESYNC":
                 trip_ns = (40 if slow(n) else 2) * MS
-                found += link.receive(CAMERA.send("timesync", at_ns + trip_ns // 2 - OFFSET, raw.ts1), at_ns + trip_ns)
-        found += link.receive(CAMERA.vision((at_ns - OFFSET) // 1000), at_ns + 50 * MS)
+                found += link.receive(
+                    CAMERA.send("timesync", at_ns + trip_ns // 2 - OFFSET, raw.ts1), at_ns + trip_ns
+                ).items
+        found += link.receive(CAMERA.vision((at_ns - OFFSET) // 1000), at_ns + 50 * MS).items
     return [one for one in found if isinstance(one, Event)]
 
 
@@ -286,25 +288,25 @@ def test_row_20_the_restart_is_told_once() -> None:
     source.send(50)
     told = []
     for n in range(20):
-        told += events(link.receive(CAMERA.vision(40_000 * (n + 1)), source.at_ns + (n + 1) * 40 * MS))
+        told += events(link.receive(CAMERA.vision(40_000 * (n + 1)), source.at_ns + (n + 1) * 40 * MS).items)
     assert [event.code for event in told].count("clock-resync") == 1
 
 
 @pytest.mark.fault(20)
 def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     link, vehicle, hand_over = make_link(), Peer(1, 1), HandOver()
-    (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW))
+    (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW).items)
     assert hand_over.update(HandoverView(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
     for n in range(3):
         link.receive(vehicle.local_position(60_000 + n * 100), NOW)
     later = NOW + 5 * SECOND
     link.receive(vehicle.local_position(700), later)
-    items = link.receive(vehicle.local_position(800), later)
+    items = link.receive(vehicle.local_position(800), later).items
     assert [event.code for event in events(items)] == ["vehicle-reboot"]
     (booted,) = statuses(items)
     assert hand_over.update(HandoverView(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
     assert hand_over.state is HandoverState.RELEASED  # though it says that it is armed, in OFFBOARD
-    items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND)
+    items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND).items
     assert not events(items)  # told once, and a heartbeat's status alone tells nothing
 
 
@@ -372,7 +374,7 @@ def fuzz(link: MavlinkConnection, count: int, seed: int) -> Counter[str]:
     for _ in range(count):
         at_ns += numbers.randrange(20 * MS)
         link.due(at_ns)
-        for item in link.receive(mutate(numbers.choice(SEEDS)(at_ns // 1000), numbers), at_ns):
+        for item in link.receive(mutate(numbers.choice(SEEDS)(at_ns // 1000), numbers), at_ns).items:
             check(item)
             kinds[type(item).__name__] += 1
     return kinds

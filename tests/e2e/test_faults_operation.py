@@ -8,7 +8,7 @@ from sim_rig import decode
 
 from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.records import ControlMode, Datagram, Event, Setpoint, Truth
+from uavctl.records import ControlMode, Datagram, Event, Outgoing, Setpoint, Ticked, Truth
 
 TICK_NS = 50_000_000
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
@@ -24,6 +24,7 @@ class Flight:
         self.truths: list[Truth] = []
         self.peers = Peers(config, 0, on_truth=self.truths.append)
         self.modes: list[ControlMode] = []
+        self.ticked: Ticked | None = None
         self._tick = 0
 
     def run(self, seconds: float, *, uplink: bool = True, heartbeats: bool = True) -> list[str]:
@@ -34,13 +35,14 @@ class Flight:
             for arrival_ns, link, data in self.peers.advance(at_ns):
                 if heartbeats or link != "vehicle":
                     self.loop.receive(link, data, arrival_ns)
-            for one in self.loop.tick(self._tick, at_ns):
+            outgoing: list[Outgoing] = []
+            self.ticked = self.loop.tick(self._tick, at_ns, outgoing.append)
+            for one in outgoing:
                 if one.link == "vehicle":
                     sent += [message.get_type() for message in decode(one.data)]
                 if uplink or one.link != "vehicle":
                     self.peers.receive(one.link, one.data, at_ns)
-            assert self.loop.decision is not None
-            self.modes.append(self.loop.decision.mode)
+            self.modes.append(self.ticked.decision.mode)
             self._tick += 1
         return sent
 
@@ -59,7 +61,8 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
     assert flight.truths[-1].mode == "OFFBOARD"
     flight.run(3.0, uplink=False)  # COM_OF_LOSS_T is 1 s, a heartbeat comes each second
     assert flight.truths[-1].mode != "OFFBOARD"
-    assert flight.loop.vehicle is not None and not flight.loop.vehicle.external  # seen in its heartbeats
+    assert flight.ticked is not None and flight.ticked.vehicle is not None
+    assert not flight.ticked.vehicle.external  # seen in its heartbeats
     # Nothing is streamed any more, and no mode is asked for: not even once the way is free again.
     assert set(flight.run(5.0)) <= {"HEARTBEAT", "TIMESYNC"}
     assert flight.modes[-1] is ControlMode.WAIT

@@ -12,7 +12,22 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import MAX_SAMPLES
-from uavctl.records import ControlMode, Datagram, Event, Setpoint, SetpointSource, StepInput
+from uavctl.mavlink.codec import UnsendableError
+from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.handover import HandOver, HandoverStep
+from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.records import (
+    ORDER_ACCEPTED,
+    Command,
+    ControlMode,
+    Datagram,
+    Event,
+    Order,
+    Outgoing,
+    Setpoint,
+    SetpointSource,
+    StepInput,
+)
 
 TICK_NS = 50_000_000
 OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)
@@ -27,6 +42,9 @@ class Rig:
         self.loop = make_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0)
         self.tick = 0
+        self.mode: ControlMode | None = None  # of the last tick
+        self.answers: tuple[tuple[Command, Event], ...] = ()  # the same
+        self.notices: list[str] = []  # the same, by code
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def run(self, ticks: int, *, stop: bool = False, deaf: bool = False, listening: bool = True) -> list[str]:
@@ -37,7 +55,11 @@ class Rig:
             for arrival_ns, link, data in self.peers.advance(at_ns):
                 if not (deaf and link == "vehicle"):
                     self.loop.receive(link, data, arrival_ns)
-            for one in self.loop.tick(self.tick, at_ns, stop=stop):
+            outgoing: list[Outgoing] = []
+            ticked = self.loop.tick(self.tick, at_ns, outgoing.append, stop=stop)
+            self.mode, self.answers = ticked.decision.mode, ticked.answers
+            self.notices = [event.code for event in ticked.notices]
+            for one in outgoing:
                 if one.link == "vehicle":
                     sent += [message.get_type() for message in decode(one.data)]
                 if listening:
@@ -60,7 +82,7 @@ def test_an_armed_vehicle_in_its_external_mode_gets_one_setpoint_a_tick() -> Non
     rig = Rig()
     rig.run(4)  # the first position is under way
     assert rig.run(100).count(SETPOINT) == 100
-    assert rig.loop.decision is not None and rig.loop.decision.mode is ControlMode.TRACK
+    assert rig.mode is ControlMode.TRACK
 
 
 def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back() -> None:
@@ -206,10 +228,59 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
         if after.tick % 10 == 0:
             after.heartbeat(OFFBOARD, armed=False)
         sent += after.run(1, deaf=True)
-    assert after.loop.decision is not None and after.loop.decision.mode is ControlMode.WAIT
+    assert after.mode is ControlMode.WAIT
     assert set(sent) == {"HEARTBEAT", "TIMESYNC", SETPOINT, LAND}
     commands = {
         m.command for d in after.memory.of(Datagram) if d.outgoing for m in decode(d.data) if m.get_type() == LAND
     }
     assert commands == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}  # neither arming nor a mode
     assert {s.accel_mps2 for s in after.memory.of(Setpoint)} == {(0.0, 0.0, 0.0)}
+
+
+@pytest.mark.usefixtures("control_may_fail")
+def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_before_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, hold = Rig(), Command(order=Order.HOLD)
+    rig.run(40)
+    assert rig.loop.order(hold)
+    rig.run(1)
+    assert [(command, event.code) for command, event in rig.answers] == [(hold, ORDER_ACCEPTED)]
+
+    def faulty(hand_over: HandOver, view: HandoverView) -> HandoverStep:
+        raise LookupError("no such state")
+
+    monkeypatch.setattr(HandOver, "update", faulty)
+    for notices in (["control"], []):  # the failure is told once
+        assert rig.loop.order(hold)
+        assert SETPOINT not in rig.run(1)
+        assert rig.answers == () and rig.notices == notices
+
+
+@pytest.mark.usefixtures("control_may_fail")
+def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, land = Rig("fallback.brake_s=0.0"), Command(order=Order.LAND)
+    rig.run(40)
+
+    def faulty(link: MavlinkConnection, setpoint: Setpoint) -> bytes:
+        raise UnsendableError("not finite")
+
+    monkeypatch.setattr(MavlinkConnection, "setpoint", faulty)
+    assert rig.loop.order(land)
+    assert SETPOINT not in rig.run(1)
+    assert [(command, event.code) for command, event in rig.answers] == [(land, ORDER_ACCEPTED)]
+    assert rig.notices == ["control"]
+
+
+@pytest.mark.usefixtures("control_may_fail")
+def test_what_fails_in_sending_is_no_failure_of_the_controller() -> None:
+    rig = Rig()
+    rig.run(40)
+
+    def send(outgoing: Outgoing) -> None:
+        if SETPOINT in [message.get_type() for message in decode(outgoing.data)]:
+            raise OSError("no such device")
+
+    with pytest.raises(OSError, match="no such device"):
+        rig.loop.tick(rig.tick, rig.tick * TICK_NS, send)
+    assert not rig.loop.course.died

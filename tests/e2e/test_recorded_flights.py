@@ -514,8 +514,8 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
     (reason,) = [one.text for one in heard.memory.of(Event) if one.code == "envelope-response"]
     assert heard.loop.let_go == reason and reason in heard.loop.ending.sentence
     assert heard.loop.ending.exit_code == 1
-    assert [one.text for one in heard.loop.notices if "engaged -> landing" in one.text]
-    assert "bias-at-bound" in [one.code for one in heard.loop.news]
+    assert [one.text for one in heard.notices if "engaged -> landing" in one.text]
+    assert "bias-at-bound" in [one.code for one in heard.news]
     assert reason in " ".join(words_of(page_of(heard.memory)).text)
 
     rows = truth(BLOWN)
@@ -528,7 +528,7 @@ def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
         heard = listened(BLOWN, since_s, seconds)
-        assert not heard.loop.let_go and not heard.loop.notices
+        assert not heard.loop.let_go and not heard.notices
         assert not [code for code in codes(heard.memory) if code.startswith(("envelope", "fallback"))]
 
 
@@ -556,7 +556,7 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
     assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
     assert not any("REJECTED" in one.text or "DENIED" in one.text for one in heard.memory.of(Event))
 
-    noticed = " ".join(one.text for one in heard.loop.notices)
+    noticed = " ".join(one.text for one in heard.notices)
     assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
     on_the_page = " ".join(words_of(page_of(heard.memory)).text)
     assert all(begin in on_the_page for begin in passages)

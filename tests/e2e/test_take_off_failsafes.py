@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 
 import pytest
 from loopback_rig import make_loop
@@ -39,9 +40,9 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
     more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
     flight = Flight("px4", *RELAYED, *more).relayed()
     assert flown(flight) == "engaged" and not flight.loop.failure
-    assert "failsafe" in flight.states and flight.loop.decision is not None
-    assert flight.loop.decision.mode is ControlMode.TRACK
-    told = [event.text for event in flight.loop.notices]
+    assert "failsafe" in flight.states and flight.ticked is not None
+    assert flight.ticked.decision.mode is ControlMode.TRACK
+    told = [event.text for event in flight.notices]
     assert len(told) == 2 and all("failsafe" in text for text in told)  # in, and out again: for the console
     result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
     assert result.identical, result.first_difference
@@ -55,14 +56,15 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
     flight.stick("POSCTL")
     flight.run(3.0, until=HandoverState.RELEASED)
     said = io.StringIO()
-    tell_notices(flight.loop, Console(file=said, width=200))
+    notices = deque(flight.notices)
+    tell_notices(notices, Console(file=said, width=200))
     lines = said.getvalue().splitlines()
     assert [line.split(" (")[0] for line in lines] == [
         "hand-over: climbing -> failsafe",
         "hand-over: failsafe -> climbing",
         "hand-over: engaged -> released",
     ]
-    assert not flight.loop.notices
+    assert not notices
 
 
 @pytest.mark.slow
@@ -93,7 +95,7 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=HandoverState.RELEASED)
-    assert [event.severity for event in flight.loop.notices] == [Severity.WARNING]
+    assert [event.severity for event in flight.notices] == [Severity.WARNING]
     before = flight.commands()
     flight.run(10.0, stop=True)
     assert not flight.loop.finished and flight.commands() == before

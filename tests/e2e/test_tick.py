@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import TypeVar
@@ -16,7 +16,7 @@ from places import ROOT
 from sim.simulation import World
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
-from uavctl.records import LinkStats, Outgoing, Plan, Received
+from uavctl.records import LinkStats, Outgoing, Plan, Received, Send
 
 PAGE = (ROOT / "docs" / "tick.md").read_text(encoding="utf-8")
 T = TypeVar("T")
@@ -39,13 +39,15 @@ class Watched:
             self.positions.append(files)
         return received
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         before, self.at_s = len(self.memory.entries), at_ns * 1e-9
-        sent, files = crossed(lambda: list(self.loop.tick(tick, at_ns)))
+        outgoing: list[Outgoing] = []
+        _, files = crossed(lambda: self.loop.tick(tick, at_ns, outgoing.append))
         kinds = {type(record) for _, _, record in self.memory.entries[before:]}
         if Plan in kinds and LinkStats not in kinds and self.at_s > WARM_S:  # counters of a second are not of the tick
             self.planning.append(files)
-        yield from sent
+        for one in outgoing:
+            send(one)
 
 
 def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:

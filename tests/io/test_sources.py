@@ -71,7 +71,7 @@ class Desk:
         select.select([self.connection], [], [], 0.02)
         for data, at_ns in self.connection.receive():
             self.record.append((data, at_ns, None))
-            self.samples += [item for item in self.link.receive(data, at_ns) if isinstance(item, PositionSample)]
+            self.samples += [item for item in self.link.receive(data, at_ns).items if isinstance(item, PositionSample)]
         asked_ns = time.monotonic_ns()
         self.record.append((b"", 0, asked_ns))
         for data in self.link.due(asked_ns):
@@ -118,7 +118,7 @@ def test_a_body_becomes_samples_as_old_as_their_exposure_and_replays() -> None:
     repeated = []
     for data, at_ns, asked_ns in desk.record:
         if asked_ns is None:
-            repeated += [item for item in again.receive(data, at_ns) if isinstance(item, PositionSample)]
+            repeated += [item for item in again.receive(data, at_ns).items if isinstance(item, PositionSample)]
         else:
             again.due(asked_ns)
     assert repeated == desk.samples

@@ -142,6 +142,6 @@ def test_nothing_unsigned_reaches_the_state_behind_the_door() -> None:
     plain, signed = Peer(), SignedPeer()
     for n, data in enumerate((plain.heartbeat(), plain.vision(5), SignedPeer(OTHER_KEY).heartbeat())):
         assert gate.admit(data, n) == b""
-    items = link.receive(gate.admit(signed.heartbeat() + signed.vision(6), 9), 9)
+    items = link.receive(gate.admit(signed.heartbeat() + signed.vision(6), 9), 9).items
     assert (len(statuses(items)), len(samples(items))) == (1, 1)
     assert KEY not in gate.admit(signed.heartbeat(), 10)

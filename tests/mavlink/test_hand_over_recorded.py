@@ -101,7 +101,7 @@ def fly(
             continue
         if message.get_type() == "LOCAL_POSITION_NED":
             booted_ns = at_ns - 1_000_000 * message.time_boot_ms
-        for item in link.receive(data, at_ns):
+        for item in link.receive(data, at_ns).items:
             match item:
                 case VehicleStatus():
                     vehicle = item

@@ -15,7 +15,7 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import CLOCK_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Setpoint
+from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Decision, Order, Setpoint
 
 TICK_NS = 50_000_000
 
@@ -162,8 +162,8 @@ class Air:
             for arrival_ns, link, data in self.peers.advance(at_ns):
                 if loop is not None:
                     loop.receive(link, data, arrival_ns)
-            for one in () if loop is None else loop.tick(self._tick, at_ns):
-                self.peers.receive(one.link, one.data, at_ns)
+            if loop is not None:
+                loop.tick(self._tick, at_ns, self.peers.receiver(at_ns))
             self._tick += 1
 
 
@@ -184,7 +184,7 @@ def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(auto
         assert air.peers.autopilot.mode_name != "OFFBOARD"  # its failsafe has it
     loop.order(Command(order=Order.ENGAGE))
     air.run(loop, 3.0)
-    assert loop.decision is not None and loop.decision.mode is ControlMode.TRACK and memory.of(Setpoint)
+    assert memory.of(Decision)[-1].mode is ControlMode.TRACK and memory.of(Setpoint)
     result = replay(iter(memory.entries), lambda sink: make_loop(air.config, sink))
     assert result.identical, result.first_difference
 

@@ -188,8 +188,7 @@ class Indoors:
                 return
             at_ns = self.tick * 50 * MS
             self.peers.converse(at_ns, self.loop.receive)
-            for one in self.loop.tick(self.tick, at_ns, stop=stop):
-                self.peers.receive(one.link, one.data, at_ns)
+            self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), stop=stop)
             self.tick += 1
 
     def pilot_flies(self, external: str) -> None:

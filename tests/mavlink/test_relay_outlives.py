@@ -69,7 +69,7 @@ def test_a_core_that_fails_lands_the_vehicle_and_leaves_it_its_positions_until_t
     assert LAND in flight.commands()
     poses = poses_after(flight, failed_ns)
     assert len(poses) > 50 and flight.now_ns - poses[-1] < 3 * SECOND
-    told = [event.text for event in flight.loop.notices if event.code == "control"]
+    told = [event.text for event in flight.notices if event.code == "control"]
     assert len(told) == 1 and "the core is broken" in told[0]
     ending = flight.loop.ending
     assert ending.cause == Cause.CONTROL and ending.exit_code == 1 and "the core is broken" in ending.sentence

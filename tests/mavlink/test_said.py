@@ -56,9 +56,8 @@ def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
     begun_ns = 0
     for at_ns, data in packets("arducopter-refusal.tlog"):
         begun_ns = begun_ns or at_ns
-        loop.receive("vehicle", data, at_ns)
-        while loop.news:
-            line = said.line(loop.news.popleft(), HandoverState.ARMING)
+        for event in loop.receive("vehicle", data, at_ns).news:
+            line = said.line(event, HandoverState.ARMING)
             if line is not None:
                 lines[line] = (at_ns - begun_ns) * 1e-9
     assert len(lines) == 1
@@ -75,7 +74,7 @@ def test_the_pieces_of_a_long_text_are_one_event() -> None:
     link.receive(vehicle.heartbeat(), 0)
     told = []
     for chunk, piece in enumerate(DENIED):
-        told += events(link.receive(vehicle.send("statustext", 2, piece, 7, chunk), SECOND))
+        told += events(link.receive(vehicle.send("statustext", 2, piece, 7, chunk), SECOND).items)
     assert [event.text for event in told] == ["Arming denied: Resolve system health failures first"]
 
 
@@ -83,13 +82,13 @@ def test_what_has_come_of_a_text_is_told_when_the_rest_stays_out() -> None:
     first, rest = DENIED
     link, vehicle = make_link(), Peer(1, 1)
     link.receive(vehicle.heartbeat(), 0)
-    assert events(link.receive(vehicle.send("statustext", 2, first, 7, 0), SECOND)) == []
-    late = events(link.receive(vehicle.heartbeat(), SECOND + WAIT_NS + 1))
+    assert events(link.receive(vehicle.send("statustext", 2, first, 7, 0), SECOND).items) == []
+    late = events(link.receive(vehicle.heartbeat(), SECOND + WAIT_NS + 1).items)
     assert [event.text for event in late] == [first.decode() + LOST]
-    only_rest = events(link.receive(vehicle.send("statustext", 2, rest, 8, 1), 5 * SECOND))
+    only_rest = events(link.receive(vehicle.send("statustext", 2, rest, 8, 1), 5 * SECOND).items)
     assert [event.text for event in only_rest] == [LOST + "t"]
     link.receive(vehicle.send("statustext", 2, first, 9, 0), 6 * SECOND)
-    both = events(link.receive(vehicle.send("statustext", 4, b"another", 0, 0), 6 * SECOND))
+    both = events(link.receive(vehicle.send("statustext", 4, b"another", 0, 0), 6 * SECOND).items)
     assert [event.text for event in both] == [first.decode() + LOST, "another"]
 
 

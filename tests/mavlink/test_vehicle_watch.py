@@ -31,7 +31,7 @@ def heard(boot_ms: int = 60_000, inertial_std_mps2: float = 0.0) -> tuple[Mavlin
 
 
 def newest(link: MavlinkConnection, vehicle: Peer, at_ns: int = NOW + SECOND) -> VehicleStatus:
-    return statuses(link.receive(vehicle.heartbeat(), at_ns))[-1]
+    return statuses(link.receive(vehicle.heartbeat(), at_ns).items)[-1]
 
 
 @pytest.mark.parametrize(
@@ -40,20 +40,20 @@ def newest(link: MavlinkConnection, vehicle: Peer, at_ns: int = NOW + SECOND) ->
 )
 def test_answers_to_others_are_not_ours(system: int, component: int, counts: bool) -> None:
     link, vehicle = heard()
-    items = link.receive(vehicle.send("command_ack", 400, 4, 0, 0, system, component), NOW)
+    items = link.receive(vehicle.send("command_ack", 400, 4, 0, 0, system, component), NOW).items
     assert bool([item for item in items if isinstance(item, Ack)]) == counts == bool(events(items))
 
 
 def test_answers_about_streams_are_not_told_of() -> None:
     link, vehicle = heard()
-    assert not events(link.receive(vehicle.send("command_ack", 511, 0, 0, 0, 245, 25), NOW))
+    assert not events(link.receive(vehicle.send("command_ack", 511, 0, 0, 0, 245, 25), NOW).items)
 
 
 def test_words_of_the_vehicle_are_told_and_handed_on() -> None:
     link, vehicle = heard()
-    items = link.receive(vehicle.send("statustext", 2, b"PreArm: no"), NOW)
+    items = link.receive(vehicle.send("statustext", 2, b"PreArm: no"), NOW).items
     assert [type(item) for item in items] == [Text, type(events(items)[0])]
-    assert not link.receive(Peer(9, 1).send("statustext", 2, b"not mine"), NOW)
+    assert not link.receive(Peer(9, 1).send("statustext", 2, b"not mine"), NOW).items
 
 
 @pytest.mark.fault(16)
@@ -84,11 +84,11 @@ def test_how_long_it_has_been_up_is_told_by_its_clock_and_goes_on_between_its_me
 @pytest.mark.parametrize("young_ms", [0, 100, 58_000])
 def test_a_clock_that_goes_back_is_a_restart(young_ms: int) -> None:
     link, vehicle = heard()
-    assert not events(link.receive(vehicle.local_position(young_ms), NOW + SECOND))  # one word may be garbage
-    items = link.receive(vehicle.local_position(young_ms + 40), NOW + SECOND)
+    assert not events(link.receive(vehicle.local_position(young_ms), NOW + SECOND).items)  # one word may be garbage
+    items = link.receive(vehicle.local_position(young_ms + 40), NOW + SECOND).items
     assert [event.code for event in events(items)] == ["vehicle-reboot"]
     assert [status.boots for status in statuses(items)] == [1]  # at once, not with the next heartbeat
-    assert not events(link.receive(vehicle.local_position(young_ms + 80), NOW + SECOND))
+    assert not events(link.receive(vehicle.local_position(young_ms + 80), NOW + SECOND).items)
     assert newest(link, vehicle).boots == 1
 
 
@@ -100,16 +100,16 @@ def test_any_clock_since_boot_tells_a_restart_once(name: str) -> None:
     turn = (1.0, *zeros[1:]) if name == "attitude_quaternion" else zeros
     told = []
     for boot_ms in (60_000, 60_050, 300, 350, 400):
-        told += events(link.receive(vehicle.send(name, boot_ms, *turn), NOW + SECOND))
+        told += events(link.receive(vehicle.send(name, boot_ms, *turn), NOW + SECOND).items)
     for boot_ms in (450, 500, 550):
-        told += events(link.receive(vehicle.local_position(boot_ms), NOW + SECOND))
+        told += events(link.receive(vehicle.local_position(boot_ms), NOW + SECOND).items)
     assert [event.code for event in told] == ["vehicle-reboot"]
 
 
 @pytest.mark.fault(20)
 def test_a_vehicle_that_starts_after_weeks_is_found_though_its_clock_seems_to_leap() -> None:
     link, vehicle = heard(2**31 + 5_000)
-    told = [link.receive(vehicle.local_position(n * 100), NOW + 3 * SECOND) for n in (1, 2)]
+    told = [link.receive(vehicle.local_position(n * 100), NOW + 3 * SECOND).items for n in (1, 2)]
     assert [event.code for items in told for event in events(items)] == ["vehicle-reboot"]
 
 
@@ -119,8 +119,8 @@ def test_two_vehicles_of_one_id_are_taken_for_one_that_starts_anew() -> None:
     second, told = Peer(1, 1), []
     for n in range(10):
         at_ns = NOW + n * 100 * MS
-        told += events(link.receive(first.local_position(60_000 + n * 100), at_ns))
-        told += events(link.receive(second.local_position(5_000 + n * 100), at_ns))
+        told += events(link.receive(first.local_position(60_000 + n * 100), at_ns).items)
+        told += events(link.receive(second.local_position(5_000 + n * 100), at_ns).items)
     assert "vehicle-reboot" in {event.code for event in told}
 
 
@@ -130,7 +130,7 @@ def test_garbage_in_a_time_since_boot_is_no_restart() -> None:
     rng = np.random.default_rng(1)
     for n in range(500):
         garbage = int(rng.integers(WRAP_MS)) if n % 3 == 0 else 60_000 + n * 100
-        assert not events(link.receive(vehicle.local_position(garbage), NOW + n * 100 * MS)), n
+        assert not events(link.receive(vehicle.local_position(garbage), NOW + n * 100 * MS).items), n
     assert newest(link, vehicle).boots == 0
 
 
@@ -140,7 +140,7 @@ def test_garbage_in_a_time_since_boot_is_no_restart() -> None:
 )
 def test_disorder_the_wrap_and_gaps_are_no_restarts(before_ms: int, after_ms: int) -> None:
     link, vehicle = heard(before_ms)
-    assert not events(link.receive(vehicle.local_position(after_ms), NOW + SECOND))
+    assert not events(link.receive(vehicle.local_position(after_ms), NOW + SECOND).items)
     assert newest(link, vehicle).boots == 0
 
 
@@ -149,7 +149,7 @@ def test_disorder_the_wrap_and_gaps_are_no_restarts(before_ms: int, after_ms: in
 def test_heartbeats_that_go_back_to_not_being_ready_are_no_restart(pause_s: int) -> None:
     link, vehicle = make_link(), Peer(1, 1)
     for n, status in enumerate((0, 2, 3, 0, 3, 4, 5, 0, 2, 3, 0)):
-        items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=status), NOW + n * pause_s * SECOND)
+        items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=status), NOW + n * pause_s * SECOND).items
         assert not events(items) and statuses(items)[0].boots == 0, n
 
 
@@ -157,7 +157,7 @@ def test_heartbeats_that_go_back_to_not_being_ready_are_no_restart(pause_s: int)
 def test_a_heartbeat_of_booting_after_silence_is_a_restart() -> None:
     link, vehicle = make_link(), Peer(1, 1)
     for at_s, status, boots in ((0, 3, 0), (1, 1, 0), (2, 3, 0), (6, 1, 1), (7, 1, 1), (8, 3, 1)):
-        (told,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129, status=status), NOW + at_s * SECOND))
+        (told,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129, status=status), NOW + at_s * SECOND).items)
         assert told.boots == boots, at_s
 
 
@@ -165,22 +165,22 @@ def test_a_heartbeat_of_booting_after_silence_is_a_restart() -> None:
 def test_the_recorded_px4_whose_checks_come_and_go_has_not_started_anew() -> None:
     link, told = make_link(), []
     for at_ns, data in packets("px4-flickering-checks.tlog"):
-        told += events(link.receive(data, at_ns))
+        told += events(link.receive(data, at_ns).items)
     assert link.vehicle == (1, 1)
     assert "vehicle-reboot" not in {event.code for event in told}
 
 
 def test_another_component_s_clock_is_not_the_vehicle_s() -> None:
     link, _ = heard()
-    assert not events(link.receive(Peer(1, 191).local_position(5), NOW + SECOND))
+    assert not events(link.receive(Peer(1, 191).local_position(5), NOW + SECOND).items)
 
 
 @pytest.mark.fault(16)
 def test_with_an_id_that_is_configured_no_other_vehicle_takes_its_place() -> None:
     link = make_link(daemon=DaemonConfig(tick_s=0.05, vehicle_system_id=7))
     for n in range(100):
-        assert not statuses(link.receive(Peer(1 + n % 6, 1).heartbeat(), NOW + n * SECOND))
-    assert len(statuses(link.receive(Peer(7, 1).heartbeat(), NOW + 100 * SECOND))) == 1
+        assert not statuses(link.receive(Peer(1 + n % 6, 1).heartbeat(), NOW + n * SECOND).items)
+    assert len(statuses(link.receive(Peer(7, 1).heartbeat(), NOW + 100 * SECOND).items)) == 1
     assert link.vehicle == (7, 1)
     assert link.stats(NOW).bad == {"second-vehicle": 100}
 
@@ -190,8 +190,8 @@ def test_a_vehicle_that_is_gone_from_the_ground_gives_its_place_and_one_in_the_a
     for armed in (False, True):
         link, first, other = make_link(), Peer(9, 1), Peer(1, 1)
         link.receive(first.heartbeat(base_mode=1 | (128 if armed else 0)), NOW)
-        assert not statuses(link.receive(other.heartbeat(), NOW + GONE_NS))
-        found = statuses(link.receive(other.heartbeat(), NOW + GONE_NS + 1))
+        assert not statuses(link.receive(other.heartbeat(), NOW + GONE_NS).items)
+        found = statuses(link.receive(other.heartbeat(), NOW + GONE_NS + 1).items)
         assert bool(found) == (not armed)
         assert link.vehicle == ((9, 1) if armed else (1, 1))
         if found:  # nothing is armed that was ordered for the first one
@@ -207,7 +207,7 @@ def felt(
     link: MavlinkConnection, vehicle: Peer, force: tuple[float, ...], at_ns: int, *, raw: bool = False
 ) -> list[InertialSample]:
     name, rest = ("raw_imu", (0,) * 6) if raw else ("highres_imu", (*(0.0,) * 10, 0))
-    items = link.receive(vehicle.send(name, at_ns // 1000, *force, *rest), at_ns)
+    items = link.receive(vehicle.send(name, at_ns // 1000, *force, *rest), at_ns).items
     return [item for item in items if isinstance(item, InertialSample)]
 
 
@@ -244,7 +244,9 @@ def stream(lies: Callable[[int], tuple[int, int, bool, bool]], count: int = 300)
         at_ns, stamp_ns = NOW + i * 20 * MS + late_ns, NOW + i * 20 * MS - behind_ns
         roll, north = 0.0 if stiff else 1e-4 * (i % 7), 0.1 if frozen else 0.01 * (i % 11)
         link.receive(vehicle.send("attitude", stamp_ns // MS, roll, 0.0, 0.0, 0.0, 0.0, 0.0), at_ns)
-        items = link.receive(vehicle.send("highres_imu", stamp_ns // 1000, north, 0.0, -9.8, *(0.0,) * 10, 0), at_ns)
+        items = link.receive(
+            vehicle.send("highres_imu", stamp_ns // 1000, north, 0.0, -9.8, *(0.0,) * 10, 0), at_ns
+        ).items
         taken += [i for item in items if isinstance(item, InertialSample)]
     return taken
 
@@ -291,7 +293,9 @@ def test_another_clock_of_the_same_vehicle_is_taken_up_at_once(jump_s: int) -> N
 def test_a_quaternion_beside_the_angles_counts_only_where_inertial_data_are_used() -> None:
     for std_mps2, wanted in ((0.0, 0), (0.1, 1)):
         link, vehicle = heard(inertial_std_mps2=std_mps2)
-        told = link.receive(vehicle.send("attitude_quaternion", NOW // MS, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW)
+        told = link.receive(
+            vehicle.send("attitude_quaternion", NOW // MS, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), NOW
+        ).items
         assert len(told) == wanted
 
 

@@ -11,7 +11,7 @@ from sim_rig import Client, S, decode
 
 from sim.simulation import MOCAP, VEHICLE, Peers, World
 from uavctl.config import load_config
-from uavctl.records import Outgoing, Received, Truth, Vec3
+from uavctl.records import Outgoing, Received, Send, Truth, Vec3, to_nobody
 
 MS = 1_000_000
 
@@ -30,10 +30,11 @@ class Scripted:
         self.got.append((len(self.ticks), at_ns, link, data))
         return Received(self.answer(link, data), True, True)
 
-    def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         self.ticks.append((tick, at_ns))
         accel = self.script(tick)
-        return () if accel is None else (Outgoing(link=VEHICLE, data=self.client.setpoint(*accel)),)
+        if accel is not None:
+            send(Outgoing(link=VEHICLE, data=self.client.setpoint(*accel)))
 
     def messages(self, link: str) -> list[tuple[int, int, Any]]:
         return [(n or 0, at_ns, msg) for n, at_ns, where, data in self.got if where == link for msg in decode(data)]
@@ -141,9 +142,10 @@ def test_blackout_and_corruption_reach_the_flyer_as_such() -> None:
 
 def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> None:
     class Asking(Scripted):
-        def tick(self, tick: int, at_ns: int) -> tuple[Outgoing, ...]:
-            super().tick(tick, at_ns)
-            return tuple(Outgoing(link=link, data=self.client.timesync(at_ns + 1)) for link in (VEHICLE, MOCAP))
+        def tick(self, tick: int, at_ns: int, send: Send) -> None:
+            super().tick(tick, at_ns, to_nobody)
+            for link in (VEHICLE, MOCAP):
+                send(Outgoing(link=link, data=self.client.timesync(at_ns + 1)))
 
     flyer = Asking()
     World(load_config("room-hahn-stursberg", ["link.loss=0"]), flyer).run(1.0)

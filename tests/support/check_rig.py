@@ -15,6 +15,7 @@ from uavctl.check.findings import Item, ItemState
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
+from uavctl.records import to_nobody
 
 TICK_NS, S = 50_000_000, 1_000_000_000
 # Cameras as they are: the sim's own [frame] is right, the one of the check is what is tried.
@@ -67,8 +68,7 @@ def look(
         at_ns = tick * TICK_NS
         for arrival_ns, link, data in peers.advance(at_ns):
             flight.receive(link, data if link == VEHICLE else twist(data), arrival_ns)
-        for one in flight.tick(tick, at_ns):
-            peers.receive(one.link, one.data, at_ns)
+        flight.tick(tick, at_ns, peers.receiver(at_ns))
         accel = setpoints(at_ns * 1e-9)
         if accel is not None:
             peers.receive(VEHICLE, client.setpoint(*accel), at_ns)
@@ -118,7 +118,7 @@ class Hand:
             seen = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
             x, y, z = (value + self._random.gauss(0.0, 0.003) for value in seen)
             self.flight.receive("mocap", self.cameras.vision(self.at_ns // 1000 + 10**9, x, y, z), self.at_ns)
-            list(self.flight.tick(0, self.at_ns))
+            self.flight.tick(0, self.at_ns, to_nobody)
 
     def carry(self, *way: float) -> None:
         """Carry it along a way in 1 s, and hold it for 1.5 s."""

@@ -28,6 +28,7 @@ class Bench:
         self.peers = Peers(self.config, DT_NS)
         self.arrived: dict[str, list[tuple[bytes, int]]] = {"vehicle": [], "mocap": []}
         self.connections = {name: Wire(self, name) for name in self.arrived}
+        self.told: list[tuple[str, int]] = []  # words for a person, and when they were told
         self.arrives: list[tuple[int, bytes]] = []  # what comes between ticks
         self.oversleep: dict[int, int] = {}  # deadline -> how much later the sleep ends
 
@@ -51,6 +52,8 @@ class Bench:
             lambda: self.now_ns >= stop_at_s * SECOND,
             duration_s=duration_s,
             stop_limit_s=stop_limit_s,
+            after_tick=(lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news),),
+            on_news=lambda news: self.told.extend((e.text, self.now_ns) for e in news),
             wait_for=self.wait,
             now=lambda: self.now_ns,
         )

@@ -20,7 +20,7 @@ from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
 from uavctl.loop import VEHICLE, ControlLoop, make_links
-from uavctl.records import Command, VehicleStatus
+from uavctl.records import Command, Event, VehicleStatus, to_nobody
 
 FLIGHTS = DATA / "flights"
 TICK_NS, SECOND = 50_000_000, 1_000_000_000
@@ -81,7 +81,7 @@ def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[
     tick = 0
     for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
         while begin_ns + tick * TICK_NS <= one.at_ns:
-            deque(flight.tick(tick, begin_ns + tick * TICK_NS), maxlen=0)
+            flight.tick(tick, begin_ns + tick * TICK_NS, to_nobody)
             tick += 1
         flight.receive(VEHICLE, one.data, one.at_ns)
     return {one.name: one.state.value for one in flight.items(begin_ns + tick * TICK_NS)}
@@ -94,6 +94,8 @@ class Listened:
     name: str
     loop: ControlLoop
     memory: Memory
+    news: list[Event]
+    notices: list[Event]
 
     def since_s(self, at_ns: int) -> float:
         """Time since the recording's first packet [s]."""
@@ -110,15 +112,19 @@ def listened(
     design, controller = shared(config)
     memory.put("/uavctl/header", begin_ns, header(config, design))
     loop, tick = ControlLoop(config, controller, memory, lambda: 0), 0
+    news: list[Event] = []
+    notices: list[Event] = []
     waiting = deque((whole[0].at_ns + round(time_s * SECOND), command) for time_s, command in orders)
     for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
         while (now_ns := begin_ns + tick * TICK_NS) < one.at_ns:
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
-            deque(loop.tick(tick, now_ns), maxlen=0)
+            ticked = loop.tick(tick, now_ns, to_nobody)
+            news += ticked.news
+            notices += ticked.notices
             tick += 1
-        loop.receive(VEHICLE, one.data, one.at_ns)
-    return Listened(name, loop, memory)
+        news += loop.receive(VEHICLE, one.data, one.at_ns).news
+    return Listened(name, loop, memory, news, notices)
 
 
 def watched(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> Memory:
@@ -135,7 +141,7 @@ def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """What a link makes of the vehicle's words, with times since the first packet [s]."""
     whole = packets(name)
     link = make_links(config_of(name))[VEHICLE]
-    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns))
+    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns).items)
     return [((one.at_ns - whole[0].at_ns) * 1e-9, item) for one, item in heard if isinstance(item, VehicleStatus)]
 
 

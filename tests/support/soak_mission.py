@@ -120,7 +120,7 @@ class _Ground:
 
     def look(self, world: World, watch: Watch, at_ns: int) -> None:
         """After a tick."""
-        decision = watch.loop.decision
+        decision = None if watch.ticked is None else watch.ticked.decision
         place = np.array(world.peers.vehicle.position_m)
         flies = decision is not None and decision.mode in FLIES
         self._walls(place, at_ns, flies=flies)
@@ -179,7 +179,7 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
         ground.look(world, watch, at_ns)
 
     watch = fly(prepared, config, look, take_off_m=TAKE_OFF_M, path=path)
-    tick_s, vehicle = config.daemon.tick_s, watch.loop.vehicle
+    tick_s, vehicle = config.daemon.tick_s, None if watch.ticked is None else watch.ticked.vehicle
     down = worlds[0].peers.vehicle.position_m[2] > -ON_FLOOR_M and vehicle is not None and not vehicle.armed
     return MissionFlight(
         autopilot=autopilot,

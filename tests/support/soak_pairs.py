@@ -83,7 +83,8 @@ def fly_true(
             worlds.append(world)
             if not own_motion:
                 silence_motion(world)
-        place, decision = world.peers.vehicle.position_m, watch.loop.decision
+        place = world.peers.vehicle.position_m
+        decision = None if watch.ticked is None else watch.ticked.decision
         outside_m = max(outside_m, beyond_m(config, place))
         pilot = world.peers.autopilot
         if pilot.pilot.armed:  # disarmed, a PX4 takes up the mode of before

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from uavctl.config import Config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
-from uavctl.records import Command, Order, Outgoing, Received, Record, Sink
+from uavctl.records import Command, Order, Received, Record, Send, Sink
 
 SECOND_NS = 1_000_000_000
 
@@ -94,7 +94,7 @@ class Rig:
                 return Received((), False, False)
         return self.loop.receive(link, data, at_ns)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         """Run a tick, or miss it, or put it off."""
         plan = self.plan
         if tick == 0 and plan.take_off_m is not None:
@@ -111,7 +111,7 @@ class Rig:
         else:
             for one, its_ns in [*self._late, (tick, at_ns)]:
                 stop = self.stop or (plan.stop_tick is not None and one >= plan.stop_tick)
-                yield from self.loop.tick(one, its_ns, self.missed, stop=stop)
+                self.loop.tick(one, its_ns, send, self.missed, stop=stop)
                 self.missed = 0
             self._late.clear()
         if self._doors is not None and at_ns % SECOND_NS == 0:

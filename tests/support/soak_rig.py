@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,12 +20,13 @@ from uavctl.records import (
     Decision,
     Event,
     Order,
-    Outgoing,
     Plan,
     Received,
     Record,
+    Send,
     Setpoint,
     Sink,
+    Ticked,
     Vec3,
 )
 
@@ -45,6 +46,7 @@ class Watch:
 
     Attributes:
         loop: The loop.
+        ticked: The last tick.
         plan: The newest plan.
         prepared: What it flies with.
         sink: Where its records go.
@@ -67,6 +69,7 @@ class Watch:
     ticks: int = 0
     modes: dict[str, int] = field(default_factory=dict)
     plan: Plan | None = None
+    ticked: Ticked | None = None
     _setpoint: Setpoint | None = None
     _failed: bool = False
     _before: Vec3 = (0.0, 0.0, 0.0)
@@ -88,17 +91,16 @@ class Watch:
         """Take a datagram."""
         return self.loop.receive(link, data, at_ns)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         """Run a tick and look at it."""
         if tick == 0 and self.take_off_m is not None:
             self.loop.order(Command(order=Order.TAKE_OFF, height_m=self.take_off_m))
         self._setpoint = None
-        yield from self.loop.tick(tick, at_ns, stop=self.stop)
+        self.ticked = self.loop.tick(tick, at_ns, send, stop=self.stop)
         self.ticks += 1
-        decision = self.loop.decision
-        if decision is not None:
-            self.modes[decision.mode.value] = self.modes.get(decision.mode.value, 0) + 1
-            self._judge(decision)
+        decision = self.ticked.decision
+        self.modes[decision.mode.value] = self.modes.get(decision.mode.value, 0) + 1
+        self._judge(decision)
         if self.loop.course.died and not self._failed:
             self.wrong.append(f"at {at_ns * 1e-9:.2f} s: the controller has failed: {self.loop.course.died}")
         self._failed = bool(self.loop.course.died)

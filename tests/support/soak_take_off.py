@@ -108,7 +108,7 @@ def fly_take_off(autopilot: str, seed: int) -> TakeOff:
     flight = troubled(autopilot, seed)
     what = flown(flight)
     seconds, wrong = flight.now_ns * 1e-9, []
-    told = tuple(event.text for event in flight.loop.notices)
+    told = tuple(event.text for event in flight.notices)
     if what == "hovers":
         while not flight.loop.finished and flight.now_ns * 1e-9 < seconds + LANDING_S and what == "hovers":
             flight.run(1.0)

@@ -14,7 +14,7 @@ from uavctl.config import load_config
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.records import Command, Datagram, Event, Order, Setpoint
+from uavctl.records import Command, Datagram, Event, Order, Outgoing, Setpoint, Ticked
 
 # Positions come through the relay alone, from cameras whose packets a third of are lost in bursts of ten on the mean.
 RELAYED = [
@@ -45,6 +45,8 @@ class Flight:
         self.loop = ControlLoop(self.config, controller, self.memory, lambda: 0)
         self.peers = Peers(self.config, 0, airborne=False)
         self.tick = 0
+        self.ticked: Ticked | None = None  # the last one
+        self.notices: list[Event] = []  # of the whole flight
         self.hears: Callable[[bytes], bool] = lambda data: True  # whether the vehicle hears a datagram of ours
         self.told: Callable[[bytes], bool] = lambda data: True  # whether we hear one of the vehicle's
 
@@ -76,12 +78,15 @@ class Flight:
             for arrival_ns, link, data in self.peers.advance(self.now_ns):
                 if link == "mocap" or self.told(data):
                     self.loop.receive(link, data, arrival_ns)
-            for one in self.loop.tick(self.tick, self.now_ns, stop=stop):
-                if self.hears(one.data):
-                    self.peers.receive(one.link, one.data, self.now_ns)
+            self.ticked = self.loop.tick(self.tick, self.now_ns, self._send, stop=stop)
+            self.notices += self.ticked.notices
             self.tick += 1
         assert until is None or self.state is until, (self.state, self.texts)
         return self
+
+    def _send(self, one: Outgoing) -> None:
+        if self.hears(one.data):
+            self.peers.receive(one.link, one.data, self.now_ns)
 
     def stick(self, mode: str) -> None:
         """The pilot changes the mode."""

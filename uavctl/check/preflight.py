@@ -18,7 +18,7 @@ from uavctl.config.types import Config
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Message
 from uavctl.mavlink.relay import Relay
-from uavctl.records import Outgoing, PositionSample, Received, Vec3, VehicleStatus
+from uavctl.records import Outgoing, PositionSample, Received, Send, Vec3, VehicleStatus
 
 # Moving the body by hand as asked, to see the cameras' axes; pure, time is an argument.
 
@@ -171,38 +171,38 @@ class Preflight:
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
         from_vehicle = from_source = False
-        for one in self._links[link].receive(data, at_ns):
+        understood = self._links[link].receive(data, at_ns)
+        for one in understood.items:
             if isinstance(one, PositionSample):
-                from_source = self._links[link].settled
-                attitude = self._links[link].attitude
-                self._seen.add(one, attitude)
-                self._relay.take(one, attitude)
+                from_source = understood.settled
+                self._seen.add(one, understood.attitude)
+                self._relay.take(one, understood.attitude)
                 if self.guide is not None and self._is_safe:
                     angles_rad = self._seen.angles_rad
                     self.guide.take(at_ns, one.position_m, angles_rad[-1][1][2] if angles_rad else None)
             elif isinstance(one, VehicleStatus):
                 from_vehicle, self._autopilot = True, one.autopilot
-        answers = tuple(Outgoing(link=link, data=answer) for answer in self._links[link].answers())
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
         return Received(answers, from_vehicle, from_source)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        """Yield what to send at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
+        """Send what is due at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
         del tick
         for name, link in self._links.items():
             for data in link.due(at_ns):
-                yield Outgoing(link=name, data=data)
+                send(Outgoing(link=name, data=data))
         vehicle = self._links[VEHICLE]
         for data in vehicle.relay(self._relay, at_ns, self._autopilot, refused=()):
-            yield Outgoing(link=VEHICLE, data=data)
+            send(Outgoing(link=VEHICLE, data=data))
         if vehicle.vehicle is not None:
             for data in vehicle.place_on_globe(at_ns, self._config.hand_over.origin_deg_m):
-                yield Outgoing(link=VEHICLE, data=data)
+                send(Outgoing(link=VEHICLE, data=data))
         due = self._asked_ns is None or at_ns - self._asked_ns >= ASK_NS
         if vehicle.vehicle is not None and due and self._rounds < ROUNDS:
             self._asked_ns = at_ns
             self._rounds += 1
             for data in self._requests(vehicle):
-                yield Outgoing(link=VEHICLE, data=data)
+                send(Outgoing(link=VEHICLE, data=data))
 
     def _requests(self, vehicle: MavlinkConnection) -> Iterator[bytes]:
         """Yield requests for what the vehicle has not told yet."""

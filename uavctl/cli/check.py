@@ -66,8 +66,7 @@ def run_preflight(
                 _receive(flight, name, connections[name])
             if now() >= due.at_ns:
                 break
-        for message in flight.tick(due.tick, due.at_ns):
-            connections[message.link].send(message.data)
+        flight.tick(due.tick, due.at_ns, lambda message: connections[message.link].send(message.data))
         if prompt is not None and flight.prompt != asked:
             asked = flight.prompt
             prompt(asked)

@@ -42,10 +42,11 @@ from uavctl.cli.flying import (
     tell_ending,
 )
 from uavctl.cli.prepare import prepare
-from uavctl.clock import Due, Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
+from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
 from uavctl.daemon.lock import sole_daemon
@@ -56,7 +57,6 @@ from uavctl.loop import ControlLoop
 # What stands beside the control loop of `uavctl fly`: orders, health lines, the service manager, real time.
 
 
-AfterTick = Callable[[Due, int], None]
 _UNREAD_LINES = 10  # health lines that wait for a slow terminal or log
 
 
@@ -261,7 +261,7 @@ def fly_daemon(
                     stand_by(loop, tenure.left_ns)
                 messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
                 with (
-                    live_line(loop, recorder, duration_s, config.daemon.tick_s),
+                    live_line(loop, recorder, duration_s, config.daemon.tick_s) as shown,
                     operation(loop, config, path, recorder.status, listener) as beside,
                     ending_noted(loop),
                 ):
@@ -273,12 +273,14 @@ def fly_daemon(
                         duration_s=duration_s,
                         stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
+                            shown.after_tick,
                             lambda *_: tenure.note(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
-                            lambda *_: engagement.follow(loop),
+                            lambda ticked, _: engagement.follow(loop, ticked),
                             *beside,
                             *collect,
                         ),
+                        on_news=shown.news.extend,
                     )
                 if asked_for:
                     tenure.note(False)

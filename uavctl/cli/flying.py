@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -40,7 +41,19 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import MUST_LAND
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import lacking
-from uavctl.records import Command, ControlMode, Ending, Event, Header, Order, PolicyLibrary, Record, Severity, Vec3
+from uavctl.records import (
+    Command,
+    ControlMode,
+    Ending,
+    Event,
+    Header,
+    Order,
+    PolicyLibrary,
+    Record,
+    Severity,
+    Ticked,
+    Vec3,
+)
 from uavctl.smpc.conditioned.planner import AnyDesign
 
 # What `fly` and `loopback` ask of the hand-over: whether to arm and take off, when, and what came of it.
@@ -99,17 +112,17 @@ class Engagement:
         loop.course.takes_off = self.takes_off
         loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
-    def follow(self, loop: ControlLoop) -> None:
+    def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
         """Look at the tick that has just run; the first one gives the order to take off."""
         self.engaged = self.engaged or loop.who_flies is HandoverState.ENGAGED
-        self._look_for_arrival(loop)
+        self._look_for_arrival(loop, ticked)
         loop.course.arrived = self.arrived
         if self._take_off_m is not None and not self._ordered:
             self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
 
-    def _look_for_arrival(self, loop: ControlLoop) -> None:
-        decision, estimate = loop.decision, loop.estimate
-        if self.goal is None or decision is None or estimate is None or decision.mode is not ControlMode.TRACK:
+    def _look_for_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
+        estimate = ticked.estimate
+        if self.goal is None or estimate is None or ticked.decision.mode is not ControlMode.TRACK:
             return
         plant = loop.plant
         where = [estimate.mean[index] for index in plant.position_index]
@@ -225,6 +238,8 @@ class Said:
 
 
 LANDING_S = 10.0  # after braking: for asking the vehicle to land
+MAX_NEWS = 64  # that wait to be shown, of the vehicle and the core
+MAX_NOTICES = 100  # the same, of the hand-over
 REFRESH_S = 0.25
 SIGNALLED = 128  # exit codes of a process that a signal has ended are this much higher than its number
 LIVE_PORT = 8765  # where Foxglove looks first
@@ -417,63 +432,83 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+class LiveFeed:
+    """Last tick and messages of a flight that are to be shown: filled by the control loop's thread, emptied by another.
+
+    Attributes:
+        ticked: the last tick; None before the first.
+        news: of the vehicle and the core, not shown yet.
+        notices: of the hand-over, not shown yet.
+    """
+
+    def __init__(self) -> None:
+        self.ticked: Ticked | None = None
+        self.news: deque[Event] = deque(maxlen=MAX_NEWS)
+        self.notices: deque[Event] = deque(maxlen=MAX_NOTICES)
+
+    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
+        """Keep a tick, and queue its messages."""
+        del lateness_ns
+        self.news.extend(ticked.news)
+        self.notices.extend(ticked.notices)
+        self.ticked = ticked
+
+
 @contextmanager
-def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[None]:
-    """Show the state of the loop while it flies, from a thread of its own, on standard error."""
+def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[LiveFeed]:
+    """Show the state of the loop while it flies, from a thread of its own, on standard error; yields its feed."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
     done, told = threading.Event(), threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
         task = progress.add_task("waiting", total=duration_s)
-        said = Said()
+        said, feed = Said(), LiveFeed()
 
         def tell() -> None:
-            while loop.news:
-                line = said.line(loop.news.popleft(), loop.who_flies)
+            while feed.news:
+                line = said.line(feed.news.popleft(), loop.who_flies)
                 if line is not None:
                     progress.console.print(f"[yellow]{escape(line)}[/]", soft_wrap=True)
 
         def show() -> None:
             while not done.wait(REFRESH_S):
                 tell()
-                decision = loop.decision
-                tell_notices(loop, progress.console)
+                ticked = feed.ticked
+                tell_notices(feed.notices, progress.console)
                 if loop.let_go and not told.is_set():
                     told.set()
                     progress.console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
-                if decision is not None:
-                    line = _line(loop) + _alarm(recorder.status())
-                    progress.update(task, completed=decision.tick * tick_s, description=line)
+                if ticked is not None:
+                    line = _line(ticked, loop.who_flies) + _alarm(recorder.status())
+                    progress.update(task, completed=ticked.decision.tick * tick_s, description=line)
 
         thread = threading.Thread(target=show, name="live", daemon=True)
         thread.start()
         try:
-            yield
+            yield feed
         finally:
             done.set()
             thread.join()
             tell()
-            tell_notices(loop, progress.console)
+            tell_notices(feed.notices, progress.console)
             sys.setswitchinterval(before_s)
 
 
-def tell_notices(loop: ControlLoop, console: Console) -> None:
-    """Print the hand-over's notices that are not printed yet: each transition that is a warning."""
-    while loop.notices:
-        event = loop.notices.popleft()
+def tell_notices(notices: deque[Event], console: Console) -> None:
+    """Print the hand-over's notices and take them out: each transition that is a warning."""
+    while notices:
+        event = notices.popleft()
         style = "bold red" if event.severity is Severity.ERROR else "bold yellow"
         console.print(f"[{style}]{event.code}:[/] {escape(event.text)}", soft_wrap=True)
 
 
-def _line(loop: ControlLoop) -> str:
-    decision, vehicle, estimate = loop.decision, loop.vehicle, loop.estimate
-    if decision is None:
-        return "waiting"
+def _line(ticked: Ticked, who_flies: HandoverState) -> str:
+    decision, vehicle, estimate = ticked.decision, ticked.vehicle, ticked.estimate
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
     accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
-    waiting = waits_for(loop.who_flies) if decision.mode is ControlMode.WAIT else ""
+    waiting = waits_for(who_flies) if decision.mode is ControlMode.WAIT else ""
     mode = f"{mode}, waiting for {waiting}" if waiting else mode
     return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"
 

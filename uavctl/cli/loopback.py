@@ -53,7 +53,7 @@ from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
 from uavctl.loop import ControlLoop
 from uavctl.outcome import Cause
-from uavctl.records import Outgoing, Received, Sink, Truth
+from uavctl.records import Received, Send, Sink, Truth
 
 START_LIMIT_S = 60.0
 TRUTH = "/sim/truth"
@@ -143,14 +143,16 @@ class _Timed:
         self._loop = loop
         self._engagement = engagement
         self.stop = False
+        self.at_ns = 0  # of the last tick
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         return self._loop.receive(link, data, at_ns)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        yield from self._loop.tick(tick, at_ns, stop=self.stop)
-        self._loop.timing(tick, at_ns, lateness_ns=0, send_ns=0)
-        self._engagement.follow(self._loop)
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
+        self.at_ns = at_ns
+        ticked = self._loop.tick(tick, at_ns, send, stop=self.stop)
+        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
+        self._engagement.follow(self._loop, ticked)
 
 
 class _InterruptedError(Exception):
@@ -165,9 +167,9 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
     loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
     engagement.begin(loop)
     loop.course.in_flight = not takes_off
+    timed = _Timed(loop, engagement)
     try:
         put_header(recorder, prepared, started_ns=0)
-        timed = _Timed(loop, engagement)
         with (
             ending_noted(loop),
             suppress(_InterruptedError),  # inside: an end that the operator asked for is no failure
@@ -194,7 +196,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
                 world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: loop.finished)
     finally:
         wall_s = time.perf_counter() - begun
-        recorder.put(ENDED, loop.decision.at_ns if loop.decision is not None else 0, loop.ending)
+        recorder.put(ENDED, timed.at_ns, loop.ending)
         status = recorder.close()
         tell_ending(final(loop.ending, status))
     return conclude(path, wall_s, status, loop.ending)
@@ -215,7 +217,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
             put_header(recorder, prepared, monotonic_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
-            simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
             collector = simulator.enter_context(collected_between_ticks())
             begun = time.perf_counter()
             with ending_noted(loop):
@@ -227,10 +229,12 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     duration_s=config.duration_s,
                     stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     after_tick=(
+                        shown.after_tick,
                         lambda *_: recorder.catch_up(),
-                        lambda *_: engagement.follow(loop),
+                        lambda ticked, _: engagement.follow(loop, ticked),
                         collector.after_tick,
                     ),
+                    on_news=shown.news.extend,
                 )
             wall_s = time.perf_counter() - begun
             simulator.close()  # its last words go into the recording

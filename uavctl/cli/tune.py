@@ -209,12 +209,12 @@ def where_it_stands(config: Config) -> Vec3:
 def _heard(link: MavlinkConnection, connection: Connection) -> Iterator[PositionSample]:
     """Return the positions that have arrived; answer the sources and the vehicle as a flight does."""
     for index, (data, at_ns) in enumerate(connection.receive()):
-        found = link.receive(data, at_ns)
+        found, answers, settled, *_ = link.receive(data, at_ns)
         if any(isinstance(one, VehicleStatus) for one in found):
             connection.answer(index)
-        elif link.settled and any(isinstance(one, PositionSample) for one in found):
+        elif settled and any(isinstance(one, PositionSample) for one in found):
             connection.trust(index)
-        for answer in link.answers():
+        for answer in answers:
             connection.send(answer)
         yield from (one for one in found if isinstance(one, PositionSample))
 

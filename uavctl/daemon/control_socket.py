@@ -20,13 +20,12 @@ from typing import Literal, Protocol
 
 import msgspec
 
-from uavctl.clock import Due
 from uavctl.config import Config
 from uavctl.config.checks import outside
 from uavctl.daemon.health import Health
 from uavctl.daemon.lock import runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
-from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Vec3
+from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Ticked, Vec3
 
 # Messages on a daemon's control socket, and the path of the socket.
 #
@@ -105,8 +104,6 @@ _REQUEST = msgspec.json.Decoder(ControlRequest)
 class Orderly(Protocol):
     """Receiver of orders: the control loop."""
 
-    answers: tuple[tuple[Command, Event], ...]  # the orders that the last tick took, each with its answer
-
     def order(self, command: Command) -> bool:
         """Queue an order for the next tick; False if too many wait."""
         ...
@@ -135,14 +132,14 @@ class ControlServer:
         self._clients: list[_Client] = []
         self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
-    def after_tick(self, due: Due, lateness_ns: int) -> None:
+    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
         del lateness_ns
-        self._answer()
-        self._accept(due.at_ns)
+        self._answer(list(ticked.answers))
+        self._accept(ticked.decision.at_ns)
         waiting = [client for client, _ in self._waiting]
         for client in [one for one in self._clients if one not in waiting]:
-            self._serve(client, due.at_ns)
+            self._serve(client, ticked.decision.at_ns)
 
     def close(self) -> None:
         """End the service; clients that still wait are told so."""
@@ -153,8 +150,7 @@ class ControlServer:
         self._clients.clear()
         self._waiting.clear()
 
-    def _answer(self) -> None:
-        answers = list(self._flight.answers)
+    def _answer(self, answers: list[tuple[Command, Event]]) -> None:
         waiting, self._waiting = self._waiting, []
         for client, command in waiting:
             found = next((one for one in answers if one[0] == command), None)

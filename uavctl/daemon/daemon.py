@@ -8,19 +8,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from uavctl.clock import Due, Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns
 from uavctl.errors import ConnectionClosedError
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
 from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import OVERRUN
 from uavctl.outcome import Cause
+from uavctl.records import Event, Outgoing, Ticked
 
 PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
 STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
 FRESH_NS = 150_000_000  # a look is so old at most when a setpoint goes out
 MAX_LOOKS = 10  # at a backlog, before a tick
 WITHHELD = "withheld"
+
+AfterTick = Callable[[Ticked, int], None]
+"""Called with what a tick gave and its lateness [ns], once its setpoint is out; may neither wait nor raise."""
 
 
 def fly(
@@ -31,7 +35,8 @@ def fly(
     *,
     duration_s: float | None = None,
     stop_limit_s: float,
-    after_tick: Sequence[Callable[[Due, int], None]] = (),
+    after_tick: Sequence[AfterTick] = (),
+    on_news: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
 ) -> bool:
@@ -43,7 +48,8 @@ def fly(
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
         stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
             that are relayed to it; 0 ends without one.
-        after_tick: called with each tick and its lateness [ns] once its setpoint is out; none may wait or raise.
+        after_tick: called in this order after each tick.
+        on_news: called with what a datagram brings for a person; may neither wait nor raise.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
 
@@ -56,7 +62,16 @@ def fly(
     first_ns: int | None = None
     stop_ns: int | None = None
     refusals = _Refusals(loop, connections)
-    reader = _Reader(loop, connections, now)
+    reader = _Reader(loop, connections, now, on_news)
+    withheld = 0
+
+    def send(message: Outgoing) -> None:
+        nonlocal withheld
+        if message.link == VEHICLE and not reader.fresh:
+            withheld += 1  # who has the vehicle may have changed since the look
+        else:
+            connections[message.link].send(message.data)
+
     try:
         while not loop.finished:
             due = ticker.next()
@@ -84,17 +99,13 @@ def fly(
             if late and not (stop_limit_s and loop.carries):
                 break
             withheld = 0
-            for message in loop.tick(due.tick, due.at_ns, due.missed, stop=stop_ns is not None):
-                if message.link == VEHICLE and not reader.fresh:
-                    withheld += 1  # who has the vehicle may have changed since the look
-                    continue
-                connections[message.link].send(message.data)
+            ticked = loop.tick(due.tick, due.at_ns, send, due.missed, stop=stop_ns is not None)
             if withheld:
                 loop.refused(VEHICLE, {WITHHELD: withheld}, now())
-            loop.timing(due.tick, due.at_ns, started_ns - due.at_ns, now() - due.at_ns)
+            loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
             refusals.tell(due.at_ns)
             for follow in after_tick:
-                follow(due, started_ns - due.at_ns)
+                follow(ticked, started_ns - due.at_ns)
     finally:
         refusals.tell(now(), last=True)
     return stop_ns is not None
@@ -103,8 +114,14 @@ def fly(
 class _Reader:
     """Hands on what arrives, and knows how old the last look is at what the vehicle says."""
 
-    def __init__(self, loop: ControlLoop, connections: Mapping[str, Connection], now: Callable[[], int]) -> None:
-        self._loop, self._connections, self._now = loop, connections, now
+    def __init__(
+        self,
+        loop: ControlLoop,
+        connections: Mapping[str, Connection],
+        now: Callable[[], int],
+        on_news: Callable[[tuple[Event, ...]], None],
+    ) -> None:
+        self._loop, self._connections, self._now, self._on_news = loop, connections, now, on_news
         self._looked_ns = now()  # when the last read ended
         self._whole_ns: int | None = None  # when the last read began after which nothing was left
         self._lost = dict.fromkeys(connections, 0)
@@ -146,6 +163,8 @@ class _Reader:
             connection.answer(index)
         elif received.from_source:
             connection.trust(index)
+        if received.news:
+            self._on_news(received.news)
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 

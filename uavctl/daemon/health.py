@@ -10,13 +10,12 @@ from typing import Protocol
 
 import msgspec
 
-from uavctl.clock import Due
 from uavctl.config import Config
 from uavctl.config.checks import position_index
 from uavctl.errors import UsageError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
-from uavctl.records import ControlMode, Decision, Estimate, LinkEstimate, RelayStats, Vector, VehicleStatus
+from uavctl.records import ControlMode, LinkEstimate, RelayStats, Ticked, Vector, VehicleStatus
 
 # State of a flight, once a second: for a person, for `uavctl ctl status`, for the service manager.
 
@@ -84,11 +83,6 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 class Flight(Protocol):
     """Control loop as far as its health is looked at."""
 
-    decision: Decision | None
-    estimate: Estimate | None
-    link: LinkEstimate | None
-    vehicle: VehicleStatus | None
-
     course: FlightCourse
 
     @property
@@ -127,6 +121,8 @@ class HealthWatch:
         self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
         speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
         self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
+        self._ticked: Ticked | None = None  # the last tick
+        self._link: LinkEstimate | None = None  # the last one that there was
         self._begun_ns: int | None = None
         self._now_ns = 0
         self._told_ns = 0
@@ -137,18 +133,20 @@ class HealthWatch:
         self._let_go = ""  # the same
         self._relayed = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
 
-    def after_tick(self, due: Due, lateness_ns: int) -> None:
+    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick."""
+        self._ticked, self._link = ticked, ticked.link or self._link
+        at_ns = ticked.decision.at_ns
         if self._begun_ns is None:
-            self._begun_ns = self._told_ns = due.at_ns
-        self._now_ns = due.at_ns
-        self._missed += due.missed
+            self._begun_ns = self._told_ns = at_ns
+        self._now_ns = at_ns
+        self._missed += ticked.decision.missed_ticks
         self._worst_ns = max(self._worst_ns, lateness_ns)
         if self._flight.let_go and not self._let_go:
             self._let_go = self._flight.let_go
             self._tell(f"error: the vehicle is let go: {self._let_go}")
-        if due.at_ns - self._told_ns >= PERIOD_NS:
-            self._told_ns = due.at_ns
+        if at_ns - self._told_ns >= PERIOD_NS:
+            self._told_ns = at_ns
             self._worst_before_ns, self._worst_ns = self._worst_ns, 0
             relay = self._flight.relay
             if relay is not None:
@@ -168,8 +166,10 @@ class HealthWatch:
 
     def look(self) -> Health:
         """The flight as it is now."""
-        flight, recorder = self._flight, self._recorder()
-        decision, estimate, vehicle, link = flight.decision, flight.estimate, flight.vehicle, flight.link
+        flight, recorder, ticked, link = self._flight, self._recorder(), self._ticked, self._link
+        decision, estimate, vehicle = (
+            (None, None, None) if ticked is None else (ticked.decision, ticked.estimate, ticked.vehicle)
+        )
         mean = None if estimate is None else estimate.mean
         name, url, pid = self._identity
         return Health(
@@ -274,14 +274,15 @@ class Notifier:
         self.watchdog_ns = _watchdog_ns(environ, os.getpid() if pid is None else pid)
         self._fed_ns: int | None = None
 
-    def after_tick(self, due: Due, lateness_ns: int) -> None:
+    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick: ready with the first one, then signs of life."""
         del lateness_ns
+        at_ns = ticked.decision.at_ns
         if self._fed_ns is None:
             self._tell("READY=1")
-        elif self.watchdog_ns is None or due.at_ns - self._fed_ns < self.watchdog_ns // _FEEDS:
+        elif self.watchdog_ns is None or at_ns - self._fed_ns < self.watchdog_ns // _FEEDS:
             return
-        self._fed_ns = due.at_ns
+        self._fed_ns = at_ns
         self._tell("WATCHDOG=1")
 
     def status(self, text: str) -> None:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from uavctl.clock import Due
+from uavctl.records import Ticked
 
 PRIORITY = 20  # of SCHED_FIFO: above everything normal, below the kernel's interrupt threads (50)
 COLLECT_NS = 1_000_000_000
@@ -34,13 +34,14 @@ class Outcome:
 class Collector:
     """Collects garbage once a second, right after a tick; what was there at the start is frozen and never walked."""
 
-    def after_tick(self, due: Due, lateness_ns: int) -> None:
+    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Collect if it is time to."""
         del lateness_ns
+        at_ns = ticked.decision.at_ns
         if self._collected_ns is None:
-            self._collected_ns = due.at_ns
-        elif due.at_ns - self._collected_ns >= COLLECT_NS:
-            self._collected_ns = due.at_ns
+            self._collected_ns = at_ns
+        elif at_ns - self._collected_ns >= COLLECT_NS:
+            self._collected_ns = at_ns
             gc.collect()
 
     _collected_ns: int | None = None

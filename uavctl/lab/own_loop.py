@@ -7,7 +7,7 @@ its external mode: a place and a heading, or along a motion place, velocity and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -19,7 +19,7 @@ from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion
 from uavctl.loop import VEHICLE, make_links
 from uavctl.mavlink.relay import Relay
-from uavctl.records import Outgoing, PositionSample, Received, Vec3
+from uavctl.records import Outgoing, PositionSample, Received, Send, Vec3
 
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 # What makes an estimator use external positions and nothing else, as on the recorded flights (docs/autopilots.md).
@@ -129,25 +129,26 @@ class OwnLoop:
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take a datagram; its positions are relayed to the vehicle, at once or with the next tick."""
-        source = self._links[link]
-        for item in source.receive(data, at_ns):
+        understood = self._links[link].receive(data, at_ns)
+        for item in understood.items:
             if isinstance(item, PositionSample):
                 self.samples.append(item)
-                self.relay.take(item, source.attitude or LEVEL)  # of a body that is quite level no attitude is told
-        answers = tuple(Outgoing(link=link, data=answer) for answer in source.answers())
+                self.relay.take(item, understood.attitude or LEVEL)  # of a body that is quite level none is told
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
         return Received((*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers, True, True)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         """Send everything due at a tick: heartbeats, positions, and the setpoint."""
         del tick
         for name, link in self._links.items():
             for data in link.due(at_ns):
-                yield Outgoing(link=name, data=data)
-        yield from self._pass_on(at_ns)
+                send(Outgoing(link=name, data=data))
+        for pose in self._pass_on(at_ns):
+            send(pose)
         vehicle = self._links[VEHICLE].vehicle
         if vehicle is not None:
             self.begun_ns = at_ns if self.begun_ns is None else self.begun_ns
-            yield self._setpoint(vehicle, (at_ns - self.begun_ns) * 1e-9, at_ns)
+            send(self._setpoint(vehicle, (at_ns - self.begun_ns) * 1e-9, at_ns))
 
     def _pass_on(self, at_ns: int) -> list[Outgoing]:
         poses = self._links[VEHICLE].relay(self.relay, at_ns, self.config.sim.autopilot, refused=())

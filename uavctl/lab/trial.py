@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from statistics import median
@@ -24,7 +24,7 @@ from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
 from uavctl.lab.own_loop import Moment, OwnLoop, OwnTuning, Path
 from uavctl.loop import ControlLoop
-from uavctl.records import ControlMode, Decision, Flyer, Outgoing, Plan, Received, Record, Setpoint, Vec3
+from uavctl.records import ControlMode, Decision, Flyer, Plan, Received, Record, Send, Setpoint, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 
@@ -415,11 +415,11 @@ class WatchedFlyer:
         """Take a datagram."""
         return self.flyer.receive(link, data, at_ns)
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
         """Record where the vehicle is, and run the tick."""
         self.times_s.append(at_ns * 1e-9)
         self.positions_m.append(self.where())
-        yield from self.flyer.tick(tick, at_ns)
+        self.flyer.tick(tick, at_ns, send)
 
 
 @dataclass

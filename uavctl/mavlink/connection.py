@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from statistics import median
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -174,6 +175,16 @@ _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE})  # counted, not told: every
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
 
+class Understood(NamedTuple):
+    """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
+
+    items: tuple[Item, ...]
+    answers: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
+    settled: bool  # whether the newest sample is of a source that has spoken for a while
+    attitude: Quaternion | None  # of the body in it: body axes forward, right, down to NED (w, x, y, z)
+    clock_source: ClockSource  # of its capture time
+
+
 class MavlinkConnection:
     """MAVLink on one connection.
 
@@ -222,7 +233,7 @@ class MavlinkConnection:
         self._answered = False
         self._listen = listen
         self._askers: set[int] = set()  # systems that ask for our time
-        self._answers: list[bytes] = []  # to requests of the last datagram
+        self._answers: list[bytes] = []  # to requests of the datagram in hand
         self._answers_from_ns = 0
         self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
 
@@ -230,21 +241,6 @@ class MavlinkConnection:
     def vehicle(self) -> tuple[int, int] | None:
         """System and component of the vehicle; None before its first heartbeat."""
         return self._vehicle.address
-
-    @property
-    def attitude(self) -> Quaternion | None:
-        """Attitude of the body in the newest sample: body axes forward, right, down to NED (w, x, y, z)."""
-        return self._intake.attitude
-
-    @property
-    def clock_source(self) -> ClockSource:
-        """Source of the newest sample's capture time."""
-        return self._intake.clock_source
-
-    @property
-    def settled(self) -> bool:
-        """Whether the newest sample is of a source that has spoken for a while."""
-        return self._intake.settled
 
     def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
         """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
@@ -267,7 +263,7 @@ class MavlinkConnection:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         return self._vehicle.up_s(at_ns)
 
-    def receive(self, data: bytes, at_ns: int) -> tuple[Item, ...]:
+    def receive(self, data: bytes, at_ns: int) -> Understood:
         """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
         self._answers.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
@@ -277,11 +273,9 @@ class MavlinkConnection:
             self._count(reason, count)
         items = [item for message in decoded.messages for item in self._take(message, at_ns)]
         items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
-        return (*items, *self._tell(at_ns))
-
-    def answers(self) -> tuple[bytes, ...]:
-        """Answers to the last datagram, to be sent at once: a TIMESYNC that waits measures the wait."""
-        return tuple(self._answers)
+        intake = self._intake
+        told = (*items, *self._tell(at_ns))
+        return Understood(told, tuple(self._answers), intake.settled, intake.attitude, intake.clock_source)
 
     def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
         """Take the counts of what the connection dropped unread: addresses, rates, signatures."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from uavctl.lab.trial import (
     own_loop,
 )
 from uavctl.loop import ControlLoop
-from uavctl.records import Outgoing, PositionSample, Received, Record, StepInput
+from uavctl.records import Outgoing, PositionSample, Received, Record, Send, StepInput
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SECONDS = 12.0
@@ -49,13 +49,15 @@ class Overheard:
         self._keep(received.answers)
         return received
 
-    def tick(self, tick: int, at_ns: int) -> Iterator[Outgoing]:
-        yield from self._keep(self.own.tick(tick, at_ns))
+    def tick(self, tick: int, at_ns: int, send: Send) -> None:
+        outgoing: list[Outgoing] = []
+        self.own.tick(tick, at_ns, outgoing.append)
+        self._keep(outgoing)
+        for one in outgoing:
+            send(one)
 
-    def _keep(self, outgoing: Iterable[Outgoing]) -> list[Outgoing]:
-        out = list(outgoing)
-        self.sent += [msg for one in out if one.link == VEHICLE for msg in read(one.data)]
-        return out
+    def _keep(self, outgoing: Iterable[Outgoing]) -> None:
+        self.sent += [msg for one in outgoing if one.link == VEHICLE for msg in read(one.data)]
 
     def of(self, kind: str) -> list[Any]:
         return [msg for msg in self.sent if msg.get_type() == kind]

@@ -381,10 +381,11 @@ def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[Positi
                 link.answered(address, trip.sent_ns, trip.remote_ns, one.at_ns)
         if one.outgoing:
             continue
-        for item in link.receive(one.data, one.at_ns):
+        understood = link.receive(one.data, one.at_ns)
+        for item in understood.items:
             if isinstance(item, PositionSample):
                 found.append(item)
-                if link.clock_source is ClockSource.TIMESYNC:
+                if understood.clock_source is ClockSource.TIMESYNC:
                     answered.append(item)
     return found, answered
 

@@ -29,7 +29,7 @@ from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import RawFrame, scan
 from uavctl.mavlink.messages import Position
-from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3
+from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, to_nobody
 
 # How far the flight that might have been departs from the recorded one.
 #
@@ -354,9 +354,9 @@ class _Flight:
         for command in record.commands:
             self._loop.order(command)
         self._tap.setpoint = None
-        deque(self._loop.tick(record.tick, at_ns, record.missed_ticks, record.stop), maxlen=0)
-        self._loop.timing(record.tick, at_ns, lateness_ns=0, send_ns=0)
-        self._steer(at_ns)
+        ticked = self._loop.tick(record.tick, at_ns, to_nobody, record.missed_ticks, record.stop)
+        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
+        self._steer(at_ns, ticked.decision.reason)
         self.tell(at_ns)
 
     def tell(self, to_ns: int) -> None:
@@ -378,7 +378,7 @@ class _Flight:
                 told = replace(told, sent=sent, lost=lost)
             self._tap.put(TRUTH, at_ns, told)
 
-    def _steer(self, at_ns: int) -> None:
+    def _steer(self, at_ns: int, reason: str) -> None:
         course, was, now = self.course, self._history.setpoints.get(at_ns), self._tap.setpoint
         taken = self._history.taken[at_ns]
         if was is not None and now is not None and taken:
@@ -386,7 +386,6 @@ class _Flight:
             course.departure.steer(at_ns, (now[0] - was[0], now[1] - was[1], now[2] - was[2]))
         elif self._begun and self._apart_ns is None:
             self._apart_ns = at_ns
-            reason = "" if self._loop.decision is None else self._loop.decision.reason
             course.ended = "no setpoint of the recording flies the vehicle any more" if now is not None else reason
         if self._apart_ns is None:
             course.end_ns, course.ended = at_ns, _WHOLE
