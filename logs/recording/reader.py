@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from logs.recording.disk import later_segments
-from logs.recording.segment import MAGIC
+from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MAGIC, MESSAGE
 from logs.recording.topics import (
     END,
     GOES_ON,
@@ -42,7 +42,6 @@ from uavctl.records import Header, Record
 
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _IS_MESSAGE = int(Opcode.MESSAGE)  # a plain number: compared for every record
 
 
@@ -95,8 +94,8 @@ class Contents:
             if content[at] != _IS_MESSAGE:
                 at = self._define(content, at, channels)
                 continue
-            _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-            begin, at = at + _MESSAGE.size, at + _RECORD.size + length
+            _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
+            begin, at = at + MESSAGE.size, at + _RECORD.size + length
             definition = channels[channel]
             if order is not None:
                 if sequence != order.following and order.following is not None:
@@ -136,9 +135,6 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
 
 __all__ = ["Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
 
-_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
-_CHUNK_FIELDS = _CHUNK.size - _RECORD.size
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
@@ -290,9 +286,9 @@ def _whole(data: Buffer, at: int) -> int:
         raise _TornRecordError("is torn")
     inner = at + _RECORD.size
     if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
-        good = length >= 6 and _INDEX.unpack_from(data, at)[3] == length - 6
+        good = length >= 6 and INDEX.unpack_from(data, at)[3] == length - 6
     elif opcode == Opcode.CHUNK:
-        good = length >= _CHUNK_FIELDS
+        good = length >= CHUNK_FIELDS
     elif opcode == Opcode.DATA_END:
         good = length == _DATA_END.size - _RECORD.size
     elif opcode == Opcode.HEADER:
@@ -316,10 +312,10 @@ def _header_length(data: Buffer, inner: int, length: int) -> int:
 
 def _chunk(data: Buffer, at: int, length: int) -> bytes:
     """Content of the chunk at `at`, if its checksum is right."""
-    _, _, first, last, size, crc, name, inner = _CHUNK.unpack_from(data, at)
-    if name != 0 or inner != length - _CHUNK.size or size != inner or first > last:
+    _, _, first, last, size, crc, name, inner = CHUNK.unpack_from(data, at)
+    if name != 0 or inner != length - CHUNK.size or size != inner or first > last:
         raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
-    content = data[at + _CHUNK.size : at + length]
+    content = data[at + CHUNK.size : at + length]
     if zlib.crc32(content) != crc:
         raise _BadRecordError("has a wrong checksum")
     return content
@@ -328,7 +324,7 @@ def _chunk(data: Buffer, at: int, length: int) -> bytes:
 def _next_chunk(data: Buffer, start: int) -> int | None:
     """Offset of the next whole chunk from `start` on."""
     at = data.find(bytes([Opcode.CHUNK]), start)
-    while 0 <= at <= len(data) - _CHUNK.size:
+    while 0 <= at <= len(data) - CHUNK.size:
         try:
             _chunk(data, at, _whole(data, at))
         except _BadRecordError:
