@@ -27,6 +27,7 @@ from uavctl.loop import ControlLoop
 from uavctl.records import ControlMode, Decision, Flyer, Outgoing, Plan, Received, Record, Setpoint, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.plant import AXES
 
 # A figure of eight with a given mean and largest speed, from rest to rest, as a trajectory of the configuration.
 #
@@ -51,8 +52,8 @@ def eight() -> TrajectoryConfig:
     times, positions, velocities = motion(_SAMPLE_S)
     return TrajectoryConfig(
         times_s=tuple(times.tolist()),
-        positions_m=tuple(_row_vec3(row) for row in positions),
-        velocities_mps=tuple(_row_vec3(row) for row in velocities),
+        positions_m=tuple(_vec3(row) for row in positions),
+        velocities_mps=tuple(_vec3(row) for row in velocities),
     )
 
 
@@ -107,11 +108,6 @@ def _length() -> float:
     angle = np.linspace(0.0, 2.0 * math.pi, _FINE + 1)
     points = np.column_stack([HALF_M * np.sin(angle), 0.5 * WIDTH_M * np.sin(2.0 * angle)])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def _row_vec3(row: Array) -> Vec3:
-    north, east, down = row.tolist()
-    return north, east, down
 
 
 # What is flown in a trial: who flies, what, with whom, in which air and over which link. Plain and picklable.
@@ -328,9 +324,6 @@ def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
 # The room of a configuration, and what of it a controller can use.
 
 
-_AXES = ("north", "east", "down")
-
-
 def room_of(config: Config) -> tuple[Array, Array]:
     """Least and largest position in the room (3,); infinite where there is no wall."""
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
@@ -338,8 +331,8 @@ def room_of(config: Config) -> tuple[Array, Array]:
         config.plant.states_per_axis * i for i in range(len(config.plant.axes))
     )
     for axis, place in zip(config.plant.axes, index, strict=True):
-        lower[_AXES.index(axis)] = config.sets.state_lower[place]
-        upper[_AXES.index(axis)] = config.sets.state_upper[place]
+        lower[AXES.index(axis)] = config.sets.state_lower[place]
+        upper[AXES.index(axis)] = config.sets.state_upper[place]
     return lower, upper
 
 
@@ -366,7 +359,7 @@ def usable_seen(config: Config, design: Design | None) -> float:
 
 
 def _volume_share(config: Config, least: Array, most: Array) -> float:
-    axes = [_AXES.index(axis) for axis in config.plant.axes]
+    axes = [AXES.index(axis) for axis in config.plant.axes]
     lower, upper = room_of(config)
     whole = (upper - lower)[axes]
     return float(np.prod(np.clip(most - least, 0.0, None) / whole)) if np.isfinite(whole).all() else math.nan

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -158,10 +159,7 @@ class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
     def middle(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
         """The median run, quantile by quantile."""
         return TimeQuantiles(
-            p50=median(run.p50 for run in runs),
-            p99=median(run.p99 for run in runs),
-            p999=median(run.p999 for run in runs),
-            max=median(run.max for run in runs),
+            **{key: median(getattr(run, key) for run in runs) for key in TimeQuantiles.__struct_fields__}
         )
 
 
@@ -186,12 +184,12 @@ class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
     @staticmethod
     def middle(runs: Sequence[LoopRun]) -> LoopRun:
         """The medians over runs."""
-        spreads = ("in_to_out_us", "lateness_us", "empty_lateness_us", "step_us")
-        fields: dict[str, TimeQuantiles | float] = {}
-        for name in LoopRun.__struct_fields__:
-            values = [getattr(run, name) for run in runs]
-            fields[name] = TimeQuantiles.middle(values) if name in spreads else float(median(values))
-        return msgspec.convert(fields, LoopRun)
+        columns = {name: [getattr(run, name) for run in runs] for name in LoopRun.__struct_fields__}
+        middle: dict[str, Any] = {
+            name: TimeQuantiles.middle(values) if isinstance(values[0], TimeQuantiles) else float(median(values))
+            for name, values in columns.items()
+        }
+        return LoopRun(**middle)
 
 
 class LoopBench(msgspec.Struct, frozen=True, kw_only=True):

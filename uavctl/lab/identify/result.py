@@ -27,6 +27,7 @@ from uavctl.lab.identify.fit import (
 )
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, stretches, thinned
 from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis, ramped
+from uavctl.smpc.plant import AXES
 
 # What the link did: rate, losses and their runs, delays.
 
@@ -126,7 +127,6 @@ def _burst_statistic(missing: NDArray[np.int64]) -> float:
 # What was identified, and the configuration that it makes.
 
 
-AXES = ("north", "east", "down")
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
 _DIGITS = 4
 _JERK_AS_SHIPPED_MPS3 = 5.0
