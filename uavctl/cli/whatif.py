@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,8 +13,7 @@ from cyclopts import Parameter
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
 from logs.recording.export import known_number
@@ -28,7 +26,7 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
 from uavctl.build.controller import build_problem, design_of
-from uavctl.cli.common import SEED, Common, Flight, Json, located, messages, warn
+from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared, prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
@@ -291,11 +289,8 @@ def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
         warn(text)
 
 
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
-        yield progress
+def _progress() -> Progress:
+    return bars(TaskProgressColumn(), TimeElapsedColumn())
 
 
 def _watch(progress: Progress, what: str) -> Watch:
@@ -371,10 +366,6 @@ def _recorded(
 
 
 def _picture(result: WhatIf) -> RenderableType:
-    table = Table()
-    for heading in HEADINGS:
-        table.add_column(heading, overflow="fold")
-    for row in side_by_side(result):
-        table.add_row(*map(Text, row))
+    table = columns("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
     places = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
     return Group(*map(Text, story(result)), table, *map(Text, places))
