@@ -22,7 +22,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote
 
 import msgspec
@@ -31,7 +31,7 @@ from mcap.reader import make_reader
 
 from logs.recording.outputs import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, finished, good_messages, segment_files
-from logs.recording.topics import HEADER, LIBRARY, decode, is_view, record_type
+from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import Record, Vec3
 
@@ -45,22 +45,6 @@ class TableColumn:
 
     name: str
     kind: type  # of its cells, one of `_LEAVES`
-
-
-class _Form(Protocol):
-    """How values of one type stand in columns; told all values first, then asked for the cells of each."""
-
-    def learn(self, value: Any) -> None:
-        """See how many columns a value needs."""
-        ...
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        """The columns that all values need, each beginning with `name`."""
-        ...
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        """Append a value's cells, one for each column."""
-        ...
 
 
 class _Leaf:
@@ -95,19 +79,26 @@ class _Parts:
         self._mark, self._parts, self._forms, self._item = mark, parts, dict(forms), item
 
     def learn(self, value: Any) -> None:
+        """See how many columns a value needs."""
         for key, part in ({} if value is None else self._parts(value)).items():
             if key not in self._forms:
                 self._forms = dict(sorted([*self._forms.items(), (key, _form(self._item))]))
             self._forms[key].learn(part)
 
     def columns(self, name: str) -> Iterator[TableColumn]:
+        """The columns that all values need, each beginning with `name`."""
         for key, form in self._forms.items():
             yield from form.columns(f"{name}{self._mark}{key}" if name else key)
 
     def put(self, value: Any, row: list[Cell]) -> None:
+        """Append a value's cells, one for each column."""
         held = {} if value is None else self._parts(value)
         for key, form in self._forms.items():
             form.put(held.get(key), row)
+
+
+# How values of one type stand in columns; told all values first, then asked for the cells of each.
+_Form = _Leaf | _Parts
 
 
 def _fields(kind: type[msgspec.Struct]) -> _Parts:
@@ -342,7 +333,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
         nonlocal total
         for message in good_messages(flight):
             total += 1
-            if not _is_known(message.definition.topic):
+            if not is_known(message.definition.topic):
                 unknown[message.definition.topic] += 1
             yield message
 
@@ -354,16 +345,8 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
 def _decoded(messages: Iterable[RecordedMessage]) -> Iterator[tuple[str, int, Record]]:
     for message in messages:
         topic = message.definition.topic
-        if _is_known(topic):
+        if is_known(topic):
             yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
-
-
-def _is_known(topic: str) -> bool:
-    try:
-        record_type(topic)
-    except KeyError:
-        return False
-    return True
 
 
 _Write = Callable[[list[Cell]], None]  # appends a row to a table

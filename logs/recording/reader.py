@@ -33,6 +33,7 @@ from logs.recording.topics import (
     RecorderNote,
     decode,
     definition,
+    is_known,
     record_type,
 )
 from uavctl.errors import RecordingError
@@ -474,12 +475,16 @@ def last_note(path: Path) -> RecorderNote | None:
 
 def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
     """The last one of a file's last chunk."""
-    for message in reversed(end or []):
-        if message.definition.topic == RECORDER:
-            note = decode(RECORDER, message.data, message.at_ns)
-            assert isinstance(note, RecorderNote)  # the topic's type
-            return note
-    return None
+    return next((note for message in reversed(end or []) if (note := note_of(message)) is not None), None)
+
+
+def note_of(message: RecordedMessage) -> RecorderNote | None:
+    """What the recorder says in a message; None in any other."""
+    if message.definition.topic != RECORDER:
+        return None
+    note = decode(RECORDER, message.data, message.at_ns)
+    assert isinstance(note, RecorderNote)  # the topic's type
+    return note
 
 
 def records(path: Path, kind: type[R]) -> Iterator[R]:
@@ -490,7 +495,7 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
     """
     for message in good_messages(path):
         topic = message.definition.topic
-        if _is(topic, kind):
+        if is_known(topic) and issubclass(record_type(topic), kind):
             record = decode(topic, message.data, message.at_ns)
             assert isinstance(record, kind)  # the topic's type
             yield record
@@ -521,21 +526,13 @@ def good_messages(path: Path) -> Iterator[RecordedMessage]:
             raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
 
 
-def _is(topic: str, kind: type[Record]) -> bool:
-    try:
-        return issubclass(record_type(topic), kind)
-    except KeyError:
-        return False
-
-
 def _continues(path: Path) -> bool:
     """Whether a file goes on with another one (and is no recording of its own with such a name)."""
     for count, item in enumerate(scan(path)):
         if not isinstance(item, RecordedMessage):
             return True  # empty or damaged: better told than passed over
-        if item.definition.topic == RECORDER:
-            note = decode(RECORDER, item.data, item.at_ns)
-            return isinstance(note, RecorderNote) and note.segment > 1
+        if (note := note_of(item)) is not None:
+            return note.segment > 1
         if count == 1:
             break
     return False

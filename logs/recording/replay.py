@@ -258,19 +258,7 @@ def _order(command: Command) -> str:
     return command.order.value if given is None else f"{command.order.value} {given}"
 
 
-COMPARED = frozenset(
-    {
-        "/uavctl/step_input",
-        "/uavctl/estimate",
-        "/uavctl/link_estimate",
-        "/uavctl/plan",
-        "/uavctl/decision",
-        "/uavctl/setpoint",
-        "/uavctl/vehicle",
-        "/uavctl/event",
-        "/uavctl/link",
-    }
-)
+COMPARED = frozenset(_SAID_BY)
 Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})

@@ -303,7 +303,7 @@ def _parameters(one: LoadedFlight) -> dict[str, object]:
         raise RecordingError(f"{one.side.recording}: the configuration in its header is damaged ({error})") from error
     return {
         # JSON has no infinity, which limits may be.
-        **{key: one if one not in (math.inf, -math.inf) else str(one) for key, one in dotted(config)},
+        **{key: str(one) if isinstance(one, float) and not math.isfinite(one) else one for key, one in dotted(config)},
         "design_id": header.design_id,
         "library_id": header.library_id,
         "cpu": header.cpu,

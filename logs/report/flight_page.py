@@ -100,13 +100,6 @@ _BAND = Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f
 _UNREADABLE = "The flight's configuration cannot be read by this version, so its model cannot be run again."
 
 
-def verdict_sections(flight: FlightData, judged: Judged) -> Iterator[PageSection]:
-    """Risk, model and clocks; the link's verdict stands with its figures."""
-    yield _risk(judged.verdicts)
-    yield _model(flight, judged)
-    yield _clocks(flight, judged.verdicts)
-
-
 def verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
     """One line for each verdict."""
     risk = verdicts.risk
@@ -319,7 +312,8 @@ def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Ite
     begins = part_begins(flight)
     part = [("Part of a flight", f"begins at {begins}")] if begins else []
     yield PageSection("Summary", "", page.facts([*part, *rows(summary), *verdict_rows(judged.verdicts)]))
-    yield _timeline_section(flight)
+    wide, narrow, marks = timeline(flight)
+    yield PageSection("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
     yield _path_section(flight)
     yield _axes_section(flight)
     yield _age_section(flight)
@@ -329,13 +323,10 @@ def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Ite
     yield _certificates_section(flight)
     yield _timing_section(flight)
     yield _events_section(flight)
-    yield from verdict_sections(flight, judged)
+    yield _risk(judged.verdicts)
+    yield _model(flight, judged)
+    yield _clocks(flight, judged.verdicts)
     yield from origin_sections(flight)
-
-
-def _timeline_section(flight: FlightData) -> PageSection:
-    wide, narrow, marks = timeline(flight)
-    return PageSection("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
 
 
 def _path_section(flight: FlightData) -> PageSection:

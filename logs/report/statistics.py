@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 from scipy.special import bdtrc, betaincinv, chdtrc, chdtri, ndtr, ndtri
@@ -41,6 +43,11 @@ def share(hits: int, trials: int, tests: int = 1, worth: float = 1.0) -> Share:
         raise ValueError(f"{hits} of {trials} is no share")
     low, high = exact_interval(worth * hits, worth * trials, 0.5 * (1.0 - LEVEL) / tests)
     return Share(hits=hits, trials=trials, low=low, high=high)
+
+
+def finite(value: float) -> float | None:
+    """A figure for a document, which has no infinity; None where it is none."""
+    return value if math.isfinite(value) else None
 
 
 def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, float]:
