@@ -20,6 +20,7 @@ from uavctl.build.controller import build_conditioned, build_controller, build_p
 from uavctl.build.library import library_for
 from uavctl.build.mission import build_rests, resting_places
 from uavctl.config import Config, load_config, parse
+from uavctl.config.checks import position_index
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
 from uavctl.lab.own_loop import Moment, OwnLoop, OwnTuning, Path
@@ -52,8 +53,8 @@ def eight() -> TrajectoryConfig:
     times, positions, velocities = motion(_SAMPLE_S)
     return TrajectoryConfig(
         times_s=tuple(times.tolist()),
-        positions_m=tuple(_vec3(row) for row in positions),
-        velocities_mps=tuple(_vec3(row) for row in velocities),
+        positions_m=tuple(vec3(row) for row in positions),
+        velocities_mps=tuple(vec3(row) for row in velocities),
     )
 
 
@@ -327,10 +328,7 @@ def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
 def room_of(config: Config) -> tuple[Array, Array]:
     """Least and largest position in the room (3,); infinite where there is no wall."""
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
-    index = config.plant.position_index or tuple(
-        config.plant.states_per_axis * i for i in range(len(config.plant.axes))
-    )
-    for axis, place in zip(config.plant.axes, index, strict=True):
+    for axis, place in zip(config.plant.axes, position_index(config.plant), strict=True):
         lower[AXES.index(axis)] = config.sets.state_lower[place]
         upper[AXES.index(axis)] = config.sets.state_upper[place]
     return lower, upper
@@ -535,7 +533,7 @@ def path_of(motion: TrajectoryConfig) -> Path:
         moves = times[0] <= since_s < times[-1]
         place = spline(min(max(since_s, times[0]), times[-1]))
         velocity, accel = (speed(since_s), change(since_s)) if moves else (np.zeros(3), np.zeros(3))
-        return _vec3(place), _vec3(velocity), _vec3(accel)
+        return vec3(place), vec3(velocity), vec3(accel)
 
     return at
 
@@ -578,6 +576,7 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else math.nan
 
 
-def _vec3(values: Array) -> Vec3:
+def vec3(values: Array) -> Vec3:
+    """Three numbers as plain ones."""
     north, east, down = np.asarray(values, dtype=np.float64).tolist()
     return north, east, down

@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
 from statistics import median
@@ -46,20 +45,13 @@ _SO_TIMESTAMPNS = 35  # Linux: the kernel's own time of arrival, so that our wak
 _TIMESPEC = struct.Struct("qq")
 
 
-@dataclass
-class LoopReplies:
-    """What came back."""
-
-    # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
-    in_to_out_ns: list[int] = field(default_factory=list)
-    positions: int = 0  # sent so far
-
-
 class Peer:
     """Speaks to the daemon on one UDP connection; the grid of ticks is that of CLOCK_MONOTONIC."""
 
     def __init__(self, port: int, tick_ns: int) -> None:
-        self.seen = LoopReplies()
+        # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
+        self.in_to_out_ns: list[int] = []
+        self.positions = 0  # sent so far
         self._tick_ns = tick_ns
         self._socket = socket.socket(type=socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -79,12 +71,12 @@ class Peer:
         now_ns = time.monotonic_ns()
         deadline_ns = (now_ns + LEAD_NS) // self._tick_ns * self._tick_ns + self._tick_ns
         self._listen(deadline_ns - LEAD_NS)
-        if self.seen.positions % _HEARTBEAT_TICKS == 0:
+        if self.positions % _HEARTBEAT_TICKS == 0:
             self._beat(_ARMED)
         sent_ns = time.monotonic_ns()
         self._send(self._out.vision_position_estimate_encode(sent_ns // 1000, *self._position, 0.0, 0.0, 0.0))
         self._asked_ns.add(sent_ns // self._tick_ns * self._tick_ns + self._tick_ns)
-        self.seen.positions += 1
+        self.positions += 1
         self._move()
 
     def finish(self) -> None:
@@ -117,7 +109,7 @@ class Peer:
         deadline_ns = arrived_ns // self._tick_ns * self._tick_ns
         if deadline_ns in self._asked_ns:
             self._asked_ns.remove(deadline_ns)
-            self.seen.in_to_out_ns.append(arrived_ns - deadline_ns)
+            self.in_to_out_ns.append(arrived_ns - deadline_ns)
 
     def _move(self) -> None:
         tick_s = self._tick_ns * 1e-9
@@ -274,13 +266,13 @@ def _measured(path: Path, peer: Peer, memory_kib: Sequence[int], idle_ns: list[i
     late = TimeQuantiles.of(np.array([timing.lateness_ns for timing in timings]))
     empty = TimeQuantiles.of(np.array(idle_ns))
     return LoopRun(
-        in_to_out_us=TimeQuantiles.of(np.array(peer.seen.in_to_out_ns)),
+        in_to_out_us=TimeQuantiles.of(np.array(peer.in_to_out_ns)),
         lateness_us=late,
         empty_lateness_us=empty,
         above_empty_us=late.p999 - empty.p999,
         step_us=TimeQuantiles.of(np.array([timing.step_ns for timing in timings])),
-        positions=peer.seen.positions,
-        unanswered=peer.seen.positions - len(peer.seen.in_to_out_ns),
+        positions=peer.positions,
+        unanswered=peer.positions - len(peer.in_to_out_ns),
         missed_ticks=missed,
         recorded=recorded,
         dropped=dropped,
@@ -359,7 +351,7 @@ def _fly(peer: Peer, process: subprocess.Popen[str], positions: int) -> list[int
     """
     memory_kib: list[int] = []
     next_ns = time.monotonic_ns()
-    while peer.seen.positions < positions:
+    while peer.positions < positions:
         now_ns = time.monotonic_ns()
         peer.tick()
         if now_ns >= next_ns:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from logs.report.statistics import finite
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.intervals import (
     Pair,
@@ -287,8 +287,7 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
 
 def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
     """A figure of values; None of none, and where it is infinite or none."""
-    found = float(figure(values)) if values.size else math.nan
-    return found if math.isfinite(found) else None
+    return finite(float(figure(values))) if values.size else None
 
 
 def difference(a: Runs, b: Runs, column: str, per: float = 1.0) -> PairedDifference | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.config import Config
+from uavctl.config.checks import position_index
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
@@ -160,8 +161,7 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
         config: The configuration by which runs are judged: room, target, Δt.
         states: (N, T+1, n_x).
     """
-    plant = config.plant
-    index = list(plant.position_index or (3 * i for i in range(len(plant.axes))))
+    plant, index = config.plant, list(position_index(config.plant))
     axes = [AXES.index(axis) for axis in plant.axes]
     where = states[:, :, index]
     off = np.linalg.norm(where - np.array(config.target.position_m)[axes], axis=2)
