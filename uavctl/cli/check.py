@@ -166,10 +166,14 @@ def check(
     config = common.with_overrides(overrides).load().config
     items = [*disk_items(out, config.log.free_bytes)]
     items.append(_strangers(warnings(config.security, config.daemon)))
+
+    def prompt(text: str) -> None:
+        messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
+
     try:
         with connected(config) as connections, stop_on_signals() as stopped:
             seconds_s = config.check.seconds
-            items += run_preflight(config, connections, seconds_s, move=move, prompt=_prompt, stop=stopped)
+            items += run_preflight(config, connections, seconds_s, move=move, prompt=prompt, stop=stopped)
     except (ConnectionSpecError, KeyFileError) as error:
         if isinstance(error, ConnectionSpecError) and not isinstance(error.__cause__, OSError):
             raise  # a URL that is none: usage
@@ -206,10 +210,6 @@ def _strangers(texts: tuple[str, ...]) -> Item:
     state = ItemState.NOTE if texts else ItemState.GOOD
     value, hint = "; ".join(texts) or "none can speak", "see security.allow and security.key_file (docs/security.md)"
     return item("strangers", state, value, "known peers, and signed frames", hint)
-
-
-def _prompt(text: str) -> None:
-    messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
 
 
 def _table(report: Report) -> Table:

@@ -358,10 +358,8 @@ def _says_plant(common: Common) -> bool:
     if any(one.replace(" ", "").startswith("sim.plant=") for one in common.overrides):
         return True
     path = Path(common.config)
-    return path.suffix == ".toml" and path.exists() and _names_plant(path)
-
-
-def _names_plant(path: Path) -> bool:
+    if path.suffix != ".toml" or not path.exists():
+        return False
     sim = parse_toml(path.read_text(encoding="utf-8"), str(path)).get("sim")
     return isinstance(sim, dict) and "plant" in sim
 

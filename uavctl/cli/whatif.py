@@ -32,7 +32,6 @@ from uavctl.cli.prepare import Prepared, prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
-from uavctl.config.link import LinkConfig
 from uavctl.config.load import parse
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
@@ -235,7 +234,10 @@ def whatif(
         now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
-    other = None if over == RECORDED else _relinked(history, on, seed)
+    other = None
+    if over != RECORDED:
+        noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
+        other = Relinked(history, on, before.sim.seed if seed is None else seed, noise_m)
     begun = time.perf_counter()
     with new_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
         again = _reproduced(history, was, response, _watch(progress, "reproducing the flight"))
@@ -317,13 +319,6 @@ def _link(given: tuple[str, ...], overrides: tuple[str, ...]) -> str:
         typed = " --link ".join(given)
         raise UsageError(f"--link {typed}: give `{RECORDED}` or `{CONFIGURED}` alone, or KEY=VALUE, as in loss=0.5")
     return words[0] if words else ", ".join(given)
-
-
-def _relinked(history: RecordedFlight, link: LinkConfig, seed: int | None) -> Relinked:
-    """Another link for the positions of a recording."""
-    simulated, before = bool(history.flight.truths), history.config
-    noise_m = before.sim.camera.noise_std_m if simulated else before.estimator.position_std_m
-    return Relinked(history, link, before.sim.seed if seed is None else seed, noise_m)
 
 
 class _Memory:
