@@ -30,7 +30,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from logs.recording.outputs import all_or_none, check_free, unfinished
-from logs.recording.reader import RecordedMessage, finished, good_messages, segment_files
+from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
 from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import Record, Vec3
@@ -264,7 +264,7 @@ def known_number(flight: Path) -> int | None:
     Raises:
         RecordingError: There is no such recording.
     """
-    if not finished(flight):
+    if lacks_end(flight):
         return None
     number = 0
     for place, path in enumerate(segment_files(flight)):

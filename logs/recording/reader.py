@@ -426,15 +426,6 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
         yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
 
 
-def finished(path: Path) -> bool:
-    """Whether every file of a recording was closed in order, and the last of them with the recorder's last word.
-
-    Raises:
-        RecordingError: there is no such recording.
-    """
-    return not lacks_end(path)
-
-
 def lacks_end(path: Path) -> str:
     """Why a recording's end is not there, in words; nothing if it is.
 

@@ -120,7 +120,6 @@ Air = Literal["calm", "gusts", "strong-gusts"]
 
 SCENARIOS: tuple[Scenario, ...] = ("hold", "eight", "blackout")
 AUTOPILOTS: tuple[AutopilotName, ...] = ("px4", "ardupilot")
-AIRS: tuple[Air, ...] = ("calm", "gusts", "strong-gusts")
 WIND_MPS: Vec3 = (0.6, -0.36, 0.0)  # 0.7 m/s, wherever there are gusts
 GUST_WIND_MPS: dict[Air, float] = {"calm": 0.0, "gusts": 3.0, "strong-gusts": 8.0}
 BLACKOUT_S = 4.0
