@@ -42,11 +42,11 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import lacking
 from uavctl.records import Command, ControlMode, Ending, Event, Header, Order, PolicyLibrary, Record, Severity, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.plant import AXES
 
 # What `fly` and `loopback` ask of the hand-over: whether to arm and take off, when, and what came of it.
 
 
-AXES = ("north", "east", "down")
 DOWN = 2
 
 
