@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uavctl.lab.campaign.intervals import paired_ratio
+from uavctl.errors import UsageError
+from uavctl.lab.campaign.intervals import LEVEL, Array, Pair, paired_difference
 from uavctl.lab.campaign.results import CellSummary, Results, cell_summary, grouped, read_results
 
 COLUMNS = ("cost", "settled_cost")
@@ -35,6 +36,23 @@ def main(arguments: list[str]) -> int:
         for other in given.others:
             _tell(f"    {other}: {_figures(results, named[other])}{_over(results, ours, named[other])}")
     return 0
+
+
+def paired_ratio(a: Array, b: Array, level: float = LEVEL) -> tuple[float, Pair]:
+    """Mean of a (N,) over the mean of b (N,), run against run on the same draws, with its interval.
+
+    The interval is that of the mean of a - r b, with r the ratio, over the mean of b: what moves both costs of a run
+    alike is not counted.
+
+    Raises:
+        UsageError: There are no pairs, or runs without a partner, or b is zero in the mean.
+    """
+    base = float(b.mean()) if b.size else 0.0
+    if base == 0.0:
+        raise UsageError("nothing has a ratio to a mean of zero; compare runs that cost something")
+    ratio = float(a.mean()) / base
+    left = paired_difference(a, ratio * b, level)
+    return ratio, (ratio + left.low / base, ratio + left.high / base)
 
 
 def _figures(results: Results, cell: CellSummary) -> str:

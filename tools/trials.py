@@ -26,6 +26,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, fields
 from pathlib import Path
 from statistics import median
+from typing import get_args
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -33,7 +34,7 @@ from rich.table import Table
 
 from uavctl.errors import UavctlError
 from uavctl.lab.own_loop import TUNED, OwnTuning
-from uavctl.lab.trial import AIRS, AUTOPILOTS, SCENARIOS, SHOWN, Scenario, TrialCell, TrialFlight, TrialPilot, fly
+from uavctl.lab.trial import AUTOPILOTS, SCENARIOS, SHOWN, Air, Scenario, TrialCell, TrialFlight, TrialPilot, fly
 
 SCHEMES = ("hahn-stursberg", "age-conditioned")
 PILOTS = ("configured", *SCHEMES, "own", "own-tuned")
@@ -84,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--rates", nargs="+", type=float, default=[5.0, 50.0], help="of the cameras [Hz]")
     parser.add_argument("--losses", nargs="+", type=float, default=[0.3, 0.6])
-    parser.add_argument("--air", nargs="+", choices=AIRS, default=["gusts"])
+    parser.add_argument("--air", nargs="+", choices=get_args(Air), default=["gusts"])
     parser.add_argument("--seconds", type=float, default=40.0, help="length of a flight [s]; an eight has its own")
     parser.add_argument("--from", dest="from_s", type=float, default=10.0, help="from when on it is to hold [s]")
     parser.add_argument("--own-gain", action="append", default=[], metavar="NAME=VALUE", help="of own-tuned")

@@ -22,19 +22,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from logs.recording.design_view import DesignView, Floats
-from uavctl.records import (
-    Decision,
-    Estimate,
-    LinkEstimate,
-    LinkStats,
-    Matrix,
-    Plan,
-    Record,
-    Setpoint,
-    Timing,
-    Truth,
-    VehicleStatus,
-)
+from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, Setpoint, Timing, Truth
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
 
@@ -172,13 +160,13 @@ def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
 
 def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
     """Return the age at a tick; `captured_ns` is the capture time of the newest position so far."""
-    return _same(
+    return same(
         AgePlot,
         decision,
         age_s=math.nan if captured_ns is None else (decision.at_ns - captured_ns) * 1e-9,
-        age_steps=_number(decision.age_steps),
+        age_steps=number(decision.age_steps),
         limit_steps=float(design.horizon),
-        plan_index=_number(decision.plan_index),
+        plan_index=number(decision.plan_index),
         mode=decision.mode.value,
     )
 
@@ -230,55 +218,41 @@ def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, 
     return lower, upper
 
 
-def solve_plot(plan: Plan) -> SolvePlot:
-    """Return method and outcome of a solve."""
-    return _same(SolvePlot, plan, status=plan.status.value)
-
-
 def timing_plot(timing: Timing) -> TimingPlot:
     """Return the computing times of a tick."""
     return TimingPlot(
         lateness_us=timing.lateness_ns * 1e-3,
         step_us=timing.step_ns * 1e-3,
         send_us=timing.send_ns * 1e-3,
-        capture_to_send_ms=_number(timing.capture_to_send_ns) * 1e-6,
+        capture_to_send_ms=number(timing.capture_to_send_ns) * 1e-6,
     )
-
-
-def link_plot(link: LinkEstimate) -> LinkPlot:
-    """Return the link estimate."""
-    return _same(LinkPlot, link)
 
 
 def counter_plot(stats: LinkStats) -> CounterPlot:
     """Return the counters of a connection."""
-    return _same(
+    return same(
         CounterPlot,
         stats,
         bad=sum(stats.bad.values()),
-        clock_offset_ms=_number(stats.clock_offset_ns) * 1e-6,
-        clock_rtt_ms=_number(stats.clock_rtt_ns) * 1e-6,
-        clock_drift_ppm=_number(stats.clock_drift_ppm),
+        clock_offset_ms=number(stats.clock_offset_ns) * 1e-6,
+        clock_rtt_ms=number(stats.clock_rtt_ns) * 1e-6,
+        clock_drift_ppm=number(stats.clock_drift_ppm),
     )
 
 
 def truth_plot(truth: Truth) -> TruthPlot:
     """Return the true state of the simulated vehicle."""
     position, velocity = (Axes(north=v[0], east=v[1], down=v[2]) for v in (truth.position_m, truth.velocity_mps))
-    return _same(TruthPlot, truth, position_m=position, velocity_mps=velocity)
+    return same(TruthPlot, truth, position_m=position, velocity_mps=velocity)
 
 
-def vehicle_plot(status: VehicleStatus) -> VehiclePlot:
-    """Return mode and state of the vehicle."""
-    return _same(VehiclePlot, status, battery_v=_number(status.battery_v))
-
-
-def _same(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
+def same(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
     """Return a record of `kind`: fields of the same name are copied from `record`, the others given."""
     return kind(**{name: getattr(record, name) for name in kind.__struct_fields__ if name not in others}, **others)
 
 
-def _number(value: float | None) -> float:
+def number(value: float | None) -> float:
+    """A number that may be missing; NaN if it is."""
     return math.nan if value is None else float(value)
 
 

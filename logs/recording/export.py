@@ -18,11 +18,11 @@ import types
 import typing
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from enum import Enum, StrEnum
+from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any
 from urllib.parse import quote
 
 import msgspec
@@ -30,8 +30,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from logs.recording.outputs import all_or_none, check_free, unfinished
-from logs.recording.reader import RecordedMessage, finished, good_messages, segment_files
-from logs.recording.topics import HEADER, LIBRARY, decode, is_view, record_type
+from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
+from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import Record, Vec3
 
@@ -39,44 +39,18 @@ Cell = int | float | bool | str | bytes | None
 _AXES = ("x", "y", "z")
 
 
-class ColumnKind(Enum):
-    """Kind of a column's values."""
-
-    INTEGER = "integer"
-    FLOAT = "float"
-    BOOLEAN = "boolean"
-    TEXT = "text"
-    BYTES = "bytes"
-
-
 @dataclass(frozen=True)
 class TableColumn:
     """One column of a table."""
 
     name: str
-    kind: ColumnKind
-
-
-class _Form(Protocol):
-    """Columns of values of one type; learns from all values first, then writes the cells of each."""
-
-    def learn(self, value: Any) -> None:
-        """Look at a value to find the columns that it needs."""
-        ...
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        """Return the columns that all values need, each name beginning with `name`."""
-        ...
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        """Append the cells of a value, one for each column."""
-        ...
+    kind: type  # of its cells, one of `_LEAVES`
 
 
 class _Leaf:
     """A single column; `cell` makes a cell of a value."""
 
-    def __init__(self, kind: ColumnKind, cell: Callable[[Any], Cell] = lambda value: value) -> None:
+    def __init__(self, kind: type, cell: Callable[[Any], Cell] = lambda value: value) -> None:
         self._kind, self._cell = kind, cell
 
     def learn(self, value: Any) -> None:
@@ -105,19 +79,26 @@ class _Parts:
         self._mark, self._parts, self._forms, self._item = mark, parts, dict(forms), item
 
     def learn(self, value: Any) -> None:
+        """Look at a value to find the columns that it needs."""
         for key, part in ({} if value is None else self._parts(value)).items():
             if key not in self._forms:
                 self._forms = dict(sorted([*self._forms.items(), (key, _form(self._item))]))
             self._forms[key].learn(part)
 
     def columns(self, name: str) -> Iterator[TableColumn]:
+        """Return the columns that all values need, each name beginning with `name`."""
         for key, form in self._forms.items():
             yield from form.columns(f"{name}{self._mark}{key}" if name else key)
 
     def put(self, value: Any, row: list[Cell]) -> None:
+        """Append the cells of a value, one for each column."""
         held = {} if value is None else self._parts(value)
         for key, form in self._forms.items():
             form.put(held.get(key), row)
+
+
+# How values of one type stand in columns; told all values first, then asked for the cells of each.
+_Form = _Leaf | _Parts
 
 
 def _fields(kind: type[msgspec.Struct]) -> _Parts:
@@ -125,13 +106,7 @@ def _fields(kind: type[msgspec.Struct]) -> _Parts:
     return _Parts(".", lambda value: {name: getattr(value, name) for name in forms}, forms)
 
 
-_LEAVES = {
-    int: ColumnKind.INTEGER,
-    float: ColumnKind.FLOAT,
-    bool: ColumnKind.BOOLEAN,
-    str: ColumnKind.TEXT,
-    bytes: ColumnKind.BYTES,
-}
+_LEAVES = (int, float, bool, str, bytes)
 
 
 def _form(kind: Any) -> _Form:
@@ -143,20 +118,20 @@ def _form(kind: Any) -> _Form:
     kind = _present(kind)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if kind in _LEAVES:
-        return _Leaf(_LEAVES[kind])
+        return _Leaf(kind)
     if kind == Vec3:
-        axis = _Leaf(ColumnKind.FLOAT)
+        axis = _Leaf(float)
         return _Parts("_", lambda value: dict(zip(_AXES, value, strict=True)), dict.fromkeys(_AXES, axis))
     if origin is tuple and arguments[-1] is Ellipsis:
         if _is_record(arguments[0]):  # they stand in a table of their own
-            return _Leaf(ColumnKind.INTEGER, len)
+            return _Leaf(int, len)
         return _Parts("_", lambda value: dict(enumerate(value)), {}, arguments[0])
     if origin is dict:
         if arguments[1] is object:
-            return _Leaf(ColumnKind.TEXT, lambda value: msgspec.json.encode(value).decode())
+            return _Leaf(str, lambda value: msgspec.json.encode(value).decode())
         return _Parts(".", dict, {}, arguments[1])
     if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return _Leaf(ColumnKind.TEXT, lambda value: value.value)
+        return _Leaf(str, lambda value: value.value)
     if _is_record(kind):
         return _fields(kind)
     raise TypeError(f"no column can hold {kind}")
@@ -187,7 +162,7 @@ class _Table:
         self._form.learn(record)
 
     def columns(self) -> tuple[TableColumn, ...]:
-        return (*(TableColumn(name, ColumnKind.INTEGER) for name in self._lead), *self._form.columns(""))
+        return (*(TableColumn(name, int) for name in self._lead), *self._form.columns(""))
 
     def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
         self.rows += 1
@@ -289,7 +264,7 @@ def known_number(flight: Path) -> int | None:
     Raises:
         RecordingError: There is no such recording.
     """
-    if not finished(flight):
+    if lacks_end(flight):
         return None
     number = 0
     for place, path in enumerate(segment_files(flight)):
@@ -333,7 +308,7 @@ def export_tables(
         writers = {name: stack.enter_context(begin(parts[files[name]], columns[name])) for name in columns}
         for topic, at_ns, record in _decoded(watch(good_messages(flight), total, "writing")):
             for name, row in tables.rows(topic, at_ns, record):
-                writers[name].write(row)
+                writers[name](row)
                 rows[name] += 1
     return Exported(
         tables=tuple(
@@ -358,7 +333,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
         nonlocal total
         for message in good_messages(flight):
             total += 1
-            if not _is_known(message.definition.topic):
+            if not is_known(message.definition.topic):
                 unknown[message.definition.topic] += 1
             yield message
 
@@ -370,111 +345,74 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
 def _decoded(messages: Iterable[RecordedMessage]) -> Iterator[tuple[str, int, Record]]:
     for message in messages:
         topic = message.definition.topic
-        if _is_known(topic):
+        if is_known(topic):
             yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
 
 
-def _is_known(topic: str) -> bool:
-    try:
-        record_type(topic)
-    except KeyError:
-        return False
-    return True
+_Write = Callable[[list[Cell]], None]  # appends a row to a table
+_Writer = Callable[[Path, tuple[TableColumn, ...]], AbstractContextManager[_Write]]
 
 
-class _Writer(Protocol):
-    """Writer of one table's file."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None: ...
-
-    def write(self, row: list[Cell]) -> None:
-        """Append a row."""
-        ...
-
-
-def _writer(kind: TableFormat) -> Callable[[Path, tuple[TableColumn, ...]], _Writer]:
+def _writer(kind: TableFormat) -> _Writer:
     """Return the writer of a table format.
 
     Raises:
         UsageError: `pyarrow` is not there.
     """
     if kind is TableFormat.CSV:
-        return _CsvFile
+        return _csv_file
     try:
         import pyarrow  # noqa: F401 before anything is read or written
     except ImportError as missing:
         raise UsageError(
             "Parquet is written by pyarrow, which is not there; install uavctl[parquet], or take --to csv"
         ) from missing
-    return _ParquetFile
+    return _parquet_file
 
 
-class _CsvFile:
+@contextmanager
+def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
+    in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
+    with path.open("w", newline="", encoding=CSV_ENCODING) as file:
+        rows = csv.writer(file)
+        rows.writerow([column.name for column in columns])
 
-    def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
-        self._file = path.open("w", newline="", encoding=CSV_ENCODING)
-        self._csv = csv.writer(self._file)
-        self._bytes = tuple(place for place, column in enumerate(columns) if column.kind is ColumnKind.BYTES)
-        self._csv.writerow([column.name for column in columns])
+        def write(row: list[Cell]) -> None:
+            for place in in_bytes:
+                held = row[place]
+                row[place] = held.hex() if isinstance(held, bytes) else None
+            rows.writerow(row)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
-        self._file.close()
-
-    def write(self, row: list[Cell]) -> None:
-        for place in self._bytes:
-            held = row[place]
-            row[place] = held.hex() if isinstance(held, bytes) else None
-        self._csv.writerow(row)
+        yield write
 
 
-class _ParquetFile:
+@contextmanager
+def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """Parquet with one row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    def __init__(self, path: Path, columns: tuple[TableColumn, ...]) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+    types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
+    fields = [(column.name, types[column.kind]) for column in columns]
+    schema = pa.schema(fields)
+    rows: list[list[Cell]] = []
 
-        types = {
-            ColumnKind.INTEGER: pa.int64(),
-            ColumnKind.FLOAT: pa.float64(),
-            ColumnKind.BOOLEAN: pa.bool_(),
-            ColumnKind.TEXT: pa.string(),
-            ColumnKind.BYTES: pa.binary(),
-        }
-        self._arrow: Any = pa
-        self._columns = tuple((column.name, types[column.kind]) for column in columns)
-        self._schema = pa.schema(self._columns)
-        self._rows: list[list[Cell]] = []
-        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
-        try:
-            if failed is None:
-                self._flush()
-        finally:
-            self._writer.close()
-
-    def write(self, row: list[Cell]) -> None:
-        self._rows.append(row)
-        if len(self._rows) == _BATCH_ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        pa = self._arrow
+    def flush() -> None:
         arrays = []
-        for place, (name, kind) in enumerate(self._columns):
+        for place, (name, kind) in enumerate(fields):
             try:
-                arrays.append(pa.array([row[place] for row in self._rows], type=kind))
+                arrays.append(pa.array([row[place] for row in rows], type=kind))
             except (OverflowError, pa.ArrowInvalid) as error:
                 raise RecordingError(f"column {name}: Parquet has no place for one of its values ({error})") from error
-        self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
-        self._rows.clear()
+        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        rows.clear()
+
+    def write(row: list[Cell]) -> None:
+        rows.append(row)
+        if len(rows) == _BATCH_ROWS:
+            flush()
+
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        yield write
+        flush()

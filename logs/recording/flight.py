@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,6 @@ from uavctl.records import (
     Truth,
     VehicleStatus,
 )
-
-R = TypeVar("R", bound=Record)
 
 FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
 MOVES = 3  # successive boundaries with another target each: it moves, and was not only changed
@@ -86,38 +84,22 @@ class FlightData:
         Raises:
             RecordingError: no header, no decision, or a design without the keys of `DesignView`.
         """
-        found: defaultdict[type[Record], list[Record]] = defaultdict(list)
+        found: defaultdict[type[Record], list[Any]] = defaultdict(list)
         for _, _, record in records:
             found[type(record)].append(record)
 
-        def take(kind: type[R]) -> tuple[R, ...]:
-            return tuple(record for record in found[kind] if isinstance(record, kind))
-
-        headers, decisions = take(Header), take(Decision)
+        headers = found[Header]
         where = "" if path is None else f"{path}: "
         if not headers:
             raise RecordingError(f"{where}the recording has no header; it is empty, or not one of uavctl")
-        if not decisions:
+        if not found[Decision]:
             raise RecordingError(
                 f"{where}the recording has no decision: nothing was flown, so there is nothing to report"
             )
         return cls(
             header=headers[0],
             design=design_view(headers[0]),
-            step_inputs=take(StepInput),
-            estimates=take(Estimate),
-            plans=take(Plan),
-            decisions=decisions,
-            setpoints=take(Setpoint),
-            vehicles=take(VehicleStatus),
-            events=take(Event),
-            timings=take(Timing),
-            links=take(LinkStats),
-            truths=take(Truth),
-            link_estimates=take(LinkEstimate),
-            checks=take(Checked),
-            notes=take(RecorderNote),
-            endings=take(Ending),
+            **{name: tuple(found[get_args(kind)[0]]) for name, kind in get_type_hints(cls).items() if get_args(kind)},
         )
 
     @property
@@ -290,6 +272,7 @@ class Steps:
     decisions: tuple[Decision, ...]
     t_s: Floats  # (n,)
     state: Floats  # (n, n_x), the true one if known, else the estimate
+    decided: Floats  # (n, n_u), inputs before the wire; NaN where there was none
     input: Floats  # (n, n_u), applied during the step; NaN if unknown
     target: Floats  # (n, n_x), where the mission wanted the vehicle to be
     from_truth: bool
@@ -310,13 +293,7 @@ class Steps:
         near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
         state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
         target = np.array([d.target or flight.design.target for d in decisions]).reshape(-1, n_x)
-        return cls(decisions, flight.seconds(at_ns.tolist()), state, applied, target, bool(flight.truths))
-
-    @property
-    def decided(self) -> Floats:
-        """Inputs as decided (n, n_u), before they were sent; NaN where there was none."""
-        width = self.input.shape[1]
-        return np.array([d.input or (np.nan,) * width for d in self.decisions]).reshape(-1, width)
+        return cls(decisions, flight.seconds(at_ns.tolist()), state, decided, applied, target, bool(flight.truths))
 
 
 def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -283,13 +283,5 @@ def _origin(header: Header) -> RecordingOrigin:
         name = str(tomllib.loads(header.config_toml).get("name", ""))
     except tomllib.TOMLDecodeError:
         name = ""
-    return RecordingOrigin(
-        config=name,
-        seed=header.seed,
-        command=header.command,
-        started_utc=header.started_utc,
-        design_id=header.design_id,
-        library_id=header.library_id,
-        versions=header.versions,
-        cpu=header.cpu,
-    )
+    copied = {key: getattr(header, key) for key in RecordingOrigin.__struct_fields__ if key != "config"}
+    return RecordingOrigin(config=name, **copied)

@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from logs.recording.disk import later_segments
-from logs.recording.segment import MAGIC
+from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MAGIC, MESSAGE
 from logs.recording.topics import (
     END,
     GOES_ON,
@@ -33,6 +33,7 @@ from logs.recording.topics import (
     RecorderNote,
     decode,
     definition,
+    is_known,
     record_type,
 )
 from uavctl.errors import RecordingError
@@ -42,7 +43,6 @@ from uavctl.records import Header, Record
 
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _IS_MESSAGE = int(Opcode.MESSAGE)  # a plain number: compared for every record
 
 
@@ -95,8 +95,8 @@ class Contents:
             if content[at] != _IS_MESSAGE:
                 at = self._define(content, at, channels)
                 continue
-            _, length, channel, sequence, at_ns, _ = _MESSAGE.unpack_from(content, at)
-            begin, at = at + _MESSAGE.size, at + _RECORD.size + length
+            _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
+            begin, at = at + MESSAGE.size, at + _RECORD.size + length
             definition = channels[channel]
             if order is not None:
                 if sequence != order.following and order.following is not None:
@@ -136,9 +136,6 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
 
 __all__ = ["Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
 
-_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, start, end, size, crc, length of compression name (0), length
-_CHUNK_FIELDS = _CHUNK.size - _RECORD.size
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of its entries
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
@@ -290,9 +287,9 @@ def _whole(data: Buffer, at: int) -> int:
         raise _TornRecordError("is torn")
     inner = at + _RECORD.size
     if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
-        good = length >= 6 and _INDEX.unpack_from(data, at)[3] == length - 6
+        good = length >= 6 and INDEX.unpack_from(data, at)[3] == length - 6
     elif opcode == Opcode.CHUNK:
-        good = length >= _CHUNK_FIELDS
+        good = length >= CHUNK_FIELDS
     elif opcode == Opcode.DATA_END:
         good = length == _DATA_END.size - _RECORD.size
     elif opcode == Opcode.HEADER:
@@ -316,10 +313,10 @@ def _header_length(data: Buffer, inner: int, length: int) -> int:
 
 def _chunk(data: Buffer, at: int, length: int) -> bytes:
     """Return the content of the chunk at `at`, if its checksum is right."""
-    _, _, first, last, size, crc, name, inner = _CHUNK.unpack_from(data, at)
-    if name != 0 or inner != length - _CHUNK.size or size != inner or first > last:
+    _, _, first, last, size, crc, name, inner = CHUNK.unpack_from(data, at)
+    if name != 0 or inner != length - CHUNK.size or size != inner or first > last:
         raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
-    content = data[at + _CHUNK.size : at + length]
+    content = data[at + CHUNK.size : at + length]
     if zlib.crc32(content) != crc:
         raise _BadRecordError("has a wrong checksum")
     return content
@@ -328,7 +325,7 @@ def _chunk(data: Buffer, at: int, length: int) -> bytes:
 def _next_chunk(data: Buffer, start: int) -> int | None:
     """Return the offset of the next whole chunk from `start` on."""
     at = data.find(bytes([Opcode.CHUNK]), start)
-    while 0 <= at <= len(data) - _CHUNK.size:
+    while 0 <= at <= len(data) - CHUNK.size:
         try:
             _chunk(data, at, _whole(data, at))
         except _BadRecordError:
@@ -429,15 +426,6 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
         yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
 
 
-def finished(path: Path) -> bool:
-    """Return whether every file of a recording was closed in order, the last one with the recorder's end note.
-
-    Raises:
-        RecordingError: there is no such recording.
-    """
-    return not lacks_end(path)
-
-
 def lacks_end(path: Path) -> str:
     """Return why a recording's end is missing, in words; empty if it is there.
 
@@ -478,12 +466,16 @@ def last_note(path: Path) -> RecorderNote | None:
 
 def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
     """Return the last note in a file's last chunk."""
-    for message in reversed(end or []):
-        if message.definition.topic == RECORDER:
-            note = decode(RECORDER, message.data, message.at_ns)
-            assert isinstance(note, RecorderNote)  # the topic's type
-            return note
-    return None
+    return next((note for message in reversed(end or []) if (note := note_of(message)) is not None), None)
+
+
+def note_of(message: RecordedMessage) -> RecorderNote | None:
+    """What the recorder says in a message; None in any other."""
+    if message.definition.topic != RECORDER:
+        return None
+    note = decode(RECORDER, message.data, message.at_ns)
+    assert isinstance(note, RecorderNote)  # the topic's type
+    return note
 
 
 def records(path: Path, kind: type[R]) -> Iterator[R]:
@@ -494,7 +486,7 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
     """
     for message in good_messages(path):
         topic = message.definition.topic
-        if _is(topic, kind):
+        if is_known(topic) and issubclass(record_type(topic), kind):
             record = decode(topic, message.data, message.at_ns)
             assert isinstance(record, kind)  # the topic's type
             yield record
@@ -525,21 +517,13 @@ def good_messages(path: Path) -> Iterator[RecordedMessage]:
             raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
 
 
-def _is(topic: str, kind: type[Record]) -> bool:
-    try:
-        return issubclass(record_type(topic), kind)
-    except KeyError:
-        return False
-
-
 def _continues(path: Path) -> bool:
     """Return whether a file is followed by another one of the same recording."""
     for count, item in enumerate(scan(path)):
         if not isinstance(item, RecordedMessage):
             return True  # empty or damaged: better told than passed over
-        if item.definition.topic == RECORDER:
-            note = decode(RECORDER, item.data, item.at_ns)
-            return isinstance(note, RecorderNote) and note.segment > 1
+        if (note := note_of(item)) is not None:
+            return note.segment > 1
         if count == 1:
             break
     return False

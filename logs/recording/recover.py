@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 
 from logs.recording.disk import DiskFile
-from logs.recording.reader import Damage, EndOfFile, RecordedMessage, is_end, walk
+from logs.recording.reader import Damage, EndOfFile, RecordedMessage, is_end, note_of, walk
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import HOLES, NO_END, RECORDER, RECOVERED, RecorderNote, decode, definition, encode
+from logs.recording.topics import HOLES, NO_END, RECORDER, RECOVERED, RecorderNote, definition, encode
 from uavctl.errors import RecordingError
 
 CHUNK_BYTES = 16384
@@ -55,7 +55,8 @@ class _Tally:
         self._doubtful_bytes = 0  # without a gap nothing was in them: an index, or the file's head
         self._next = item.sequence + 1
         self.messages += not item.repeated
-        self.ended = item.definition.topic == RECORDER and _is_end(item)
+        note = note_of(item)
+        self.ended = note is not None and is_end(note)
 
     def damaged(self, item: Damage) -> None:
         self.damage.append(item)
@@ -144,9 +145,3 @@ def _losses(result: RecoverResult) -> str:
         (not result.ended, NO_END),
     )
     return ", ".join(text for given, text in parts if given)
-
-
-def _is_end(message: RecordedMessage) -> bool:
-    note = decode(RECORDER, message.data, message.at_ns)
-    assert isinstance(note, RecorderNote)  # the topic's type
-    return is_end(note)

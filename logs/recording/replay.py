@@ -36,7 +36,7 @@ from uavctl.records import (
     StepInput,
     to_nobody,
 )
-from uavctl.smpc.plant import Plant
+from uavctl.smpc.plant import AXES, Plant
 
 # Where a replay parts from its recording: the field, what the tick knew, and how the difference goes on.
 
@@ -65,7 +65,6 @@ _STATES = {
     (DECISION, "target"),
 }
 _INPUTS = {("/uavctl/estimate", "bias"), ("/uavctl/plan", "inputs"), ("/uavctl/plan", "bias"), (DECISION, "input")}
-_AXES = ("north", "east", "down")  # of what is a vector in local NED
 _UNITS = {"ns": "ns", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "v": "V", "ppm": "ppm"}
 _NUMBER = re.compile(r"\[(\d+)\]")
 _STAGE = {"inputs": "stage", "states": "stage", "backoff_x": "stage", "backoff_u": "stage"}
@@ -155,7 +154,7 @@ class FieldNames:
                 meaning, unit = known[numbers[-1]]
                 return meaning + staged, unit
         unit = _unit(name)
-        return (_AXES[numbers[-1]] if unit.startswith("m") and numbers[-1] < len(_AXES) else ""), unit
+        return (AXES[numbers[-1]] if unit.startswith("m") and numbers[-1] < len(AXES) else ""), unit
 
 
 def plain(path: str) -> str:
@@ -174,16 +173,17 @@ def stage(topic: str) -> str:
 
 def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
     """Return the leaves in which two records of a topic differ in any bit."""
-    return list(_unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed), ""))
+    return list(unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
 
 
-def _unequal(left: object, right: object, path: str) -> Iterator[Leaf]:
+def unequal(left: object, right: object, path: str = "") -> Iterator[Leaf]:
+    """Leaves where two trees of plain values differ in any bit."""
     if isinstance(left, dict) and isinstance(right, dict):
         for key in dict.fromkeys([*left, *right]):
-            yield from _unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
+            yield from unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
     elif isinstance(left, list | tuple) and isinstance(right, list | tuple) and len(left) == len(right):
         for index, (one, other) in enumerate(zip(left, right, strict=True)):
-            yield from _unequal(one, other, f"{path}[{index}]")
+            yield from unequal(one, other, f"{path}[{index}]")
     elif not _same_bits(left, right):
         yield path, left, right
 
@@ -259,19 +259,7 @@ def _order(command: Command) -> str:
     return command.order.value if given is None else f"{command.order.value} {given}"
 
 
-COMPARED = frozenset(
-    {
-        "/uavctl/step_input",
-        "/uavctl/estimate",
-        "/uavctl/link_estimate",
-        "/uavctl/plan",
-        "/uavctl/decision",
-        "/uavctl/setpoint",
-        "/uavctl/vehicle",
-        "/uavctl/event",
-        "/uavctl/link",
-    }
-)
+COMPARED = frozenset(_SAID_BY)
 Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})

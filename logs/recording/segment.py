@@ -34,13 +34,13 @@ from logs.recording.topics import HEADER, LIBRARY, Definition, definition, is_vi
 from uavctl.config.types import LogConfig
 
 MAGIC = b"\x89MCAP0\r\n"
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
 _OPCODE = int(Opcode.MESSAGE)
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 # Both are written for every chunk, without compression, whose name is an empty text: a length of 0.
-_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first time, last time, size, CRC-32, compression, size
-_CHUNK_FIELDS = 40
+CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first time, last time, size, CRC-32, compression, size
+CHUNK_FIELDS = 40
 _CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, start, length, bytes of offsets
 _OFFSET = struct.Struct("<HQ")  # channel, where its index is
 _CHUNK_INDEX_END = struct.Struct("<QIQQ")  # bytes of the indexes, compression, compressed size, size
@@ -104,7 +104,7 @@ class Segment:
             channel, head = self._new_channel(entry.definition)
         else:
             head = b"" if channel.number in self._indexes else channel.record
-        size = len(head) + _MESSAGE.size + len(entry.data)
+        size = len(head) + MESSAGE.size + len(entry.data)
         full = bool(self.open_entries) and self._size + size > self._chunk_bytes
         self.open_entries.append(entry)
         if full:
@@ -198,16 +198,16 @@ class Segment:
             self._indexes[channel] = [at_ns, place]
         else:
             index += (at_ns, place)
-        fields = _MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel, entry.sequence, at_ns, at_ns)
+        fields = MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel, entry.sequence, at_ns, at_ns)
         self._parts += (head, fields, data)
-        self._size = place + _MESSAGE.size + len(data)
+        self._size = place + MESSAGE.size + len(data)
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
         content = b"".join(self._parts)
         times_ns = [one.at_ns for one in entries]
         first, last = min(times_ns), max(times_ns)
         size = len(content)
-        head = _CHUNK.pack(Opcode.CHUNK, _CHUNK_FIELDS + size, first, last, size, zlib.crc32(content), 0, size)
+        head = CHUNK.pack(Opcode.CHUNK, CHUNK_FIELDS + size, first, last, size, zlib.crc32(content), 0, size)
         length = len(head) + size
         prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
         start = self.bytes + len(prefix)
@@ -216,7 +216,7 @@ class Segment:
         for channel_id, flat in self._indexes.items():
             offsets.append(_OFFSET.pack(channel_id, at))
             indexes.append(
-                _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
+                INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
                 + struct.pack(f"<{len(flat)}Q", *flat)
             )
             at += len(indexes[-1])

@@ -325,10 +325,15 @@ def spread(values_us: Floats) -> Percentiles:
 
 def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
     """Return the summary as a table for a terminal, followed by further (name, value)."""
+    return names_and_values((*rows(summary), *more))
+
+
+def names_and_values(pairs: Iterable[tuple[str, str]]) -> Table:
+    """A table of (name, value) without lines, for a terminal."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    for name, value in (*rows(summary), *more):
+    for name, value in pairs:
         table.add_row(name, Text(value))  # paths and names may look like markup
     return table
 

@@ -141,6 +141,11 @@ def is_view(topic: str) -> bool:
     return topic in _VIEW_BY_NAME
 
 
+def is_known(topic: str) -> bool:
+    """Whether this version has records of a topic."""
+    return topic in _BY_NAME or raw_link(topic) is not None
+
+
 def record_type(topic: str) -> type[Record]:
     """Return the record type of a topic.
 

@@ -24,7 +24,6 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from logs.recording import derived_topics as plots
 from logs.recording import derived_topics as topics
 from logs.recording.derived_topics import pack, tightened
 from logs.recording.design_view import AXIS_NUMBER, DesignView, design_view
@@ -358,26 +357,26 @@ class Views:
         match record:
             case Decision():
                 captured_ns = None if self._estimate is None else self._estimate.captured_ns
-                yield plots.age_plot(design, record, captured_ns)
-                yield plots.input_plot(design, record)
+                yield topics.age_plot(design, record, captured_ns)
+                yield topics.input_plot(design, record)
             case Estimate():
-                yield plots.state_plot(design, record)
+                yield topics.state_plot(design, record)
             case Setpoint():
-                yield plots.setpoint_plot(record)
+                yield topics.setpoint_plot(record)
             case Timing():
-                yield plots.timing_plot(record)
+                yield topics.timing_plot(record)
             case Plan():
-                yield plots.solve_plot(record)
+                yield topics.same(topics.SolvePlot, record, status=record.status.value)
                 if record.status is SolveStatus.OPTIMAL:
-                    yield plots.limits_plot(design, record)
+                    yield topics.limits_plot(design, record)
             case LinkEstimate():
-                yield plots.link_plot(record)
+                yield topics.same(topics.LinkPlot, record)
             case LinkStats():
-                yield plots.counter_plot(record)
+                yield topics.counter_plot(record)
             case Truth():
-                yield plots.truth_plot(record)
+                yield topics.truth_plot(record)
             case VehicleStatus():
-                yield plots.vehicle_plot(record)
+                yield topics.same(topics.VehiclePlot, record, battery_v=topics.number(record.battery_v))
 
     def _views(self, design: DesignView, at_ns: int, record: Record) -> Iterator[_Item]:
         match record:

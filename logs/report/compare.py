@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from string import ascii_uppercase
 
 import msgspec
 import numpy as np
@@ -25,8 +26,9 @@ from logs.recording.summary import FlightSummary, Percentiles, count, position_e
 from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, raw_link
 from logs.report import page
 from logs.report.page import Mark, PageSection
-from logs.report.plots import DASHED, DOTTED, SEEN, along, thin
+from logs.report.plots import DASHED, DOTTED, SEEN, along, course, position_limits, thin
 from logs.report.svg import Canvas, Drawing, canvas, colour
+from uavctl.config.load import dotted
 from uavctl.errors import RecordingError, UsageError
 from uavctl.mavlink.framing import scan
 from uavctl.records import Header
@@ -37,7 +39,7 @@ from uavctl.records import Header
 class ComparedFlight(msgspec.Struct, frozen=True, kw_only=True):
     """One recording of a comparison: its name there, where it is from, and how its flight ended."""
 
-    name: str  # A, B, ...
+    name: str  # A to Z, and then A1, B1, ...
     recording: str
     config: str
     command: str
@@ -65,7 +67,8 @@ def load_all(paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: None
     """
     loaded = []
     for number, path in enumerate(paths):
-        loaded.append(_load(path, _letter(number)))
+        name = ascii_uppercase[number % 26] + (str(number // 26) if number >= 26 else "")
+        loaded.append(_load(path, name))
         on_loaded()
     return tuple(loaded)
 
@@ -88,11 +91,6 @@ def _load(path: Path, name: str) -> LoadedFlight:
     return LoadedFlight(side, flight, summary)
 
 
-def _letter(number: int) -> str:
-    """Return the name of recording `number`: A to Z, then A1, B1 and so on."""
-    return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
-
-
 # Figures of flights beside each other.
 
 
@@ -113,43 +111,35 @@ class Figure(msgspec.Struct, frozen=True, kw_only=True):
 
 def figures(loaded: Sequence[LoadedFlight]) -> Iterator[Figure]:
     """Return the figures that at least one of the flights has."""
-    measured = [{row.key: row for row in _rows(one)} for one in loaded]
-    for key, row in {key: row for one in reversed(measured) for key, row in one.items()}.items():
-        values = tuple(one[key].value if key in one else None for one in measured)
-        if any(value is not None for value in values):
-            yield _figure(row, values)
+    measured = [{row[0]: row for row in _rows(one)} for one in loaded]
+    for key, (_, group, text, unit, _) in {key: row for one in reversed(measured) for key, row in one.items()}.items():
+        values = tuple(one[key][-1] if key in one else None for one in measured)
+        if all(value is None for value in values):
+            continue
+        first, *others = values
+        yield Figure(
+            key=key,
+            group=group,
+            text=text,
+            unit=unit,
+            values=values,
+            differences=tuple(None if first is None or one is None else one - first for one in others),
+            ratios=tuple(None if not first or one is None else one / first for one in others),
+        )
 
 
-@dataclass(frozen=True)
-class _Row:
-    key: str
-    group: str
-    text: str
-    unit: str
-    value: Value
+_Row = tuple[str, str, str, str, Value]  # key, group, text, unit and value
 
 
-def _figure(row: _Row, values: tuple[Value, ...]) -> Figure:
-    first, *others = values
-    return Figure(
-        key=row.key,
-        group=row.group,
-        text=row.text,
-        unit=row.unit,
-        values=values,
-        differences=tuple(None if first is None or one is None else one - first for one in others),
-        ratios=tuple(None if not first or one is None else one / first for one in others),
-    )
-
-
-def _rows(one: LoadedFlight) -> Iterator[_Row]:
+def _rows(one: LoadedFlight) -> tuple[_Row, ...]:
     """Return the figures of one flight; those of the summary keep its keys."""
     s, flight = one.summary, one.flight
     ages = [d.age_steps for d in flight.steps.decisions if d.age_steps is not None]
     error_m = position_error_m(flight)
     inputs = np.linalg.norm(flight.steps.input, axis=1)
     methods = {**dict.fromkeys(("frozen", "mixture", "exact"), 0), **s.methods}
-    table: tuple[tuple[str, str, str, str, Value], ...] = (
+    in_fallback_s = sum((b - a for a, b in flight.fallback_spans), 0.0)
+    return (
         ("steps", "flight", "steps flown", "", s.steps),
         ("duration_s", "flight", "duration", "s", s.duration_s),
         ("received", "link", "positions received", "", s.received),
@@ -160,13 +150,7 @@ def _rows(one: LoadedFlight) -> Iterator[_Row]:
         ("max_age", "link", "largest age", "steps", s.max_age),
         ("max_age_s", "link", "largest age", "s", s.max_age_s),
         ("fallbacks", "limits", "fallbacks", "", s.fallbacks),
-        (
-            "fallback_s",
-            "limits",
-            "time in fallback",
-            "s",
-            round(sum((b - a for a, b in flight.fallback_spans), 0.0), 9),
-        ),
+        ("fallback_s", "limits", "time in fallback", "s", round(in_fallback_s, 9)),
         ("state_violations", "limits", "state outside limits", "steps", s.state_violations),
         ("input_violations", "limits", "input outside limits", "steps", s.input_violations),
         ("slack_used", "limits", "plans with slack", "", s.slack_used),
@@ -185,10 +169,9 @@ def _rows(one: LoadedFlight) -> Iterator[_Row]:
         ("missed_ticks", "time", "ticks missed", "", s.missed_ticks),
         ("records_lost", "recording", "records lost", "", one.side.records_lost),
     )
-    return (_Row(*row) for row in table)
 
 
-def _times(key: str, text: str, spread: Percentiles) -> Iterator[tuple[str, str, str, str, Value]]:
+def _times(key: str, text: str, spread: Percentiles) -> Iterator[_Row]:
     for name, words in (("p50", "median"), ("p99", "99 %"), ("max", "largest")):
         yield f"{key}.{name}", "time", f"{text}, {words}", "µs", getattr(spread, name)
 
@@ -319,25 +302,13 @@ def _parameters(one: LoadedFlight) -> dict[str, object]:
     except tomllib.TOMLDecodeError as error:
         raise RecordingError(f"{one.side.recording}: the configuration in its header is damaged ({error})") from error
     return {
-        **dict(_dotted(config, "")),
+        # JSON has no infinity, which limits may be.
+        **{key: str(one) if isinstance(one, float) and not math.isfinite(one) else one for key, one in dotted(config)},
         "design_id": header.design_id,
         "library_id": header.library_id,
         "cpu": header.cpu,
         **{f"versions.{name}": version for name, version in sorted(header.versions.items())},
     }
-
-
-def _dotted(value: object, path: str) -> Iterator[tuple[str, object]]:
-    """Return a configuration's values by dotted keys; tables of a list are numbered, as in `fence[0].side`."""
-    if isinstance(value, Mapping):
-        for key, one in value.items():
-            yield from _dotted(one, f"{path}.{key}" if path else key)
-    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-        for place, one in enumerate(value):
-            yield from _dotted(one, f"{path}[{place}]")
-    else:
-        # JSON has no infinity, which limits may be.
-        yield path, str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _differences(parameters: Sequence[Mapping[str, object]]) -> Iterator[ParameterDifference]:
@@ -486,7 +457,7 @@ def _paths(flights: Sequence[FlightData], axes: Sequence[str]) -> Iterator[Drawi
         with canvas(key, 3.7) as one:
             ax = one.axes(title, f"{x_name} [m]", f"{y_name} [m]")
             for place, flight in enumerate(flights):
-                points = along(_course(flight)[1])
+                points = along(course(flight)[1])
                 x, y = (points[:, AXIS_NUMBER[axis]] for axis in shown)
                 ax.plot(x_sign * x, y_sign * y, color=colour(_ROLES[place]), lw=_width(place, flights))
             for side in _limits(flights[0], shown[0]):
@@ -501,7 +472,7 @@ def _position(flights: Sequence[FlightData], axis: str) -> Drawing:
     name, sign = SEEN[axis]
 
     def values(flight: FlightData) -> tuple[Floats, Floats]:
-        t_s, points = _course(flight)
+        t_s, points = course(flight)
         return t_s, sign * points[:, AXIS_NUMBER[axis]]
 
     with canvas(f"position-{axis}", 2.3) as one:
@@ -544,21 +515,9 @@ def _width(place: int, flights: Sequence[FlightData]) -> float:
     return float(np.linspace(_WIDEST, _FINEST, len(flights))[place])
 
 
-def _course(flight: FlightData) -> tuple[Floats, Floats]:
-    """Return times (n,) [s] and positions (n, 3) [m] in local NED: the true ones if known, else the estimated ones."""
-    if flight.truths:
-        points = [truth.position_m for truth in flight.truths]
-        return flight.seconds([truth.at_ns for truth in flight.truths]), np.array(points)
-    points = [flight.design.position_of(estimate.mean) for estimate in flight.estimates]
-    return flight.seconds([estimate.at_ns for estimate in flight.estimates]), np.array(points).reshape(-1, 3)
-
-
 def _limits(flight: FlightData, axis: str) -> list[float]:
     """Return the finite limits of an axis' position [m], with the sign that the axis is drawn with."""
-    design = flight.design
-    index = design.position_index[design.axes.index(axis)]
-    sides = (SEEN[axis][1] * float(box[index]) for box in (design.state_box.lower, design.state_box.upper))
-    return [side for side in sides if np.isfinite(side)]
+    return [side for side in position_limits(flight.design, axis) if np.isfinite(side)]
 
 
 def _sides(found: FlightComparison) -> str:

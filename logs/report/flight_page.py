@@ -9,11 +9,7 @@ from pathlib import Path
 from logs.recording.flight import FlightData
 from logs.recording.outputs import write_whole
 from logs.recording.summary import FlightSummary, rows
-from logs.report import figures as plots_control
-from logs.report import figures as plots_link
-from logs.report import figures as plots_solver
-from logs.report import figures as plots_verdicts
-from logs.report import page, plots
+from logs.report import figures, page, plots
 from logs.report.figures import picture
 from logs.report.page import Mark, PageSection
 from logs.report.plots import path_3d
@@ -104,13 +100,6 @@ _BAND = Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f
 _UNREADABLE = "The flight's configuration cannot be read by this version, so its model cannot be run again."
 
 
-def verdict_sections(flight: FlightData, judged: Judged) -> Iterator[PageSection]:
-    """Return the sections on risk, model and clocks; the link's verdict stands beside its figures."""
-    yield _risk(judged.verdicts)
-    yield _model(flight, judged)
-    yield _clocks(flight, judged.verdicts)
-
-
 def verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
     """Return one row (name, outcome) for each verdict."""
     risk = verdicts.risk
@@ -193,11 +182,11 @@ def _model(flight: FlightData, judged: Judged) -> PageSection:
             drawing
             for column, axis in enumerate(verdict.axes)
             for drawing in (
-                plots_verdicts.errors(flight, axis.axis, found.t_s, found.normalised[:, column]),
-                plots_verdicts.whiteness(axis),
+                figures.errors(flight, axis.axis, found.t_s, found.normalised[:, column]),
+                figures.whiteness(axis),
             )
         ),
-        *([plots_verdicts.coverage(verdict.leads)] if verdict.leads else ()),
+        *([figures.coverage(verdict.leads)] if verdict.leads else ()),
     ]
     columns = ("axis", "error [mm]", "× foretold", "bounds", "mean", "white")
     table = page.table(columns, [_axis_row(one) for one in verdict.axes], frozenset({1, 2, 3, 4, 5}))
@@ -250,7 +239,7 @@ def _clocks(flight: FlightData, verdicts: Verdicts) -> PageSection:
         sentences.append(verdicts.stamps.text)
     if not sentences:
         return PageSection("Verdict: clocks", note, page.paragraph("No connection told anything of its clock."))
-    drawings = list(plots_verdicts.clocks(flight, verdicts.clocks))
+    drawings = list(figures.clocks(flight, verdicts.clocks))
     body = [page.paragraph(sentence) for sentence in sentences]
     columns = ("connection", "source", "drift [ppm]", "residual [µs]", "round trip [ms]", "refused")
     if verdicts.clocks:
@@ -323,7 +312,8 @@ def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Ite
     begins = part_begins(flight)
     part = [("Part of a flight", f"begins at {begins}")] if begins else []
     yield PageSection("Summary", "", page.facts([*part, *rows(summary), *verdict_rows(judged.verdicts)]))
-    yield _timeline_section(flight)
+    wide, narrow, marks = timeline(flight)
+    yield PageSection("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
     yield _path_section(flight)
     yield _axes_section(flight)
     yield _age_section(flight)
@@ -333,13 +323,10 @@ def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Ite
     yield _certificates_section(flight)
     yield _timing_section(flight)
     yield _events_section(flight)
-    yield from verdict_sections(flight, judged)
+    yield _risk(judged.verdicts)
+    yield _model(flight, judged)
+    yield _clocks(flight, judged.verdicts)
     yield from origin_sections(flight)
-
-
-def _timeline_section(flight: FlightData) -> PageSection:
-    wide, narrow, marks = timeline(flight)
-    return PageSection("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
 
 
 def _path_section(flight: FlightData) -> PageSection:
@@ -382,7 +369,7 @@ def _age_section(flight: FlightData) -> PageSection:
     return PageSection(
         "Age of information",
         "How many steps old the newest position was. A plan lasts H steps; at age H the fallback takes over.",
-        page.wide_or_narrow(*plots_control.age(flight)),
+        page.wide_or_narrow(*figures.age(flight)),
         (
             Mark("line", "estimate", "age"),
             Mark("dashed", "limit", f"horizon H = {flight.design.horizon}"),
@@ -393,7 +380,7 @@ def _age_section(flight: FlightData) -> PageSection:
 
 
 def _link_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
-    drawings = list(plots_link.link(flight, verdict))
+    drawings = list(figures.link(flight, verdict))
     bound = (Mark("thin", "estimate", "lower bound in flight"),) if flight.link_estimates else ()
     horizon = (Mark("dotted", "muted", f"horizon H = {flight.design.horizon}"),) if verdict.ages else ()
     note = "The dashed line is what the design counts on, by the link of the configuration."
@@ -426,8 +413,8 @@ def _quickest(delay: DelayVerdict) -> str:
 
 
 def _certificates_section(flight: FlightData) -> PageSection:
-    drawings = list(plots_solver.certificates(flight))
-    marks = [Mark("dot", role, name) for name, role in plots_solver.methods(flight)]
+    drawings = list(figures.certificates(flight))
+    marks = [Mark("dot", role, name) for name, role in figures.methods(flight)]
     gave = any(drawing.key == "plan-slack" for drawing in drawings)
     told = (
         "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
@@ -440,7 +427,7 @@ def _certificates_section(flight: FlightData) -> PageSection:
     return PageSection(
         "Certificates and slack",
         f"Each plan comes with a bound of the least cost there is: the gap between them is certified. "
-        f"{plots_solver.ways(flight)}{told}",
+        f"{figures.ways(flight)}{told}",
         page.grid(drawings) if drawings else page.paragraph(_NO_PLAN),
         tuple(marks) if drawings else (),
     )
@@ -450,7 +437,7 @@ def _inputs_section(flight: FlightData) -> PageSection:
     return PageSection(
         "Inputs",
         "The colour tells how far into its plan the controller was when it gave the input, as in the first figure.",
-        page.grid(list(plots_control.inputs(flight))),
+        page.grid(list(figures.inputs(flight))),
         (_LIMIT, Mark("cross", "limit", "outside"), *_fallback_mark(flight)),
     )
 
@@ -468,7 +455,7 @@ def _plans_section(flight: FlightData) -> PageSection:
 
 
 def _timing_section(flight: FlightData) -> PageSection:
-    drawings = list(plots_control.timing(flight))
+    drawings = list(figures.timing(flight))
     late = "in virtual time no tick is late" if flight.virtual_time else _LATENESS
     return PageSection(
         "Time taken",

@@ -82,7 +82,7 @@ def _places(flight: FlightData) -> Floats:
 
 def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> None:
     """Draw the position limits as a frame; an open side has no line."""
-    (x0, x1), (y0, y1) = (_limits(design, axis) for axis in axes_shown)
+    (x0, x1), (y0, y1) = (position_limits(design, axis) for axis in axes_shown)
     if np.isfinite([x0, x1, y0, y1]).all():
         corners = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
         ax.plot(*corners, color=colour("limit"), lw=1.2, ls=DASHED, zorder=1)
@@ -93,7 +93,7 @@ def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> Non
                 draw(side, color=colour("limit"), lw=1.2, ls=DASHED, zorder=1)
 
 
-def _limits(design: DesignView, axis: str) -> tuple[float, float]:
+def position_limits(design: DesignView, axis: str) -> tuple[float, float]:
     """Return the position limits of an axis with the sign that it is drawn with [m]; infinite if open."""
     if axis not in design.axes:
         return -np.inf, np.inf
@@ -201,14 +201,8 @@ def plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
 
 def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawing:
     """Draw a few plans over what was then flown, from above."""
-    design = flight.design
-    position = (
-        [t.position_m for t in flight.truths]
-        if flight.truths
-        else [design.position_of(e.mean) for e in flight.estimates]
-    )
-    t_s = flight.seconds([known.at_ns for known in flight.truths or flight.estimates])
-    flown = along(np.array(position).reshape(-1, 3)[t_s <= end_s])
+    design, (t_s, position) = flight.design, course(flight)
+    flown = along(position[t_s <= end_s])
     with canvas("plan-above", 2.5) as one:
         ax = one.axes("From above", "east [m]", "north [m]")
         for plan in chosen:
@@ -218,6 +212,13 @@ def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawin
         ax.plot(flown[:, 1], flown[:, 0], color=colour("truth"), lw=1.5, zorder=4)
         ax.set_aspect("equal", adjustable="datalim")
     return Drawing("plan-above", one.svg, f"{len(chosen)} plans against what was flown, seen from above")
+
+
+def course(flight: FlightData) -> tuple[Floats, Floats]:
+    """Where it was: times (n,) [s] and positions (n, 3), local NED; the true ones where they are known."""
+    known = flight.truths or flight.estimates
+    points = [t.position_m for t in flight.truths] or [flight.design.position_of(e.mean) for e in flight.estimates]
+    return flight.seconds([one.at_ns for one in known]), np.array(points).reshape(-1, 3)
 
 
 def _component(flight: FlightData, index: int) -> list[float]:
@@ -365,9 +366,7 @@ def outline(semi_axes_m: Floats) -> tuple[float, float, float]:
 
 def _flown_m(flight: FlightData) -> Floats:
     """Return the flown path (n, 3) [m], thinned: by the truth if that is known, else by the estimate."""
-    design = flight.design
-    places = np.array([t.position_m for t in flight.truths] or [design.position_of(e.mean) for e in flight.estimates])
-    return along(places)
+    return along(course(flight)[1])
 
 
 def _room(design: DesignView, path_m: Floats) -> tuple[Floats, Floats]:

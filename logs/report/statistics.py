@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
-from scipy.special import betainc, betaincinv, chdtrc, gammaincc, gammaincinv, ndtr, ndtri
+from scipy.special import bdtrc, betaincinv, chdtrc, chdtri, ndtr, ndtri
 
 from logs.recording.design_view import Floats
 
@@ -43,6 +45,11 @@ def share(hits: int, trials: int, tests: int = 1, worth: float = 1.0) -> Share:
     return Share(hits=hits, trials=trials, low=low, high=high)
 
 
+def finite(value: float) -> float | None:
+    """A figure for a document, which has no infinity; None where it is none."""
+    return value if math.isfinite(value) else None
+
+
 def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, float]:
     """Return the interval of a probability by quantiles of the beta distribution (Clopper and Pearson, 1934).
 
@@ -57,9 +64,7 @@ def exact_interval(hits: float, trials: float, tail: float) -> tuple[float, floa
 
 def at_least(hits: int, trials: int, probability: float) -> float:
     """Return P(X >= hits) for X binomial: the p-value of so many hits if each has `probability` at most."""
-    if hits <= 0:
-        return 1.0
-    return float(betainc(hits, trials - hits + 1, probability))
+    return float(bdtrc(hits - 1, trials, probability))
 
 
 def two_sided_normal(z: float) -> float:
@@ -75,13 +80,13 @@ def normal_reach(tests: int = 1) -> float:
 def variance_bounds(count: int, tests: int = 1) -> tuple[float, float]:
     """Return bounds of the mean of `count` squared standard normal numbers, by the χ² distribution."""
     tail = 0.5 * (1.0 - LEVEL) / tests
-    low, high = (2.0 * float(gammaincinv(0.5 * count, p)) / count for p in (tail, 1.0 - tail))
+    low, high = (chi2_quantile(p, count) / count for p in (tail, 1.0 - tail))
     return low, high
 
 
 def variance_p(squares: float, count: int) -> float:
     """Return the two-sided p-value of a sum of `count` squared standard normal numbers."""
-    above = float(gammaincc(0.5 * count, 0.5 * squares))
+    above = float(chdtrc(count, squares))
     return min(1.0, 2.0 * min(above, 1.0 - above))
 
 
@@ -110,4 +115,4 @@ def ljung_box(correlation: Floats, count: int) -> tuple[float, float]:
 
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Return a quantile of the χ² distribution."""
-    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
+    return float(chdtri(degrees, 1.0 - probability))

@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-from logs.recording.export import Cell, ColumnKind, Tables
+from logs.recording.export import Cell, Tables
 from uavctl.records import Record
-
-HELD = {
-    ColumnKind.INTEGER: int,
-    ColumnKind.FLOAT: float,
-    ColumnKind.BOOLEAN: bool,
-    ColumnKind.TEXT: str,
-    ColumnKind.BYTES: bytes,
-}
 
 
 def tabulate(records: list[tuple[str, int, Record]]) -> dict[str, list[dict[str, Cell]]]:
@@ -26,6 +18,6 @@ def tabulate(records: list[tuple[str, int, Record]]) -> dict[str, list[dict[str,
             names = [column.name for column in columns[name]]
             assert len(set(names)) == len(names)
             for column, cell in zip(columns[name], cells, strict=True):
-                assert cell is None or type(cell) is HELD[column.kind], column
+                assert cell is None or type(cell) is column.kind, column
             rows[name].append(dict(zip(names, cells, strict=True)))
     return rows

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.check.findings import AIDED, HORIZONTAL, Heard, Item, ItemState, item
-from uavctl.check.positions import CAMERA_AXES, from_cameras, spread_m
+from uavctl.check.positions import CAMERA_AXES, extent_m, from_cameras, spread_m
 from uavctl.config.types import Config
 from uavctl.frames import Quaternion, from_euler, multiply, to_euler
 from uavctl.records import Vec3
@@ -186,7 +186,7 @@ def evidence_of(
         if config.check.same_origin:
             middle = np.median(seen, axis=0, keepdims=True), np.median(own, axis=0, keepdims=True)
             found.append(Evidence(middle[1], middle[0], config.check.offset_m))
-        if max(_extent(seen), _extent(own)) >= config.check.move_m:
+        if max(extent_m(seen), extent_m(own)) >= config.check.move_m:
             away = own - own.mean(axis=0)
             tolerance_m = _MOVE_TOLERANCE_M + _MOVE_PART * float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
             moved = Evidence(away, seen - seen.mean(axis=0), tolerance_m)
@@ -195,11 +195,6 @@ def evidence_of(
         tolerance_m = _ASKED_TOLERANCE_PART * math.hypot(*wanted)
         found.append(Evidence(np.array([wanted]), np.array([got]), tolerance_m))
     return found, moved
-
-
-def _extent(places: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    low, high = np.percentile(places, [5, 95], axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def _axes(

@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uavctl.check.findings import Heard, Item, ItemState, Sample, item, judged
 from uavctl.config.checks import position_index
@@ -13,6 +14,7 @@ from uavctl.config.connections import CAMERAS
 from uavctl.config.types import Config
 from uavctl.flight.link_estimate import loss_std
 from uavctl.records import Vec3
+from uavctl.smpc.plant import AXES
 
 _ENOUGH = 8  # samples without which nothing is said
 _AGE_TOLERANCE_S = 0.005
@@ -25,7 +27,7 @@ _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"))
 CAMERA_AXES = (
     "does Motive stream Z up? Then the URL of daemon.mocap needs ?up=z, else not; see [frame] (origin_m, yaw_deg)"
 )
-_AXES = ("north", "east", "down")
+Array = NDArray[np.float64]
 
 
 def position_items(seen: Heard, config: Config, at_ns: int) -> list[Item]:
@@ -163,8 +165,13 @@ def spread_m(samples: list[Sample]) -> Vec3:
 def rests(seen: Heard, move_m: float) -> bool:
     """Whether the vehicle stood still, as far as its own position, or else the cameras', show."""
     where = [place for _, place in seen.own] if len(seen.own) >= _ENOUGH else [one.position_m for one in seen.samples]
-    low, high = np.percentile(np.array(where), [5, 95], axis=0)
-    return float(np.linalg.norm(high - low)) < move_m
+    return extent_m(np.array(where)) < move_m
+
+
+def extent_m(places: Array) -> float:
+    """How far places (n, 3) lie apart, the farthest of them left out [m]."""
+    low, high = np.percentile(places, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def _noise(samples: list[Sample], config: Config) -> Item:
@@ -213,7 +220,7 @@ def _place(samples: list[Sample], config: Config) -> Item:
 
 
 def _is_inside(where: list[float], limits: dict[str, tuple[float, float]], margin_m: float) -> bool:
-    low_high = ((where[_AXES.index(axis)], low, high) for axis, (low, high) in limits.items())
+    low_high = ((where[AXES.index(axis)], low, high) for axis, (low, high) in limits.items())
     return all(low - margin_m <= value <= high + margin_m for value, low, high in low_high)
 
 

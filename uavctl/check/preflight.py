@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping
 
 from uavctl.check.axes import axis_items, compared
 from uavctl.check.findings import Heard, Item, ItemState, item
@@ -126,20 +125,9 @@ PROMPT_NS = 30_000_000_000
 _STREAMS_HZ = {3: {148: 0.0, 193: 1.0}, 12: {148: 0.0, 230: 1.0}}
 
 
-class MakeLinks(Protocol):
-    """Makes the protocol states of the connections, with somebody who hears every message."""
-
-    def __call__(self, config: Config, listen: Listen) -> Mapping[str, MavlinkConnection]:
-        """The links by name."""
-        ...
-
-
-class Listen(Protocol):
-    """Hears a message that arrived at a time [ns]."""
-
-    def __call__(self, message: Message, at_ns: int, /) -> None:
-        """Take one message."""
-        ...
+Listen = Callable[[Message, int], None]  # hears a message that arrived at a time [ns]
+# Makes the protocol states of the connections by name, with somebody who hears every message.
+MakeLinks = Callable[[Config, Listen], Mapping[str, MavlinkConnection]]
 
 
 class Preflight:

@@ -11,15 +11,14 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uavctl.build.controller import build_conditioned, build_design, build_spec
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, located, messages
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, bars, columns, located
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.lab.bench.decisions import DecisionBench, time_decisions, time_flight
-from uavctl.lab.bench.loop import LoopBench, LoopRun, TimeQuantiles, run_loop_bench
+from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
 from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, run_bench
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
@@ -32,8 +31,7 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
     options = ["--config", common.config]
     for override in common.overrides:
         options += ["--set", override]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True, auto_refresh=False) as progress:
+    with bars(auto_refresh=False) as progress:
         task = progress.add_task("")
 
         def told(what: str, done: int, total: int) -> None:
@@ -46,12 +44,15 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
 
 def loop_picture(result: LoopBench) -> RenderableType:
     """Return the figures of the control loop as a table."""
-    table = Table(title="Control loop on real UDP, recording", title_justify="left")
-    for heading in ("", "median", "p99", "p99.9", "largest"):
-        table.add_column(heading, justify="right" if heading else "left")
+    table = columns("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
         table.add_row(f"[bold]{name}")
-        for label, spread in _spreads(run):
+        for label, spread in (
+            ("position in -> setpoint out", run.in_to_out_us),
+            ("tick late by", run.lateness_us),
+            ("tick of an empty loop late by", run.empty_lateness_us),
+            ("in the control core", run.step_us),
+        ):
             table.add_row(f"  {label}", *(f"{value / 1e3:.3f} ms" for value in msgspec.structs.astuple(spread)))
     head = (
         f"Median of {result.runs} runs of {result.seconds:g} s each, a position in every tick of {result.tick_s:g} s."
@@ -59,15 +60,6 @@ def loop_picture(result: LoopBench) -> RenderableType:
     denied = () if result.permitted else ("Not all of --realtime was permitted; `uavctl fly --realtime` says what.",)
     return Group(
         head, "", table, _rest("without --realtime", result.plain), _rest("with --realtime", result.realtime), *denied
-    )
-
-
-def _spreads(run: LoopRun) -> tuple[tuple[str, TimeQuantiles], ...]:
-    return (
-        ("position in -> setpoint out", run.in_to_out_us),
-        ("tick late by", run.lateness_us),
-        ("tick of an empty loop late by", run.empty_lateness_us),
-        ("in the control core", run.step_us),
     )
 
 
@@ -163,9 +155,8 @@ def _decisions(found: DecisionBench, name: str) -> str:
 
 @contextmanager
 def _progress() -> Iterator[Advance]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     # A thread that draws the bar would disturb what is measured.
-    with Progress(*columns, console=messages(), transient=True, auto_refresh=False) as progress:
+    with bars(auto_refresh=False) as progress:
         task = progress.add_task("design", total=None)
         drawn = 0.0
 
@@ -193,11 +184,6 @@ def bench_picture(result: BenchResult, name: str) -> RenderableType:
 
 
 def _methods(result: BenchResult) -> Table:
-    table = Table(title="One decision for all axes", title_justify="left")
-    for heading in ("", "states", "median", "library is faster by", "what came of it"):
-        table.add_column(
-            heading, justify="right" if heading in ("states", "median", "library is faster by") else "left"
-        )
     joint = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"
     same = "" if result.cost_difference is None else f"cost of the exact one to {result.cost_difference:.1e}"
     library = result.library_us
@@ -218,8 +204,9 @@ def _methods(result: BenchResult) -> Table:
         ),
         ("exact", result.exact_states, _ms(result.exact_ms), result.ratio_exact_library, ""),
     )
-    for label, states, took, ratio, ending in rows:
-        table.add_row(label, str(states), took, f"{ratio:.0f} ×", ending)
+    told = [(label, str(states), took, f"{ratio:.0f} ×", ending) for label, states, took, ratio, ending in rows]
+    headings = ("", "states", "median", "library is faster by", "what came of it")
+    table = columns("One decision for all axes", headings, told, (headings[0], headings[-1]))
     table.add_row(
         "policy library",
         str(result.states),
@@ -245,17 +232,13 @@ def _axis(result: BenchResult) -> str:
 
 
 def _certificates(result: BenchResult) -> Table:
-    table = Table(title="The library's answers", title_justify="left")
-    for heading in ("method", "share", "median"):
-        table.add_column(heading, justify="left" if heading == "method" else "right")
     shares = result.shares
-    for method, share, took in (
-        ("frozen policy", shares.frozen, result.frozen_us),
-        ("mixture", shares.mixture, result.mixture_us),
-        ("exact program", shares.exact, result.fallback_us),
-    ):
-        table.add_row(method, f"{share:.1%}", _us(took))
-    return table
+    rows = (
+        ("frozen policy", f"{shares.frozen:.1%}", _us(result.frozen_us)),
+        ("mixture", f"{shares.mixture:.1%}", _us(result.mixture_us)),
+        ("exact program", f"{shares.exact:.1%}", _us(result.fallback_us)),
+    )
+    return columns("The library's answers", ("method", "share", "median"), rows)
 
 
 def _gaps(result: BenchResult) -> str:

@@ -16,11 +16,10 @@ import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavctl.cli import INTERRUPTED
-from uavctl.cli.common import WORKERS, Common, messages
+from uavctl.cli.common import WORKERS, Common, QuietJson, bars, columns, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
@@ -78,11 +77,9 @@ def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
         cells = [cell for cell in result.cells if cell.place.scenario == scenario]
         if not cells:
             continue
-        table = Table(title=f"Campaign {escape(result.name)}: {scenario}", title_justify="left")
-        for heading in (*lists, "controller"):
-            table.add_column(heading.replace("rate_hz", "Hz"))
-        for one in shown:
-            table.add_column(one.heading, justify="right")
+        named = [name.replace("rate_hz", "Hz") for name in (*lists, "controller")]
+        headings = (*named, *(one.heading for one in shown))
+        table = columns(f"Campaign {escape(result.name)}: {scenario}", headings, (), named)
         for cell in cells:
             names = [_text(getattr(cell.place, name)) for name in (*lists, "controller")]
             told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
@@ -126,9 +123,7 @@ def campaign(
     resume: Annotated[
         bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
     ] = False,
-    json: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
-    ] = False,
+    json: QuietJson = False,
 ) -> int:
     """Fly a grid of controllers, links, disturbances and plants, each on the same noise and the same losses.
 
@@ -205,10 +200,9 @@ def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
         places = places_of(spec, ready_library)
         return trial_document(spec, places), list(trial_tasks(spec, places))
 
-    def summaries(folder: Path) -> list[TrialSummary]:
-        return summarise_trial(folder)[1]
-
-    return _Given(spec.name, text, TRIALS, prepare, write_trial_report, summaries, trial_picture)
+    return _Given(
+        spec.name, text, TRIALS, prepare, write_trial_report, lambda folder: summarise_trial(folder)[1], trial_picture
+    )
 
 
 def _new_folder(name: str) -> Path:
@@ -234,9 +228,7 @@ def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Worke
 
 @contextmanager
 def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    left = (TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, *left, console=messages(), transient=True) as progress:
+    with bars(MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()) as progress:
         there = sum(task.runs for task in tasks if task.name in kept)
         bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=there)
         yield lambda task: progress.update(bar, advance=task.runs)
@@ -258,9 +250,8 @@ def _tell(text: str) -> None:
 def _picture(result: CampaignResult[CellSummary]) -> RenderableType:
     # What is the same in all cells needs no column.
     lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
-    table = Table(title=f"Campaign {result.name}", title_justify="left")
-    for heading in (*lists, "runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest"):
-        table.add_column(heading, justify="left" if heading in lists else "right")
+    figured = ("runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest")
+    table = columns(f"Campaign {result.name}", (*lists, *figured), (), lists)
     for cell in result.cells:
         names = [escape(getattr(cell, name)) for name in lists]
         if cell.refused:

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from uavctl.check.findings import Item, ItemState, item, judged, refusals
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, columns, given_keys, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -110,8 +110,9 @@ def checked_before_arming(
     if against:
         lines = (f"{one.name}: {one.value} (wanted: {one.want}); {one.hint}" for one in against)
         raise NotReadyError("\n".join(("not armed, as the check before it failed:", *lines)))
-    for one in _worth_telling(items):
-        messages().print(f"[yellow]check:[/] {escape(f'{one.name}: {one.value}; {one.hint}')}", soft_wrap=True)
+    for one in items:
+        if one.state is not ItemState.GOOD:
+            messages().print(f"[yellow]check:[/] {escape(f'{one.name}: {one.value}; {one.hint}')}", soft_wrap=True)
     return items
 
 
@@ -120,10 +121,6 @@ def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
     for one in items:
         found = Checked(at_ns=at_ns, name=one.name, state=str(one.state), value=one.value, want=one.want, hint=one.hint)
         sink.put("/uavctl/check", at_ns, found)
-
-
-def _worth_telling(items: Iterable[Item]) -> list[Item]:
-    return [one for one in items if one.state is not ItemState.GOOD]
 
 
 # `uavctl check`: what can be known before take-off. It never arms, and changes neither mode nor parameter.
@@ -151,9 +148,7 @@ def check(
     *,
     common: Common = DEFAULTS,
     vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
-    mocap: Annotated[
-        str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
-    ] = None,
+    mocap: Mocap = None,
     seconds: Annotated[
         float | None, Parameter(help="how long to listen [s]; else check.seconds", validator=SPAN_S)
     ] = None,
@@ -166,19 +161,18 @@ def check(
 
     Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
     """
-    given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap, "check.seconds": seconds}
-    overrides = [
-        f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}"
-        for key, value in given.items()
-        if value is not None
-    ]
+    overrides = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
     config = common.with_overrides(overrides).load().config
     items = [*disk_items(out, config.log.free_bytes)]
     items.append(_strangers(warnings(config.security, config.daemon)))
+
+    def prompt(text: str) -> None:
+        messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
+
     try:
         with connected(config) as connections, stop_on_signals() as stopped:
             seconds_s = config.check.seconds
-            items += run_preflight(config, connections, seconds_s, move=move, prompt=_prompt, stop=stopped)
+            items += run_preflight(config, connections, seconds_s, move=move, prompt=prompt, stop=stopped)
     except (ConnectionSpecError, KeyFileError) as error:
         if isinstance(error, ConnectionSpecError) and not isinstance(error.__cause__, OSError):
             raise  # a URL that is none: usage
@@ -217,19 +211,14 @@ def _strangers(texts: tuple[str, ...]) -> Item:
     return item("strangers", state, value, "known peers, and signed frames", hint)
 
 
-def _prompt(text: str) -> None:
-    messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
-
-
 def _table(report: Report) -> Table:
     words = "ready" if report.ok else "not ready: see what is red"
-    table = Table(title=f"check: {words}", title_justify="left", show_lines=False)
-    for heading in ("", "what", "found", "wanted", "what to do"):
-        table.add_column(heading, overflow="fold")
-    for one in report.items:
-        style = _STYLES[one.state]
-        table.add_row(f"[{style}]{one.state}[/]", *(_plain(text) for text in (one.name, one.value, one.want, one.hint)))
-    return table
+    headings = ("", "what", "found", "wanted", "what to do")
+    rows = (
+        (f"[{_STYLES[one.state]}]{one.state}[/]", *map(_plain, (one.name, one.value, one.want, one.hint)))
+        for one in report.items
+    )
+    return columns(f"check: {words}", headings, rows, headings, fold=True)
 
 
 def _plain(text: str) -> str:

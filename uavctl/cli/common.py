@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from cyclopts import Parameter, validators
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uavctl.config import LoadedConfig, explain, load
@@ -38,6 +39,10 @@ Overrides = Annotated[
 ]
 
 
+Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
+QuietJson = Annotated[Json, Parameter(show_default=False)]
+
+
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Common:
@@ -47,9 +52,7 @@ class Common:
         str, Parameter(help="preset (paper, room, room-px4, room-ardupilot, room-hahn-stursberg) or TOML file")
     ] = "room"
     overrides: Overrides = ()
-    json: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
-    ] = False
+    json: QuietJson = False
 
     def load(self) -> LoadedConfig:
         """Load the configuration that the options ask for.
@@ -98,13 +101,24 @@ def can_be_read(type_: object, path: object) -> None:
 
 DEFAULTS = Common()
 Flight = Annotated[Path, Parameter(help="the recording", validator=can_be_read)]
-Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
 SPAN_S = validators.Number(gt=0, lte=LONGEST_S)
 HEIGHT_M = validators.Number(gt=0, lte=1000)
 SEED = validators.Number(gte=0, lte=LARGEST_SEED)
 WORKERS = validators.Number(gte=1, lte=1024)
 PORT = validators.Number(gte=1, lte=65535)
 FREE_PORT = validators.Number(gte=0, lte=65535)
+Mocap = Annotated[
+    str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
+]
+TakeOff = Annotated[
+    float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
+]
+
+
+def given_keys(**given: str | float | None) -> list[str]:
+    """Overrides of those keys that a command's own options give; `__` stands for the dot in a key."""
+    values = {key.replace("__", "."): value for key, value in given.items() if value is not None}
+    return [f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}" for key, value in values.items()]
 
 
 def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
@@ -113,6 +127,46 @@ def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
     for name, value in rows:
         table.add_row(escape(name), escape(str(value)))
     return table
+
+
+def columns(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Iterable[RenderableType]],
+    left: Collection[str] | None = None,
+    *,
+    fold: bool = False,
+    lines: bool = False,
+) -> Table:
+    """A table with headings.
+
+    Args:
+        rows: Cells, in which markup is markup.
+        left: Headings of the columns that are set flush left, the others right; the first alone if None.
+        fold: Go on in the next line where a column is too narrow, else cut.
+        lines: Draw one between the rows.
+    """
+    table = Table(title=title or None, title_justify="left", show_lines=lines)
+    for heading in headings:
+        flush_left = heading in (headings[:1] if left is None else left)
+        table.add_column(
+            escape(heading), justify="left" if flush_left else "right", overflow="fold" if fold else "ellipsis"
+        )
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """Counts in words, as in "126 track, 20 hold"."""
+    return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
+
+
+def bars(*more: ProgressColumn, auto_refresh: bool = True) -> Progress:
+    """Progress among the messages, gone in the end: what is done, a bar, and `more`; else how many of all, and time."""
+    counted = more or (MofNCompleteColumn(), TimeElapsedColumn())
+    head = (TextColumn("{task.description}"), BarColumn())
+    return Progress(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
 
 
 def messages() -> Console:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from uavctl.cli.common import Common, messages
+from uavctl.cli.common import Common, QuietJson, messages, two_columns
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
 from uavctl.errors import NotReachedError, UsageError
@@ -34,9 +35,7 @@ class Which:
     control: Annotated[
         Path | None, Parameter(help="folder of the control sockets; else $UAVCTL_CONTROL or the user's own")
     ] = None
-    json: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
-    ] = False
+    json: QuietJson = False
 
 
 ANY = Which()
@@ -48,28 +47,24 @@ def goto(place: Annotated[str, Parameter(allow_leading_hyphen=True)], /, *, whic
     return _order(ControlRequest(ask="goto", position_m=_place(place)), which)
 
 
-@ctl_app.command
-def hold(*, which: Which = ANY) -> int:
-    """Stay where the vehicle comes to rest."""
-    return _order(ControlRequest(ask="hold"), which)
+Ask = Literal["hold", "resume", "land", "engage"]
 
 
-@ctl_app.command
-def resume(*, which: Which = ANY) -> int:
-    """Go on with the configured mission where it was left."""
-    return _order(ControlRequest(ask="resume"), which)
+def _plain_order(ask: Ask) -> Callable[..., int]:
+    def order(*, which: Which = ANY) -> int:
+        return _order(ControlRequest(ask=ask), which)
+
+    return order
 
 
-@ctl_app.command
-def land(*, which: Which = ANY) -> int:
-    """Brake and hand over to the vehicle's own landing."""
-    return _order(ControlRequest(ask="land"), which)
-
-
-@ctl_app.command
-def engage(*, which: Which = ANY) -> int:
-    """Ask for the external mode again, after the pilot or the vehicle has left it."""
-    return _order(ControlRequest(ask="engage"), which)
+_ORDERS: dict[Ask, str] = {
+    "hold": "Stay where the vehicle comes to rest.",
+    "resume": "Go on with the configured mission where it was left.",
+    "land": "Brake and hand over to the vehicle's own landing.",
+    "engage": "Ask for the external mode again, after the pilot or the vehicle has left it.",
+}
+for _name, _help in _ORDERS.items():
+    ctl_app.command(_plain_order(_name), name=_name, help=_help)
 
 
 @ctl_app.command
@@ -177,7 +172,6 @@ def _connect(path: Path) -> socket.socket | None:
 
 
 def _table(health: Health) -> Table:
-    table = Table(title=f"{health.name} (process {health.pid}), {health.url}", title_justify="left", show_header=False)
     vehicle, recorder = health.vehicle, health.recorder
     rows = {
         "mode": "waiting" if health.mode is None else f"{health.mode.value}: {health.reason}",
@@ -193,9 +187,7 @@ def _table(health: Health) -> Table:
         "lateness": f"{health.lateness_us / 1e3:.2f} ms, {health.missed_ticks} ticks missed",
         "recording": recorder.path if recorder.ok and not recorder.reason else f"{recorder.path}, {_trouble(recorder)}",
     }
-    for name, text in rows.items():
-        table.add_row(name, text)
-    return table
+    return two_columns(f"{health.name} (process {health.pid}), {health.url}", list(rows.items()))
 
 
 def _relay(relay: RelayHealth) -> str:

@@ -11,14 +11,12 @@ import msgspec
 import numpy as np
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_conditioned, build_design, build_spec, start_state
 from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
-from uavctl.cli.common import DEFAULTS, Common, located, messages
+from uavctl.cli.common import DEFAULTS, Common, bars, columns, located
 from uavctl.cli.prepare import ready_library
 from uavctl.lab.compare_designs import Costs, GainComparison, GainReport, compare_gains
 from uavctl.smpc.conditioned.planner import ConditionedDesign, conditioned_record
@@ -46,8 +44,7 @@ def gains_report(common: Common, states: int) -> int:
 
 @contextmanager
 def _progress(steps: int) -> Iterator[Callable[[str], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
+    with bars() as progress:
         task = progress.add_task("designs", total=steps)
 
         def advance(what: str) -> None:
@@ -57,11 +54,8 @@ def _progress(steps: int) -> Iterator[Callable[[str], None]]:
 
 
 def _gains_picture(found: GainComparison, name: str) -> RenderableType:
-    table = Table(title=f"Terminal gain of {name}", title_justify="left")
-    for heading in ("", "configured", "synthesised"):
-        table.add_column(heading, justify="right" if heading else "left")
-    for label, figure in _GAIN_ROWS:
-        table.add_row(label, figure(found.before), figure(found.after))
+    rows = ((label, figure(found.before), figure(found.after)) for label, figure in _GAIN_ROWS)
+    table = columns(f"Terminal gain of {name}", ("", "configured", "synthesised"), rows)
     refusals = [
         Text(f"No complete design with the {which} gain: {report.refused}")
         for which, report in (("configured", found.before), ("synthesised", found.after))
@@ -129,10 +123,8 @@ def design(
     if loaded.config.conditioned:
         with located(loaded):
             conditioned = build_conditioned(loaded.config)
-        common.show(
-            conditioned_document(conditioned, time.perf_counter() - start),
-            lambda: conditioned_picture(conditioned, loaded.config.name),
-        )
+        figures = {**conditioned_record(conditioned), "wall_s": time.perf_counter() - start}
+        common.show(figures, lambda: conditioned_picture(conditioned, loaded.config.name))
         return 0
     with located(loaded):
         made = build_design(loaded.config)
@@ -142,16 +134,10 @@ def design(
     return 0
 
 
-def conditioned_document(made: ConditionedDesign, wall_s: float) -> dict[str, object]:
-    """Return the figures of scheme `age-conditioned`, for --json."""
-    return {**conditioned_record(made), "wall_s": wall_s}
-
-
 def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
     """Return tables of ages with their risk, and of where a plan may rest."""
-    ages = Table(title=f"Risk by the age of information, design {made.design_id} of {name}", title_justify="left")
-    for heading in ("age [steps]", "probability", "may be outside", "far from limits"):
-        ages.add_column(heading, justify="right")
+    title = f"Risk by the age of information, design {made.design_id} of {name}"
+    ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
     risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
     left = 1.0 - np.cumsum(risk.weights)
     told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
@@ -164,14 +150,14 @@ def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
         ages.add_row(f"{told + 1} to {problem.horizon}", rest, *both)
     ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
     names = build_names(made)
-    limits = Table(title="Where a plan may rest", title_justify="left")
-    for heading in ("limit", "at", "rests up to", "unit"):
-        limits.add_column(heading, justify="left" if heading in ("limit", "unit") else "right")
     # A row of one entry limits -x from below where the entry is negative.
     sizes = problem.state_set.c.sum(axis=1)
-    for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True):
-        limits.add_row(row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
-    return Group(ages, limits)
+    rows = (
+        (row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
+        for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True)
+    )
+    headings = ("limit", "at", "rests up to", "unit")
+    return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")))
 
 
 def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
@@ -200,18 +186,24 @@ def library_document(stored: StoredLibrary) -> dict[str, object]:
 
 def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
     """Return Assumption 4, the schedule and the policy library as tables."""
-    checks = Table(title=f"Assumption 4, design {made.design_id} of {name}", title_justify="left")
-    for heading in ("item", "holds", "value", "limit", "of what"):
-        checks.add_column(heading)
-    for check in made.assumptions:
-        holds = "[green]yes[/]" if check.ok else "[red]no[/]"
-        checks.add_row(check.item, holds, f"{check.value:.4g}", f"{check.limit:.4g}", check.text)
-    schedule = Table()
-    for heading in ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"):
-        schedule.add_column(heading, justify="right")
-    rows = zip(made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True)
-    for t, (delay, alpha, gamma_x, gamma_u) in enumerate(rows):
-        schedule.add_row(str(t), str(delay), f"{alpha:.5f}", f"{gamma_x:.5f}", f"{gamma_u:.5f}")
+    headings = ("item", "holds", "value", "limit", "of what")
+    checked = (
+        (
+            check.item,
+            "[green]yes[/]" if check.ok else "[red]no[/]",
+            f"{check.value:.4g}",
+            f"{check.limit:.4g}",
+            check.text,
+        )
+        for check in made.assumptions
+    )
+    checks = columns(f"Assumption 4, design {made.design_id} of {name}", headings, checked, headings)
+    schedule = columns("", ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"), (), ())
+    stages = zip(
+        made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True
+    )
+    for t, (delay, *shares) in enumerate(stages):
+        schedule.add_row(str(t), str(delay), *(f"{share:.5f}" for share in shares))
     terminal = (
         f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
         f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
@@ -228,11 +220,8 @@ def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> Ren
 def _library_picture(stored: StoredLibrary | None) -> list[RenderableType]:
     if stored is None:
         return []
-    table = Table(title=f"Policy library {stored.library_id}", title_justify="left")
-    for heading in ("", "policies"):
-        table.add_column(heading, justify="right" if heading else "left")
-    for name, size in zip(stored.names, stored.sizes, strict=True):
-        table.add_row(name, str(size))
+    sizes = zip(stored.names, map(str, stored.sizes), strict=True)
+    table = columns(f"Policy library {stored.library_id}", ("", "policies"), sizes)
     check = stored.check
     shares = ", ".join(f"{count / check.states:.0%} {name}" for name, count in check.methods.items())
     answers = f"Answers from {check.states} states, most of them anywhere in the limits: {shares}; worst gap "

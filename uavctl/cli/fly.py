@@ -20,7 +20,7 @@ from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, HEIGHT_M, SPAN_S, Common, located, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
     Live,
@@ -151,16 +151,12 @@ def fly(
     *,
     common: Common = DEFAULTS,
     vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
-    mocap: Annotated[
-        str | None, Parameter(help="URL of the positions; else daemon.mocap. The vehicle's own is one connection")
-    ] = None,
+    mocap: Mocap = None,
     duration: Annotated[
         float | None, Parameter(help="hand over after this time [s]; else fly on", validator=SPAN_S)
     ] = None,
     arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
-    takeoff: Annotated[
-        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
-    ] = None,
+    takeoff: TakeOff = None,
     goto: Annotated[
         str | None,
         Parameter(help="x,y,z in local NED [m]: fly there once in charge and stay", allow_leading_hyphen=True),
@@ -181,10 +177,9 @@ def fly(
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
     switches. When the pilot leaves the mode, streaming stops at once and does not come back.
     """
-    given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap}
     take_off_m = checked_take_off(arm, takeoff)
     view_port = live_view_port(live=live, port=live_port)
-    overrides = [*(f'{key}="{value}"' for key, value in given.items() if value is not None), *goto_overrides(goto)]
+    overrides = [*given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap), *goto_overrides(goto)]
     summary = fly_daemon(
         common.with_overrides(overrides).load(),
         take_off_m=take_off_m,

@@ -55,11 +55,11 @@ from uavctl.records import (
     Vec3,
 )
 from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.plant import AXES
 
 # What `fly` and `loopback` ask of the hand-over: whether to arm and take off, when, and what came of it.
 
 
-AXES = ("north", "east", "down")
 DOWN = 2
 
 

@@ -12,14 +12,13 @@ import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, Common, can_be_read, messages, warn
+from uavctl.cli.common import DEFAULTS, Common, bars, can_be_read, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -88,8 +87,7 @@ def design_doubts(config: Config) -> tuple[str, ...]:
 @contextmanager
 def fitting(steps: int) -> Iterator[Callable[[], None]]:
     """Show a bar while plants are fitted."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
+    with bars() as progress:
         task = progress.add_task("fitting", total=steps)
         yield lambda: progress.advance(task)
 

@@ -8,10 +8,8 @@ from typing import Annotated
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from uavctl.cli.common import Common
+from uavctl.cli.common import Common, Json
 from uavctl.io.signed_connection import new_key, read_key
-
-Json = Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")]
 
 key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -23,7 +22,7 @@ from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
-from uavctl.cli.common import Common, Flight, Json, messages, two_columns, warn
+from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, two_columns, warn
 from uavctl.errors import UsageError
 
 # `uavctl log export`: a recording for other programs.
@@ -77,8 +76,7 @@ def _tlog_file(flight: Path, out: Path | None) -> Path:
 
 @contextmanager
 def _progress() -> Iterator[Watch]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
+    with bars() as progress:
 
         def watch(records: Iterable[RecordedMessage], total: int | None, what: str) -> Iterable[RecordedMessage]:
             return progress.track(records, total=total, description=what)
@@ -87,21 +85,13 @@ def _progress() -> Iterator[Watch]:
 
 
 def _tables_picture(exported: Exported, folder: Path) -> RenderableType:
-    table = Table()
-    for column in ("file", "rows", "columns"):
-        table.add_column(column, justify="left" if column == "file" else "right", overflow="fold")
-    for one in exported.tables:
-        table.add_row(Text(Path(one.file).name), str(one.rows), str(one.columns))
-    return Group(table, Text(f"in {folder}"))
+    rows = ((Text(Path(one.file).name), str(one.rows), str(one.columns)) for one in exported.tables)
+    return Group(columns("", ("file", "rows", "columns"), rows, fold=True), Text(f"in {folder}"))
 
 
 def _tlog_picture(exported: ExportedTlog) -> RenderableType:
-    table = Table()
-    table.add_column("topic")
-    table.add_column("packets", justify="right")
-    for topic, packets in exported.packets.items():
-        table.add_row(Text(topic), str(packets))
-    return Group(table, Text(f"in {exported.file}"))
+    rows = ((Text(topic), str(packets)) for topic, packets in exported.packets.items())
+    return Group(columns("", ("topic", "packets"), rows), Text(f"in {exported.file}"))
 
 
 # `uavctl log info` as a table.
@@ -112,9 +102,7 @@ def info_table(found: RecordingInfo) -> RenderableType:
     title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
     if len(found.files) > 1:
         title += f" in {len(found.files)} files"
-    table = Table()
-    for column in ("topic", "messages", "rate", "longest gap", "at"):
-        table.add_column(column, justify="left" if column == "topic" else "right")
+    table = columns("", ("topic", "messages", "rate", "longest gap", "at"), ())
     for topic in found.topics:
         rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
         gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
@@ -141,9 +129,8 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
     for note in found.notes:
         yield f"{note.at_s:.1f} s: {note.text}"
     for link in found.connections:
-        lost = "".join(
-            f"; {what}: {_counts(counts)}" for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts
-        )
+        left_out = {what: counts for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts}
+        lost = "".join(f"; {what}: {counted(dict(sorted(counts.items())))}" for what, counts in left_out.items())
         yield (
             f"connection {link.link}: {link.datagrams} datagrams, {link.messages} messages, "
             f"{link.samples} positions{lost}"
@@ -162,11 +149,6 @@ def _loss(loss: PositionLoss) -> Iterator[str]:
         yield f"positions: {100 * loss.believed:.0f} % of the steps without news, as last estimated{bursts}{promise}"
     if loss.simulated_sent:
         yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
-
-
-def _counts(counts: Mapping[str, int]) -> str:
-    """Return counts in words, as in "3 checksum, 1 length"."""
-    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 
 # `uavctl log`: its commands by name; what a recording holds, its repair, and a viewer's layout.

@@ -8,14 +8,13 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from logs.recording.flight import FlightData
 from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.reader import lacks_end, read
-from logs.recording.summary import render, summarise
+from logs.recording.summary import names_and_values, render, summarise
 from logs.report.compare import (
     ComparedFlight,
     FlightComparison,
@@ -32,7 +31,7 @@ from logs.report.compare import (
 from logs.report.figures import picture
 from logs.report.flight_page import verdict_rows, write_report
 from logs.report.verdicts import judge
-from uavctl.cli.common import Column, Common, Flight, Json, WideTable, can_be_read, messages, warn
+from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, warn
 
 # `uavctl log compare`: recordings beside each other.
 
@@ -43,11 +42,10 @@ def compare_command(
     /,
     *more: Annotated[Path, Parameter(help="and more", validator=can_be_read)],
     out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
-    json: Annotated[bool, Parameter(negative=(), help="one JSON document on standard output, nothing else")] = False,
+    json: Json = False,
 ) -> int:
     """Put flights beside each other: parameters that differ, figures, and where they part."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
+    with bars() as progress:
         paths = (first, second, *more)
         task = progress.add_task("reading", total=len(paths))
         loaded = load_all(paths, lambda: progress.advance(task))
@@ -70,23 +68,17 @@ def comparison_picture(found: FlightComparison) -> RenderableType:
 
 
 def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column(overflow="fold")
-    for one in sides:
+    def told(one: ComparedFlight) -> str:
         state = "" if one.finished else ", torn"
-        made = f"config {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
-        table.add_row(one.name, Text(f"{one.recording}\n{made}"))
-    return table
+        return f"{one.recording}\nconfig {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
+
+    return names_and_values((one.name, told(one)) for one in sides)
 
 
 def _parameters(found: FlightComparison) -> Table:
-    table = Table(title="Parameters that differ", title_justify="left")
-    for name in ("", *(one.name for one in found.recordings)):
-        table.add_column(name, overflow="fold")
-    for one in found.parameters:
-        table.add_row(Text(one.key), *(Text(parameter(value)) for value in one.values))
-    return table
+    headings = ("", *(one.name for one in found.recordings))
+    rows = ((Text(one.key), *(Text(parameter(value)) for value in one.values)) for one in found.parameters)
+    return columns("Parameters that differ", headings, rows, headings, fold=True)
 
 
 def _figures(found: FlightComparison) -> WideTable:

@@ -23,7 +23,7 @@ from logs.recording.views import Views
 from sim.server import Ready, serve_in_child
 from sim.simulation import World
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, HEIGHT_M, SEED, SPAN_S, Common, located, messages
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
     Live,
@@ -68,9 +68,7 @@ def loopback(
     ] = None,
     seed: Annotated[int | None, Parameter(help="seed of every random draw; else sim.seed", validator=SEED)] = None,
     arm: Annotated[bool, Parameter(negative=(), help="begin on the ground, disarmed; needs --takeoff")] = False,
-    takeoff: Annotated[
-        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
-    ] = None,
+    takeoff: TakeOff = None,
     goto: Annotated[
         str | None, Parameter(help="x,y,z in local NED [m]: fly there and stay", allow_leading_hyphen=True)
     ] = None,
@@ -87,8 +85,7 @@ def loopback(
     view_port = live_view_port(live=live, port=live_port)
     if live and not udp:
         raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
-    given = {"duration_s": duration, "sim.seed": seed}
-    overrides = [*(f"{key}={value}" for key, value in given.items() if value is not None), *goto_overrides(goto)]
+    overrides = [*given_keys(duration_s=duration, sim__seed=seed), *goto_overrides(goto)]
     summary = fly_simulated(
         common.with_overrides(overrides).load(),
         udp=udp,

@@ -12,12 +12,12 @@ from typing import Annotated, Literal
 import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_design, build_spec
-from uavctl.cli.common import SEED, WORKERS, Common, located, messages
+from uavctl.cli.common import SEED, WORKERS, Common, QuietJson, bars, columns, located, messages
 from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.paper.claims import (
@@ -70,9 +70,7 @@ def paper(
             help="also which schedules make a design, complexity over τ, and the least cost within the input limits",
         ),
     ] = False,
-    json: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="one JSON document on standard output, nothing else")
-    ] = False,
+    json: QuietJson = False,
 ) -> int:
     """Fly Section 5 of the paper, draw its figures, and hold every claim against what was measured."""
     begun = time.perf_counter()
@@ -122,8 +120,7 @@ def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
     if not shown:
         yield lambda _: None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
+    with bars(MofNCompleteColumn(), TimeRemainingColumn()) as progress:
         task = progress.add_task("runs", total=total)
         yield lambda done: progress.update(task, advance=done)
 
@@ -156,14 +153,10 @@ def paper_picture(
 ) -> RenderableType:
     """Return the claims beside each design's result; `claims` are those of the first, and what was measured beyond."""
     first = results[0]
-    table = Table(
-        title=f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}",
-        title_justify="left",
-        show_lines=True,
-    )
-    for heading in ("claim", "paper", *(f"τ = {result.tau}" for result in results)):
-        table.add_column(heading)
+    title = f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}"
+    headings = ("claim", "paper", *(f"τ = {result.tau}" for result in results))
     others = [{one.key: one for one in result.claims} for result in results[1:]]
+    table = columns(title, headings, (), headings, lines=True)
     for one in claims:
         table.add_row(one.claim, one.paper, _cell(one), *(_cell(other.get(one.key)) for other in others))
     more = [] if depth is None else [_designs(depth.designs), _complexity(depth.complexity)]
@@ -187,11 +180,9 @@ def _costs(result: VariantResult) -> str:
 
 
 def _designs(tried: list[DesignTried]) -> Table:
-    table = Table(title="Schedules, and what comes of them", title_justify="left")
-    for heading in ("τ", "schedule", "delays", "γ^x_H", "cost at start", "refused"):
-        table.add_column(heading)
-    for one in tried:
-        table.add_row(
+    headings = ("τ", "schedule", "delays", "γ^x_H", "cost at start", "refused")
+    rows = (
+        (
             str(one.tau),
             one.schedule,
             "" if one.delays is None else " ".join(map(str, one.delays)),
@@ -199,13 +190,14 @@ def _designs(tried: list[DesignTried]) -> Table:
             "" if one.refused else "not reached" if one.cost is None else f"{one.cost:.0f}",
             Text(one.refused),
         )
-    return table
+        for one in tried
+    )
+    return columns("Schedules, and what comes of them", headings, rows, headings)
 
 
 def _complexity(sizes: list[Complexity]) -> Table:
-    table = Table(title="One decision of one axis over τ, medians", title_justify="left")
-    for heading in ("τ", "H", "terminal states", "gains", "as printed", "exact", "library", "refused"):
-        table.add_column(heading, justify="left" if heading == "refused" else "right")
+    headings = ("τ", "H", "terminal states", "gains", "as printed", "exact", "library", "refused")
+    table = columns("One decision of one axis over τ, medians", headings, (), ("refused",))
     for one in sizes:
         times = (
             "" if one.printed_ms is None else f"{one.printed_ms:.0f} ms",

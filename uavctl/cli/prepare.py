@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from uavctl import __version__
 from uavctl.build.code_id import decider_id
 from uavctl.build.controller import build_controller
-from uavctl.cli.common import messages
+from uavctl.cli.common import bars, messages
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
 from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign
@@ -66,20 +66,15 @@ def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
         return library_for(design, advance, lambda text: messages().print(escape(text), style="yellow", soft_wrap=True))
 
 
-def _silent(text: str) -> None:
-    del text
-
-
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[str], None]]:
     """Show a progress bar of unknown length; where standard error is no terminal, its title alone."""
     console = messages()
     if not console.is_terminal:
         console.print(escape(title), soft_wrap=True)
-        yield _silent
+        yield lambda _: None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with bars(TimeElapsedColumn()) as progress:
         task = progress.add_task(escape(title), total=None)
         yield lambda text: progress.update(task, description=escape(text))
 

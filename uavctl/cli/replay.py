@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,14 +31,13 @@ from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlo
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.build.controller import build_controller, design_of
 from uavctl.build.library import check_fits, decode
-from uavctl.cli.common import DEFAULTS, Common, Flight, located, messages, two_columns, warn
+from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
 from uavctl.cli.prepare import Prepared, cpu, prepare, versions
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse
 from uavctl.errors import LibraryError, RecordingError, UsageError
-from uavctl.flight.controller import Controller
 from uavctl.loop import VEHICLE, ControlLoop, make_links
-from uavctl.records import Header, Sink, StepInput
+from uavctl.records import Header, StepInput
 from uavctl.smpc.hahn_stursberg.design import Design
 
 # The controller of a recording: with the policy library that it carries, whatever the cache holds.
@@ -291,9 +290,7 @@ def _course(course: tuple[FieldDivergence, ...]) -> Table:
     title = "What becomes of it, on the recorded inputs"
     if len(course) > MOST_FIELDS:
         title += f" ({MOST_FIELDS} of {len(course)} fields, all with --json)"
-    table = Table("field", title=title, title_justify="left")
-    for name in ("from [s]", "records that differ", "largest", "at [s]"):
-        table.add_column(escape(name), justify="right")
+    table = columns(title, ("field", "from [s]", "records that differ", "largest", "at [s]"), ())
     for one in course[:MOST_FIELDS]:
         unit = f" {one.unit}" if one.unit else ""
         entry = f" ({one.entry})" if one.entry else ""
@@ -359,29 +356,22 @@ def replay(
     return 0 if result.identical else 1
 
 
-def _loop_maker(config: Config, controller: Controller) -> Callable[[Sink], ControlLoop]:
-    return lambda sink: ControlLoop(config, controller, sink, lambda: 0)
-
-
 def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Common) -> int:
     loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
     config = loaded.config
     with located(loaded):
-        controller = prepare(config, design_of(config)).controller
-        # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
-        make_loop = _loop_maker(config, replace(controller, envelope=None))
+        prepared = prepare(config, design_of(config))
+    # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
+    controller = replace(prepared.controller, envelope=None)
     packets = ((packet.at_ns, packet.data) for packet in recorded if not packet.outgoing)
     tick_ns = round(config.daemon.tick_s * 1e9)
-    result = replay_tlog(packets, make_loop, link=VEHICLE, tick_ns=tick_ns)
+    result = replay_tlog(
+        packets, lambda sink: ControlLoop(config, controller, sink, lambda: 0), link=VEHICLE, tick_ns=tick_ns
+    )
     if not result.positions:
         raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
     common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
     return 0
-
-
-def _counts(counts: Mapping[str, int]) -> str:
-    """Return counts in words, as in "126 track, 20 hold"."""
-    return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
 
 
 def _ages(ages: Mapping[str, int], horizon: int) -> str:
@@ -402,9 +392,9 @@ def _foreign_table(result: ForeignReplay, horizon: int) -> Table:
         ("out of order", result.out_of_order),
         ("accepted / refused", f"{result.accepted} / {result.rejected}"),
         ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
-        ("solves", _counts(result.solves)),
-        ("ticks by mode", _counts(result.modes)),
-        *([("not taken by the connection", _counts(result.left_out))] if result.left_out else []),
+        ("solves", counted(result.solves)),
+        ("ticks by mode", counted(result.modes)),
+        *([("not taken by the connection", counted(result.left_out))] if result.left_out else []),
         ("decisions by age in steps", _ages(result.age_steps, horizon)),
     ]
     if ages is not None:

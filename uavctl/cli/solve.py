@@ -69,24 +69,9 @@ def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
 
 def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
     """Return the answer for --json; infinite values (no plan, no lower bound) are null."""
-    return {
-        "status": answer.status.value,
-        "cost": answer.cost,
-        "cost_lower": answer.cost_lower,
-        "gap": answer.gap,
-        "inputs": answer.inputs.tolist(),
-        "states": answer.states.tolist(),
-        "backoff_x": answer.backoff_x.tolist(),
-        "backoff_u": answer.backoff_u.tolist(),
-        "slack": answer.slack,
-        "offset": answer.offset,
-        "terminal_miss": answer.terminal_miss,
-        "gave_way": msgspec.to_builtins(answer.gave_way),
-        "reference": answer.reference.tolist(),
-        "method": answer.method,
-        "iterations": answer.iterations,
-        "solve_us": solve_us,
-    }
+    document: dict[str, object] = msgspec.to_builtins(answer, enc_hook=lambda array: array.tolist())
+    del document["seq"]
+    return {**document, "solve_us": solve_us}
 
 
 def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: float) -> RenderableType:

@@ -23,7 +23,19 @@ from logs.recording.outputs import write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.build.controller import design_of
-from uavctl.cli.common import HEIGHT_M, SEED, Common, Json, Overrides, can_be_read, located, messages, warn
+from uavctl.cli.common import (
+    SEED,
+    Common,
+    Json,
+    Overrides,
+    TakeOff,
+    can_be_read,
+    columns,
+    given_keys,
+    located,
+    messages,
+    warn,
+)
 from uavctl.cli.fly import fly_daemon
 from uavctl.cli.flying import checked_take_off
 from uavctl.cli.identify import design_doubts, fitting
@@ -38,7 +50,7 @@ from uavctl.io.signed_connection import connected
 from uavctl.io.transport import wait
 from uavctl.lab.identify.history import from_records
 from uavctl.lab.identify.page import write_page as write_fit_page
-from uavctl.lab.identify.result import AXES, fits_of, flown_stretches, identify, kinds_of, ramp_of
+from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
 from uavctl.lab.tune.change import (
     PinnedAxis,
     PredictionErrors,
@@ -78,6 +90,7 @@ from uavctl.loop import make_links
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.outcome import Cause
 from uavctl.records import PositionSample, Vec3, VehicleStatus
+from uavctl.smpc.plant import AXES
 
 # The flights of `uavctl tune`: one function that flies, and what it came to by its recording.
 
@@ -161,7 +174,7 @@ def _whole(config: Config, flight: FlightData) -> bool:
     if not chosen.any():
         return False
     index = list(flight.design.position_index)
-    axes = [("north", "east", "down").index(axis) for axis in flight.design.axes]
+    axes = [AXES.index(axis) for axis in flight.design.axes]
     wanted = np.array(mission.waypoints[-1])[axes]
     if not np.allclose(flight.steps.target[np.flatnonzero(chosen)[-1]][index], wanted):
         return False
@@ -229,15 +242,10 @@ def _enough(samples: list[PositionSample]) -> bool:
 
 def changes_picture(told: TunedResult) -> RenderableType:
     """Return tables of old and new values, and of both models' prediction errors on data they were not fitted to."""
-    columns = error_columns(told.old_errors)
+    predicted, rows = error_columns(told.old_errors), error_rows(told.old_errors, told.new_errors)
     return Group(
-        _table("Configuration", CHANGE_COLUMNS, change_rows(told), frozenset({1, 2, 3})),
-        _table(
-            "Prediction on halves of the flight not fitted to, rms",
-            columns,
-            error_rows(told.old_errors, told.new_errors),
-            frozenset(range(2, len(columns))),
-        ),
+        _table("Configuration", CHANGE_COLUMNS, change_rows(told), ("value", "why")),
+        _table("Prediction on halves of the flight not fitted to, rms", predicted, rows, predicted[:2]),
         *(Text(f"{one}.", style="yellow") for one in told.warnings),
     )
 
@@ -248,8 +256,7 @@ def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
     if progress.tuned is not None:
         parts += [Text(one) for one in story(progress.tuned, progress.comparison)]
     if progress.comparison is not None:
-        rows = figure_rows(progress.comparison)
-        parts.append(_table("Both flights", FIGURE_COLUMNS, rows, frozenset({1, 2, 3})))
+        parts.append(_table("Both flights", FIGURE_COLUMNS, figure_rows(progress.comparison), FIGURE_COLUMNS[:1]))
     if progress.tuned is not None:
         parts.append(Text(f"configuration: {folder / TUNED}"))
     if progress.comparison is not None:
@@ -257,13 +264,8 @@ def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
     return Group(*parts)
 
 
-def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for place, name in enumerate(columns):
-        table.add_column(escape(name), justify="right" if place in numbers else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
+def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str]) -> Table:
+    return columns(title, headings, (map(escape, row) for row in rows), left, fold=True)
 
 
 # `uavctl tune`: fly to learn how the vehicle answers, write that down, fly again, compare. Goes on where it ended.
@@ -296,9 +298,7 @@ def tune(
     vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
     mocap: Annotated[str | None, Parameter(help="URL of the positions; else daemon.mocap")] = None,
     arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
-    takeoff: Annotated[
-        float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
-    ] = None,
+    takeoff: TakeOff = None,
     yes: Annotated[bool, Parameter(negative=(), help="do not ask before the second flight")] = False,
     overrides: Overrides = (),
     json: Json = False,
@@ -318,9 +318,7 @@ def tune(
         raise UsageError("--seed is of the simulator; add --loopback")
     if loopback and not (vehicle is None and mocap is None):
         raise UsageError("--vehicle and --mocap are of a real vehicle; leave them out with --loopback")
-    given = {"daemon.vehicle": vehicle, "daemon.mocap": mocap}
-    more = [f'{key}="{value}"' for key, value in given.items() if value is not None]
-    more += [f"sim.seed={seed}"] if seed is not None else []
+    more = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)
     common = Common(config, overrides, json)
     if loopback and not _says_plant(common):
         more.insert(0, "sim.plant=quadrotor")
@@ -360,10 +358,8 @@ def _says_plant(common: Common) -> bool:
     if any(one.replace(" ", "").startswith("sim.plant=") for one in common.overrides):
         return True
     path = Path(common.config)
-    return path.suffix == ".toml" and path.exists() and _names_plant(path)
-
-
-def _names_plant(path: Path) -> bool:
+    if path.suffix != ".toml" or not path.exists():
+        return False
     sim = parse_toml(path.read_text(encoding="utf-8"), str(path)).get("sim")
     return isinstance(sim, dict) and "plant" in sim
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,8 +13,7 @@ from cyclopts import Parameter
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
 from logs.recording.export import known_number
@@ -28,13 +26,12 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
 from uavctl.build.controller import build_problem, design_of
-from uavctl.cli.common import SEED, Common, Flight, Json, located, messages, warn
+from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude, new_recording, put_header
 from uavctl.cli.prepare import Prepared, prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
-from uavctl.config.link import LinkConfig
 from uavctl.config.load import parse
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
@@ -237,7 +234,10 @@ def whatif(
         now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
-    other = None if over == RECORDED else _relinked(history, on, seed)
+    other = None
+    if over != RECORDED:
+        noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
+        other = Relinked(history, on, before.sim.seed if seed is None else seed, noise_m)
     begun = time.perf_counter()
     with new_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
         again = _reproduced(history, was, response, _watch(progress, "reproducing the flight"))
@@ -291,11 +291,8 @@ def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
         warn(text)
 
 
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=messages(), transient=True) as progress:
-        yield progress
+def _progress() -> Progress:
+    return bars(TaskProgressColumn(), TimeElapsedColumn())
 
 
 def _watch(progress: Progress, what: str) -> Watch:
@@ -322,13 +319,6 @@ def _link(given: tuple[str, ...], overrides: tuple[str, ...]) -> str:
         typed = " --link ".join(given)
         raise UsageError(f"--link {typed}: give `{RECORDED}` or `{CONFIGURED}` alone, or KEY=VALUE, as in loss=0.5")
     return words[0] if words else ", ".join(given)
-
-
-def _relinked(history: RecordedFlight, link: LinkConfig, seed: int | None) -> Relinked:
-    """Make another link for the positions of a recording."""
-    simulated, before = bool(history.flight.truths), history.config
-    noise_m = before.sim.camera.noise_std_m if simulated else before.estimator.position_std_m
-    return Relinked(history, link, before.sim.seed if seed is None else seed, noise_m)
 
 
 class _Memory:
@@ -371,10 +361,6 @@ def _recorded(
 
 
 def _picture(result: WhatIf) -> RenderableType:
-    table = Table()
-    for heading in HEADINGS:
-        table.add_column(heading, overflow="fold")
-    for row in side_by_side(result):
-        table.add_row(*map(Text, row))
+    table = columns("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
     places = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
     return Group(*map(Text, story(result)), table, *map(Text, places))

@@ -399,20 +399,9 @@ def _unit(annotation: Any) -> str:
 
 
 def _limits(meta: Meta, unit: str) -> str:
-    bounds = [
-        f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in _bounds(meta) if value is not None
-    ]
-    lengths = [
-        f"{word} {value}"
-        for word, value in ((f"{unit}: at least", meta.min_length), (_most(meta, unit), meta.max_length))
-        if value is not None
-    ]
-    return f" ({', '.join(bounds + lengths)})" if bounds or lengths else ""
-
-
-def _most(meta: Meta, unit: str) -> str:
-    return f"{unit}: at most" if meta.min_length is None else "at most"
-
-
-def _bounds(meta: Meta) -> tuple[tuple[str, float | None], ...]:
-    return ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))
+    bounds = ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))
+    told = [f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in bounds if value is not None]
+    most = f"{unit}: at most" if meta.min_length is None else "at most"
+    lengths = ((f"{unit}: at least", meta.min_length), (most, meta.max_length))
+    told += [f"{word} {value}" for word, value in lengths if value is not None]
+    return f" ({', '.join(told)})" if told else ""

@@ -85,6 +85,18 @@ def _text(value: object) -> str:
     return repr(value)
 
 
+def dotted(value: object, path: str = "") -> Iterator[tuple[str, object]]:
+    """Keys of a TOML document by their dotted names, with their values; tables of a list are numbered."""
+    if isinstance(value, Mapping):
+        for key, one in value.items():
+            yield from dotted(one, f"{path}.{key}" if path else key)
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        for place, one in enumerate(value):
+            yield from dotted(one, f"{path}[{place}]")
+    else:
+        yield path, value
+
+
 # TOML and overrides in, a checked `Config` out; every problem at once, with its place.
 
 

@@ -20,6 +20,7 @@ from uavctl.build.controller import build_conditioned, build_controller, build_p
 from uavctl.build.library import library_for
 from uavctl.build.mission import build_rests, resting_places
 from uavctl.config import Config, load_config, parse
+from uavctl.config.checks import position_index
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
 from uavctl.lab.own_loop import Moment, OwnLoop, OwnTuning, Path
@@ -27,6 +28,7 @@ from uavctl.loop import ControlLoop
 from uavctl.records import ControlMode, Decision, Flyer, Plan, Received, Record, Send, Setpoint, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.smpc.plant import AXES
 
 # A figure of eight with a given mean and largest speed, from rest to rest, as a trajectory of the configuration.
 #
@@ -51,8 +53,8 @@ def eight() -> TrajectoryConfig:
     times, positions, velocities = motion(_SAMPLE_S)
     return TrajectoryConfig(
         times_s=tuple(times.tolist()),
-        positions_m=tuple(_row_vec3(row) for row in positions),
-        velocities_mps=tuple(_row_vec3(row) for row in velocities),
+        positions_m=tuple(vec3(row) for row in positions),
+        velocities_mps=tuple(vec3(row) for row in velocities),
     )
 
 
@@ -109,11 +111,6 @@ def _length() -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def _row_vec3(row: Array) -> Vec3:
-    north, east, down = row.tolist()
-    return north, east, down
-
-
 # What is flown in a trial: who flies, what, with whom, in which air and over which link. Plain and picklable.
 
 
@@ -123,7 +120,6 @@ Air = Literal["calm", "gusts", "strong-gusts"]
 
 SCENARIOS: tuple[Scenario, ...] = ("hold", "eight", "blackout")
 AUTOPILOTS: tuple[AutopilotName, ...] = ("px4", "ardupilot")
-AIRS: tuple[Air, ...] = ("calm", "gusts", "strong-gusts")
 WIND_MPS: Vec3 = (0.6, -0.36, 0.0)  # 0.7 m/s, wherever there are gusts
 GUST_WIND_MPS: dict[Air, float] = {"calm": 0.0, "gusts": 3.0, "strong-gusts": 8.0}
 BLACKOUT_S = 4.0
@@ -328,18 +324,12 @@ def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
 # The room of a configuration, and what of it a controller can use.
 
 
-_AXES = ("north", "east", "down")
-
-
 def room_of(config: Config) -> tuple[Array, Array]:
     """Return the least and the largest position in the room (3,) [m]; infinite where there is no wall."""
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
-    index = config.plant.position_index or tuple(
-        config.plant.states_per_axis * i for i in range(len(config.plant.axes))
-    )
-    for axis, place in zip(config.plant.axes, index, strict=True):
-        lower[_AXES.index(axis)] = config.sets.state_lower[place]
-        upper[_AXES.index(axis)] = config.sets.state_upper[place]
+    for axis, place in zip(config.plant.axes, position_index(config.plant), strict=True):
+        lower[AXES.index(axis)] = config.sets.state_lower[place]
+        upper[AXES.index(axis)] = config.sets.state_upper[place]
     return lower, upper
 
 
@@ -366,7 +356,7 @@ def usable_seen(config: Config, design: Design | None) -> float:
 
 
 def _volume_share(config: Config, least: Array, most: Array) -> float:
-    axes = [_AXES.index(axis) for axis in config.plant.axes]
+    axes = [AXES.index(axis) for axis in config.plant.axes]
     lower, upper = room_of(config)
     whole = (upper - lower)[axes]
     return float(np.prod(np.clip(most - least, 0.0, None) / whole)) if np.isfinite(whole).all() else math.nan
@@ -542,7 +532,7 @@ def path_of(motion: TrajectoryConfig) -> Path:
         moves = times[0] <= since_s < times[-1]
         place = spline(min(max(since_s, times[0]), times[-1]))
         velocity, accel = (speed(since_s), change(since_s)) if moves else (np.zeros(3), np.zeros(3))
-        return _vec3(place), _vec3(velocity), _vec3(accel)
+        return vec3(place), vec3(velocity), vec3(accel)
 
     return at
 
@@ -585,6 +575,7 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else math.nan
 
 
-def _vec3(values: Array) -> Vec3:
+def vec3(values: Array) -> Vec3:
+    """Three numbers as plain ones."""
     north, east, down = np.asarray(values, dtype=np.float64).tolist()
     return north, east, down

@@ -19,7 +19,7 @@ from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.controllers import met, sight_of
 from uavctl.lab.campaign.intervals import worst_step
 from uavctl.lab.campaign.pool import Columns
-from uavctl.lab.campaign.tasks import Cell, flown, fly_task, tasks_of
+from uavctl.lab.campaign.tasks import Cell, flown, tasks_of
 from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
@@ -169,7 +169,7 @@ def cell(tmp_path: Path, *more: str, overrides: str = "", master: int = 0) -> Ce
 
 def rows(made: Cell) -> Columns:
     (task,) = tasks_of([made])
-    return fly_task(task)
+    return task.fly()
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from campaign_results import STEPS, cell, runs, write
+from ratios import paired_ratio
 from scipy.optimize import brentq
 from scipy.stats import binom
 
@@ -17,7 +18,6 @@ from uavctl.lab.campaign.intervals import (
     bootstrap_mean,
     clopper_pearson,
     paired_difference,
-    paired_ratio,
     step_rate,
     worst_step,
 )

@@ -12,7 +12,7 @@ from campaign_rig import cells, controller, table
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.spec import CHUNK
 from uavctl.lab.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.lab.campaign.tasks import Task, flown, fly_task, tasks_of
+from uavctl.lab.campaign.tasks import Task, flown, tasks_of
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
 DOCUMENT = {"name": "one", "runs": 3, "cells": [{"index": 0}]}
@@ -29,7 +29,7 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
         store = Store(tmp_path / name)
         with store.opened(DOCUMENT, "text", resume=False):
             for task in order:
-                store.keep(task, fly_task(task))
+                store.keep(task, task.fly())
             assert store.kept(given) == {task.name for task in given} and not store.complete()
             files.append(store.finish(given))
         assert store.complete() and not (tmp_path / name / "parts").exists()
@@ -38,7 +38,7 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
     assert found.schema.names == SCHEMA.names
     assert list(found["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
     assert list(found["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
-    whole = fly_task(given[1])
+    whole = given[1].fly()
     row = found.slice(CHUNK + 2, 1).to_pylist()[0]
     assert row["cost"] == whole["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
     ages = [int(count) for count in whole["ages"][2]]
@@ -55,7 +55,7 @@ def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> N
     store = Store(tmp_path / "one")
     with store.opened(DOCUMENT, "text", resume=False):
         for task in given:
-            store.keep(task, fly_task(task))
+            store.keep(task, task.fly())
         part = tmp_path / "one" / "parts" / f"{given[1].name}.parquet"
         part.write_bytes(part.read_bytes()[:-20])
         with pytest.raises(UavctlError, match=rf"{given[1].name}\.parquet is damaged.*remove it"):
@@ -102,4 +102,4 @@ def test_a_run_alone_is_that_of_its_chunk(tmp_path: Path) -> None:
     assert (task.cell, task.first, task.runs) == (1, CHUNK, 4)
     found, _ = flown(task, CHUNK + 2, 1)
     assert found.cost.shape == (1, 6)
-    assert found.cost.sum() == pytest.approx(fly_task(task)["cost"][2], rel=1e-12)
+    assert found.cost.sum() == pytest.approx(task.fly()["cost"][2], rel=1e-12)

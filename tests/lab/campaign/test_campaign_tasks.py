@@ -14,7 +14,7 @@ from campaign_rig import cells, controller, table
 from uavctl.lab.campaign import controllers, spec
 from uavctl.lab.campaign.controllers import build, met
 from uavctl.lab.campaign.pool import Columns, Work, fly_tasks
-from uavctl.lab.campaign.tasks import Task, fly_task, tasks_of
+from uavctl.lab.campaign.tasks import Task, tasks_of
 from uavctl.lab.campaign.world import fly
 from uavctl.smpc.batch import BatchSmpc, News
 
@@ -29,7 +29,7 @@ def task(folder: Path, *parts: str) -> Task:
 
 def test_figures_are_those_of_the_runs(tmp_path: Path) -> None:
     one = task(tmp_path, "steps = 11\nruns = 7\n", controller("smpc"))
-    columns = fly_task(one)
+    columns = one.fly()
     smpc, meets = build(one.recipe), met(one.setting, 0, 7)
     flown = fly(meets.scene, smpc, meets.newest, meets.disturbances)
     assert isinstance(smpc, BatchSmpc)
@@ -52,13 +52,13 @@ def test_figures_are_those_of_the_runs(tmp_path: Path) -> None:
 
 
 def test_a_controller_that_counts_nothing_has_no_gap(tmp_path: Path) -> None:
-    columns = fly_task(task(tmp_path, "steps = 5\nruns = 3\n", controller("lqg")))
+    columns = task(tmp_path, "steps = 5\nruns = 3\n", controller("lqg")).fly()
     assert np.isnan(columns["largest_gap"]).all() and not columns["decisions"].any()
     assert np.isfinite(columns["cost"]).all() and (columns["steps"] == 5).all()
 
 
 def test_numbers_that_leave_all_bounds_are_told_as_an_error(tmp_path: Path) -> None:
-    columns = fly_task(task(tmp_path, "steps = 60\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)))
+    columns = task(tmp_path, "steps = 60\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)).fly()
     assert set(columns["error"]) == {"ended in numbers that are not finite"}
     assert all(np.isnan(columns[name]).all() for name in FIGURES)
     assert not columns["steps"].any() and not columns["ages"].any()
@@ -84,7 +84,7 @@ def test_a_run_that_raises_is_told_and_stops_no_other(tmp_path: Path, monkeypatc
     starts = met(one.setting, 0, 40).scene.start[:, 0]
     limit = float(np.sort(starts)[-3])
     monkeypatch.setattr(controllers, "build", lambda recipe: Crashing(limit))
-    columns = fly_task(replace(one, recipe=replace(one.recipe, key="crashing")))
+    columns = replace(one, recipe=replace(one.recipe, key="crashing")).fly()
     out = starts > limit
     assert out.sum() == 2
     assert list(columns["error"][out]) == ["ZeroDivisionError: out of range"] * 2
@@ -99,7 +99,7 @@ def test_a_controller_that_cannot_be_built_loses_its_runs_only(tmp_path: Path, m
 
     one = task(tmp_path, "steps = 2\nruns = 4\n", controller("lqg"))
     monkeypatch.setattr(controllers, "build", none)
-    columns = fly_task(replace(one, recipe=replace(one.recipe, key="none")))
+    columns = replace(one, recipe=replace(one.recipe, key="none")).fly()
     assert list(columns["error"]) == ["OSError: no such file"] * 4
 
 

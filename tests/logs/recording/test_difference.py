@@ -12,7 +12,7 @@ import pytest
 from loopback_rig import Memory, lockstep, make_loop
 from report_rig import unpaged
 
-from logs.recording.reader import finished, records, segment_files
+from logs.recording.reader import lacks_end, records, segment_files
 from logs.recording.replay import MAKERS, FieldNames, ReplayResult, leaves, replay
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run
@@ -209,7 +209,7 @@ def test_a_recording_without_its_last_file_is_alike_up_to_there_and_says_so(
     for file in segment_files(rotated / "flight.mcap")[:-1]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     last = segment_files(flight)[-1].name
-    assert not finished(flight) and finished(rotated / "flight.mcap")
+    assert lacks_end(flight) and not lacks_end(rotated / "flight.mcap")
     assert run(["log", "replay", str(flight), "--json"]) == 0
     told = capsys.readouterr()
     assert 100 < json.loads(told.out)["decisions"] < 250

@@ -9,7 +9,7 @@ import pytest
 from loopback_rig import lockstep
 
 from logs.recording.outputs import spare_recording
-from logs.recording.reader import finished
+from logs.recording.reader import lacks_end
 from logs.recording.recorder import SyncRecorder
 from logs.recording.segment import MAGIC
 from uavctl.cli.app import run
@@ -57,10 +57,10 @@ def test_a_recording_of_any_name_is_known_by_its_first_bytes(tmp_path: Path) -> 
 
 def test_a_file_is_finished_with_its_whole_index_only(recorded: Path, tmp_path: Path) -> None:
     data = recorded.read_bytes()
-    assert finished(recorded)
+    assert not lacks_end(recorded)
     cut = tmp_path / "cut.mcap"
     for size in (0, 5, len(data) // 2, len(data) - 30, len(data) - 1):
         cut.write_bytes(data[:size])
-        assert not finished(cut), size
+        assert lacks_end(cut), size
     with pytest.raises(RecordingError, match="no such recording"):
-        finished(tmp_path / "missing.mcap")
+        lacks_end(tmp_path / "missing.mcap")

@@ -12,7 +12,7 @@ from baseline_rig import problem
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from uavctl.lab.campaign.tasks import Cell, fly_task, tasks_of
+from uavctl.lab.campaign.tasks import Cell, tasks_of
 from uavctl.smpc.conditioned.backoffs import SLACK, age_risk, quantile, rest_backoffs
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
@@ -137,7 +137,7 @@ def corner(tmp_path: Path, loss: float, steps: int) -> Cell:
 def test_a_corner_uses_half_of_the_allowance_and_no_more_than_it(tmp_path: Path, loss: float, steps: int) -> None:
     """Settled steps outside, by their mean over runs and four of its standard errors; and plans with slack."""
     (task,) = tasks_of([corner(tmp_path, loss, steps)])
-    found = fly_task(task)
+    found = task.fly()
     assert not any(found["error"])
     rate = np.asarray(found["outside"])[:, 25:].mean(axis=1)
     error = 4.0 * rate.std() / np.sqrt(len(rate))

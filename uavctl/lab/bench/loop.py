@@ -15,10 +15,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -45,20 +45,13 @@ _SO_TIMESTAMPNS = 35  # Linux: the kernel's own time of arrival, so that our wak
 _TIMESPEC = struct.Struct("qq")
 
 
-@dataclass
-class LoopReplies:
-    """Replies of the daemon to a vehicle's positions."""
-
-    # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
-    in_to_out_ns: list[int] = field(default_factory=list)
-    positions: int = 0  # sent so far
-
-
 class Peer:
     """Vehicle of the benchmark on one UDP connection; the grid of ticks is that of CLOCK_MONOTONIC."""
 
     def __init__(self, port: int, tick_ns: int) -> None:
-        self.seen = LoopReplies()
+        # For each answered position, from the deadline of its tick to the arrival of the setpoint [ns]
+        self.in_to_out_ns: list[int] = []
+        self.positions = 0  # sent so far
         self._tick_ns = tick_ns
         self._socket = socket.socket(type=socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -78,12 +71,12 @@ class Peer:
         now_ns = time.monotonic_ns()
         deadline_ns = (now_ns + LEAD_NS) // self._tick_ns * self._tick_ns + self._tick_ns
         self._listen(deadline_ns - LEAD_NS)
-        if self.seen.positions % _HEARTBEAT_TICKS == 0:
+        if self.positions % _HEARTBEAT_TICKS == 0:
             self._beat(_ARMED)
         sent_ns = time.monotonic_ns()
         self._send(self._out.vision_position_estimate_encode(sent_ns // 1000, *self._position, 0.0, 0.0, 0.0))
         self._asked_ns.add(sent_ns // self._tick_ns * self._tick_ns + self._tick_ns)
-        self.seen.positions += 1
+        self.positions += 1
         self._move()
 
     def finish(self) -> None:
@@ -116,7 +109,7 @@ class Peer:
         deadline_ns = arrived_ns // self._tick_ns * self._tick_ns
         if deadline_ns in self._asked_ns:
             self._asked_ns.remove(deadline_ns)
-            self.seen.in_to_out_ns.append(arrived_ns - deadline_ns)
+            self.in_to_out_ns.append(arrived_ns - deadline_ns)
 
     def _move(self) -> None:
         tick_s = self._tick_ns * 1e-9
@@ -158,10 +151,7 @@ class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
     def middle(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
         """Return the median over runs, quantile by quantile."""
         return TimeQuantiles(
-            p50=median(run.p50 for run in runs),
-            p99=median(run.p99 for run in runs),
-            p999=median(run.p999 for run in runs),
-            max=median(run.max for run in runs),
+            **{key: median(getattr(run, key) for run in runs) for key in TimeQuantiles.__struct_fields__}
         )
 
 
@@ -186,12 +176,12 @@ class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
     @staticmethod
     def middle(runs: Sequence[LoopRun]) -> LoopRun:
         """Return the median over runs, figure by figure."""
-        spreads = ("in_to_out_us", "lateness_us", "empty_lateness_us", "step_us")
-        fields: dict[str, TimeQuantiles | float] = {}
-        for name in LoopRun.__struct_fields__:
-            values = [getattr(run, name) for run in runs]
-            fields[name] = TimeQuantiles.middle(values) if name in spreads else float(median(values))
-        return msgspec.convert(fields, LoopRun)
+        columns = {name: [getattr(run, name) for run in runs] for name in LoopRun.__struct_fields__}
+        middle: dict[str, Any] = {
+            name: TimeQuantiles.middle(values) if isinstance(values[0], TimeQuantiles) else float(median(values))
+            for name, values in columns.items()
+        }
+        return LoopRun(**middle)
 
 
 class LoopBench(msgspec.Struct, frozen=True, kw_only=True):
@@ -276,13 +266,13 @@ def _measured(path: Path, peer: Peer, memory_kib: Sequence[int], idle_ns: list[i
     late = TimeQuantiles.of(np.array([timing.lateness_ns for timing in timings]))
     empty = TimeQuantiles.of(np.array(idle_ns))
     return LoopRun(
-        in_to_out_us=TimeQuantiles.of(np.array(peer.seen.in_to_out_ns)),
+        in_to_out_us=TimeQuantiles.of(np.array(peer.in_to_out_ns)),
         lateness_us=late,
         empty_lateness_us=empty,
         above_empty_us=late.p999 - empty.p999,
         step_us=TimeQuantiles.of(np.array([timing.step_ns for timing in timings])),
-        positions=peer.seen.positions,
-        unanswered=peer.seen.positions - len(peer.seen.in_to_out_ns),
+        positions=peer.positions,
+        unanswered=peer.positions - len(peer.in_to_out_ns),
         missed_ticks=missed,
         recorded=recorded,
         dropped=dropped,
@@ -361,7 +351,7 @@ def _fly(peer: Peer, process: subprocess.Popen[str], positions: int) -> list[int
     """
     memory_kib: list[int] = []
     next_ns = time.monotonic_ns()
-    while peer.seen.positions < positions:
+    while peer.positions < positions:
         now_ns = time.monotonic_ns()
         peer.tick()
         if now_ns >= next_ns:

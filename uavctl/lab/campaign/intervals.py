@@ -115,23 +115,6 @@ def paired_difference(a: Array, b: Array, level: float = LEVEL) -> PairedDiffere
     return PairedDifference(mean=float(difference.mean()), low=low, high=high, runs=difference.size)
 
 
-def paired_ratio(a: Array, b: Array, level: float = LEVEL) -> tuple[float, Pair]:
-    """Return the mean of a (N,) over the mean of b (N,), run against run on the same draws, with its interval.
-
-    The interval is that of the mean of a - r b, with r the ratio, over the mean of b: what moves both costs of a run
-    alike is not counted.
-
-    Raises:
-        UsageError: There are no pairs, or runs without a partner, or b is zero in the mean.
-    """
-    base = float(b.mean()) if b.size else 0.0
-    if base == 0.0:
-        raise UsageError("nothing has a ratio to a mean of zero; compare runs that cost something")
-    ratio = float(a.mean()) / base
-    left = paired_difference(a, ratio * b, level)
-    return ratio, (ratio + left.low / base, ratio + left.high / base)
-
-
 def step_rate(hits: Array, steps: int, level: float = LEVEL) -> tuple[float, Pair]:
     """Return the share of steps in which something happened, with its interval over runs.
 

@@ -61,10 +61,6 @@ class CampaignView:
         looks = Looks(tuple(dict.fromkeys([*first, *(cell.controller for cell in cells)])))
         return cls(results, cells, groups, list(verdicts(results, groups)), looks)
 
-    def is_smpc(self, controller: str) -> bool:
-        """Return whether a controller is an SMPC."""
-        return any(cell.controller == controller and cell.kind == SMPC for cell in self.cells)
-
     def place(self, group: Group) -> str:
         """Return the name of a group: its link, and what else is not the same for all groups."""
         names = list(group[:1])
@@ -261,7 +257,7 @@ def _verdict_section(view: CampaignView) -> PageSection:
 
 def _name(view: CampaignView, verdict: CampaignVerdict) -> str:
     place = view.place(verdict.group)
-    several = sum(view.is_smpc(name) for name in view.looks.controllers) > 1
+    several = len({cell.controller for cell in view.cells if cell.kind == SMPC}) > 1
     return f"{verdict.smpc.controller}, {place}" if several else place
 
 

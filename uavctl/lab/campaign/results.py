@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from logs.report.statistics import finite
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.intervals import (
     Pair,
@@ -32,19 +32,9 @@ DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
 Values = NDArray[np.float64]
 
-_FIGURES = (
-    "cost",
-    "settled_cost",
-    "state_violations",
-    "input_violations",
-    "saturated",
-    "mean_square_input",
-    "decisions",
-    "infeasible",
-    "slack_used",
-    "fallbacks",
-    "largest_gap",
-)
+_COUNTED = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
+_REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap")
+_FIGURES = (*_REAL, "state_violations", "input_violations", *_COUNTED)
 _SINCE = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions have them not
 
 
@@ -266,11 +256,12 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
     counted = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
     worst = worst_step(runs.outside, n, results.steps) if counted else (None, None)
     (ages,) = np.nonzero(runs.ages)
+    told = CellSummary.__struct_fields__
+    same: dict[str, Any] = {name: getattr(cell, name) for name in cell.__struct_fields__ if name in told}
+    same |= {name: int(runs[name].sum()) for name in _COUNTED}
+    same |= {name: _finite(np.median, runs[name]) for name in ("near_s", "nearer_s", "hold_rms_m")}
     return CellSummary(
-        controller=cell.controller,
-        link=cell.link,
-        disturbance=cell.disturbance,
-        plant=cell.plant,
+        **same,
         runs=n + len(runs.failed),
         failed=len(runs.failed),
         violation_rate=state[0],
@@ -279,30 +270,16 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
         run_violation_ci=any_state[1],
         cost=cost[0],
         cost_ci=cost[1],
-        fallbacks=int(runs["fallbacks"].sum()),
         max_age=int(ages[-1]) if ages.size else 0,
-        refused=cell.refused,
-        promised_x=cell.promised_x,
-        index=cell.index,
-        kind=cell.kind,
-        promised_u=cell.promised_u,
         input_violation_rate=inputs[0],
         input_violation_ci=inputs[1],
         settled_cost=settled[0],
         settled_cost_ci=settled[1],
         mean_square_input=_mean(runs["mean_square_input"])[0],
-        saturated=int(runs["saturated"].sum()),
-        decisions=int(runs["decisions"].sum()),
-        infeasible=int(runs["infeasible"].sum()),
-        slack_used=int(runs["slack_used"].sum()),
         largest_gap=float(gaps.max()) if gaps.size else None,
         mean_age=float(np.average(np.arange(runs.ages.size), weights=runs.ages)) if ages.size else None,
         ages=runs.ages.tolist(),
-        near_s=_finite(np.median, runs["near_s"]),
-        nearer_s=_finite(np.median, runs["nearer_s"]),
-        hold_rms_m=_finite(np.median, runs["hold_rms_m"]),
         beyond_m=_finite(np.max, runs["beyond_m"]),
-        usable_room=cell.usable_room,
         worst_step_rate=worst[0],
         worst_step_ci=worst[1],
     )
@@ -310,8 +287,7 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
 
 def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
     """Return a figure of values; None of no values, and where the figure is not finite."""
-    found = float(figure(values)) if values.size else math.nan
-    return found if math.isfinite(found) else None
+    return finite(float(figure(values))) if values.size else None
 
 
 def difference(a: Runs, b: Runs, column: str, per: float = 1.0) -> PairedDifference | None:

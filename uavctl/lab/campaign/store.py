@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from logs.recording.replay import unequal
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
 
@@ -182,18 +183,10 @@ def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def first_difference(there: object, here: object, path: str = "") -> str | None:
+def first_difference(there: object, here: object) -> str | None:
     """Return the first place in which two JSON documents differ, in words."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in dict.fromkeys((*there, *here)):
-            found = first_difference(there.get(key), here.get(key), f"{path}.{key}" if path else str(key))
-            if found is not None:
-                return found
-        return None
-    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
-        pairs = enumerate(zip(there, here, strict=True))
-        return next((found for i, (a, b) in pairs if (found := first_difference(a, b, f"{path}[{i}]"))), None)
-    return None if there == here else f"{path} is {_short(there)} there and {_short(here)} here"
+    found = next(unequal(there, here), None)
+    return None if found is None else f"{found[0]} is {_short(found[1])} there and {_short(found[2])} here"
 
 
 def _short(value: object) -> str:

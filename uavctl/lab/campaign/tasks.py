@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.config import Config
+from uavctl.config.checks import position_index
 from uavctl.config.link import LinkConfig
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
@@ -22,6 +23,7 @@ from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, fly
 from uavctl.lab.trial import NEAR_M, NEARER_M, room_of, usable_seen
 from uavctl.smpc.batch import Tally
+from uavctl.smpc.plant import AXES
 
 # The cells of a campaign: the product of its controllers, links, disturbances and plants, in the order given.
 
@@ -47,21 +49,12 @@ def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
     Args:
         library_for: Gives the policy library of a design.
     """
-    recipes = {key: _recipe(campaign, key, library_for) for key in campaign.believed}
+    recipes, spec = {key: _recipe(campaign, key, library_for) for key in campaign.believed}, campaign.spec
+    i, j, k, m = (range(len(one)) for one in (spec.controller, spec.link, spec.disturbance, spec.plant))
     return tuple(
         _cell(campaign, index, which, recipes[which[0], campaign.believed_link(*which[:2])])
-        for index, which in enumerate(_product(campaign))
+        for index, which in enumerate(product(i, j, k, m))
     )
-
-
-Which = tuple[int, int, int, int]  # indices of controller, link, disturbance and plant
-
-
-def _product(campaign: Campaign) -> list[Which]:
-    spec = campaign.spec
-    lists = (spec.controller, spec.link, spec.disturbance, spec.plant)
-    i, j, k, m = (range(len(one)) for one in lists)
-    return list(product(i, j, k, m))
 
 
 def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
@@ -72,7 +65,7 @@ def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -
         return str(error)
 
 
-def _cell(campaign: Campaign, index: int, which: Which, recipe: Recipe | str) -> Cell:
+def _cell(campaign: Campaign, index: int, which: tuple[int, int, int, int], recipe: Recipe | str) -> Cell:
     i, j, k, m = which
     spec = campaign.spec
     controller, link, disturbance, plant = spec.controller[i], spec.link[j], spec.disturbance[k], spec.plant[m]
@@ -157,8 +150,6 @@ def _refused(setting: Setting) -> str:
 
 Array = NDArray[np.float64]
 
-_AXES = ("north", "east", "down")
-
 
 def ways(config: Config, states: Array) -> dict[str, Array]:
     """Return figures (N,) of runs by column of the results: way to the target, hold, and distance to walls.
@@ -170,9 +161,8 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
         config: The configuration by which runs are judged: room, target, Δt.
         states: (N, T+1, n_x).
     """
-    plant = config.plant
-    index = list(plant.position_index or (3 * i for i in range(len(plant.axes))))
-    axes = [_AXES.index(axis) for axis in plant.axes]
+    plant, index = config.plant, list(position_index(config.plant))
+    axes = [AXES.index(axis) for axis in plant.axes]
     where = states[:, :, index]
     off = np.linalg.norm(where - np.array(config.target.position_m)[axes], axis=2)
     lower, upper = (side[axes] for side in room_of(config))
@@ -208,8 +198,20 @@ class Task(Work):
     recipe: Recipe
 
     def fly(self) -> Columns:
-        """See `fly_task`."""
-        return fly_task(self)
+        """Fly the runs at once; if that raises, one by one, and those that raise have its message.
+
+        Returns:
+            Columns as in the results, each with a row a run; `ages` and `outside` are (runs, steps).
+        """
+        try:
+            built(self.recipe)
+        except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
+            return self.lost(told_of(error))
+        try:
+            return _figures(self, self.first, self.runs)
+        except Exception:  # noqa: BLE001 as above
+            rows = [_alone(self, self.first + i) for i in range(self.runs)]
+            return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
     def lost(self, error: str) -> Columns:
         """See `Work`."""
@@ -223,23 +225,6 @@ def tasks_of(cells: Sequence[Cell]) -> Iterator[Task]:
             runs = cell.setting.spec.runs
             for first in range(0, runs, CHUNK):
                 yield Task(cell.index, first, min(CHUNK, runs - first), cell.setting, cell.recipe)
-
-
-def fly_task(task: Task) -> Columns:
-    """Fly the runs of a task at once; if that raises, one by one, with the message of those that raise.
-
-    Returns:
-        Columns as in the results, each with a row a run; `ages` and `outside` are (runs, steps).
-    """
-    try:
-        built(task.recipe)
-    except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
-        return task.lost(told_of(error))
-    try:
-        return _figures(task, task.first, task.runs)
-    except Exception:  # noqa: BLE001 as above
-        rows = [_alone(task, task.first + i) for i in range(task.runs)]
-        return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
 
 def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:

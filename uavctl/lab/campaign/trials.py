@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -16,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Meta
 
+from logs.report.statistics import finite
 from uavctl import __version__
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, dump_config, load, load_config, parse
@@ -408,13 +408,9 @@ def _summary(rows: pa.Table, place: ToldPlace) -> TrialSummary:
         place=place,
         runs=len(errors),
         failed=len(errors) - len(good),
-        median={name: _finite(median(found)) if found else None for name, found in values.items()},
-        worst={name: _finite(max(found)) if found else None for name, found in values.items()},
+        median={name: finite(median(found)) if found else None for name, found in values.items()},
+        worst={name: finite(max(found)) if found else None for name, found in values.items()},
         modes=dict(modes),
         errors=[error for error in dict.fromkeys(errors) if error],
         values=values,
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.report.statistics import autocorrelation
 from uavctl.errors import RecordingError
 from uavctl.lab.identify.history import LEAST_SAMPLES, Stretch
 from uavctl.lab.identify.response import (
@@ -261,7 +262,7 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
         stds_m=known[settled],
         moved_m=second.moved_m,
         predicted_m=second.predicted_m,
-        correlation=_correlation(left / known[settled]),
+        correlation=autocorrelation(left / known[settled], min(LAGS, len(left) - 1)),
     )
 
 
@@ -302,14 +303,6 @@ def _ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) 
             )
         )
     return found
-
-
-def _correlation(values: Array) -> Array:
-    """Return the autocorrelation of a sequence, 1 to LAGS places on."""
-    centred = values - values.mean()
-    size = float(centred @ centred)
-    lags = range(1, min(LAGS, len(values) - 1) + 1)
-    return np.array([float(centred[lag:] @ centred[:-lag]) / size for lag in lags]) if size > 0 else np.zeros(len(lags))
 
 
 COARSE_S = tuple(round(0.04 * i, 2) for i in range(9))
@@ -395,7 +388,8 @@ def choose_dead_time(
     best_s = least()
     tried[best_s] = fit_axes(flown, axes, models, best_s, [one.parameters for one in tried[best_s]])
     curve = tuple((key, _total(tried[key]) - _total(tried[best_s])) for key in sorted(tried))
-    judged = _judged(flown, both, axes, tried[best_s])
+    models, starts = [one.model for one in tried[best_s]], [one.parameters for one in tried[best_s]]
+    judged = held_out(flown, both, axes, models, best_s, starts)
     advance()
     return ChosenPlant(curve, best_s, _range_s(curve, best_s), tried[best_s], judged)
 
@@ -455,21 +449,25 @@ def halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ..
     return tuple(blocks[::2]), tuple(blocks[1::2])
 
 
-def _judged(
+def held_out(
     flown: Sequence[Stretch],
     both: tuple[tuple[Block, ...], tuple[Block, ...]],
     axes: Sequence[int],
-    fits: Sequence[AxisFit],
+    models: Sequence[AxisModel],
+    dead_time_s: float,
+    starts: Sequence[Sequence[float] | None],
+    ahead_s: Sequence[float] = AHEAD_S,
+    close: float = CLOSE,
 ) -> HeldOutError:
+    """Errors on each half by plants that were fitted to the other; arguments beside the halves as of `fit_axes`."""
     begin = min(stretch.times_s[0] for stretch in flown)
     groups = 1 + int((max(stretch.times_s[-1] for stretch in flown) - begin) / _GROUP_S)
-    squares, counts = np.zeros((groups, len(axes), len(AHEAD_S))), np.zeros((groups, len(axes), len(AHEAD_S)))
-    models, starts = [one.model for one in fits], [one.parameters for one in fits]
+    squares, counts = (np.zeros((groups, len(axes), len(ahead_s))) for _ in range(2))
     for half, other in (both, both[::-1]):
         counting = [replace(stretch, counted=_within(half, stretch.times_s)) for stretch in flown]
-        for i, fit in enumerate(fit_axes(counting, axes, models, fits[0].dead_time_s, starts)):
-            for j, one in enumerate(predict_ahead(flown, axes[i], fit)):
-                held_out = _within(other, one.times_s, AHEAD_S[j])
+        for i, fit in enumerate(fit_axes(counting, axes, models, dead_time_s, starts, close)):
+            for j, one in enumerate(predict_ahead(flown, axes[i], fit, ahead_s)):
+                held_out = _within(other, one.times_s, ahead_s[j])
                 group = ((one.times_s[held_out] - begin) / _GROUP_S).astype(np.int64)
                 squares[:, i, j] += np.bincount(group, weights=one.errors_m[held_out] ** 2, minlength=groups)
                 counts[:, i, j] += np.bincount(group, minlength=groups)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
@@ -33,7 +33,7 @@ def write_page(found: Identification, seen: PositionHistory, source: str) -> str
         *(
             f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {SHOWN_S:g} s is predicted."
             for one in result.response
-            if not _is_told(one.axis, result.warnings)
+            if not any(warning.startswith(f"{one.axis}: only ") for warning in result.warnings)  # which says it already
         ),
         *_ramps(result),
         *(f"{warning}." for warning in result.warnings),
@@ -47,11 +47,6 @@ def _ramps(result: Identified) -> Iterator[str]:
             "The autopilot ramps setpoints by its jerk limit. The fit knows that, the plant of a controller does not: "
             f"{1e3 * result.ramp_s:.1f} ms, half of the ramp of one setpoint, are in the configured dead time."
         )
-
-
-def _is_told(axis: str, warnings: Sequence[str]) -> bool:
-    """Return whether a warning already says how little of an axis' motion is predicted."""
-    return any(warning.startswith(f"{axis}: only ") for warning in warnings)
 
 
 def _sections(found: Identification, seen: PositionHistory) -> Iterator[PageSection]:

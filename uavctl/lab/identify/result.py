@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.report.statistics import finite
 from uavctl.config import Config
 from uavctl.config.link import LONGEST_RUN
 from uavctl.errors import RecordingError
@@ -27,6 +28,7 @@ from uavctl.lab.identify.fit import (
 )
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, stretches, thinned
 from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis, ramped
+from uavctl.smpc.plant import AXES
 
 # What the link did: rate, losses and their runs, delays.
 
@@ -126,7 +128,6 @@ def _burst_statistic(missing: NDArray[np.int64]) -> float:
 # What was identified, and the configuration that it makes.
 
 
-AXES = ("north", "east", "down")
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
 _DIGITS = 4
 _JERK_AS_SHIPPED_MPS3 = 5.0
@@ -346,9 +347,9 @@ def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Pre
         input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if reference else None,
         force_drift_mps2_rts=fit.value("drift_mps2_rts") if reference else None,
         position_std_m=fit.value("noise_m"),
-        lag_std_s=_finite(errors["lag_s"]),
-        drag_std_1ps=_finite(errors["drag_1ps"]),
-        gain_std=_finite(errors.get("gain", math.inf)),
+        lag_std_s=finite(errors["lag_s"]),
+        drag_std_1ps=finite(errors["drag_1ps"]),
+        gain_std=finite(errors.get("gain", math.inf)),
         residual_std_m=prediction.residual_std_m,
         r2=prediction.r2,
     )
@@ -426,7 +427,3 @@ def _link_section(link: LinkFit) -> dict[str, object]:
 
 def _rounded(values: Iterable[float]) -> tuple[float, ...]:
     return tuple(round(value, _DIGITS) for value in values)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
+from logs.report.statistics import chi2_quantile
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
@@ -64,6 +64,9 @@ class Watched:
         return plans
 
 
+_TALLIED = ("decisions", "infeasible", "slack_used", "fallbacks")  # of a `Tally`
+
+
 @dataclass(frozen=True, eq=False)
 class Chunk:
     """Runs that were flown together, with the tally of the SMPC."""
@@ -82,7 +85,7 @@ class ChunkRunner:
 
     def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
-        self._setup = setup
+        self._setup, self.design = setup, design
         solver = LibrarySolver(design, setup.library, exact=config.solver.exact)
         self._watched = Watched(OneByOne(solver, design.target, (design.horizon, design.plant.n_u)), design)
         self._smpc = BatchSmpc(
@@ -96,11 +99,8 @@ class ChunkRunner:
         tally = self._smpc.tally
         return Chunk(
             flown=flown,
-            decisions=int(tally.decisions.sum()),
-            infeasible=int(tally.infeasible.sum()),
-            slack_used=int(tally.slack_used.sum()),
+            **{name: int(getattr(tally, name).sum()) for name in _TALLIED},
             missed=self._watched.missed,
-            fallbacks=int(tally.fallbacks.sum()),
             largest_gap=float(tally.largest_gap.max(initial=0.0)),
         )
 
@@ -227,11 +227,7 @@ def total(chunk: Chunk, design: Design) -> Totals:
         runs_outside=int(flown.state_violated.any(axis=1).sum()),
         runs_asking=int(flown.input_violated.any(axis=1).sum()),
         failed=int(flown.failed.sum()),
-        decisions=chunk.decisions,
-        infeasible=chunk.infeasible,
-        slack_used=chunk.slack_used,
-        missed=chunk.missed,
-        fallbacks=chunk.fallbacks,
+        **{name: getattr(chunk, name) for name in (*_TALLIED, "missed", "largest_gap")},
         outside=flown.state_violated.sum(axis=0),
         asking=flown.input_violated.sum(axis=0),
         ages=ages,
@@ -241,7 +237,6 @@ def total(chunk: Chunk, design: Design) -> Totals:
         settled=len(settled),
         settled_sum=settled.sum(axis=0),
         settled_squares=settled.T @ settled,
-        largest_gap=chunk.largest_gap,
         closest=(flown.states[:, 1:] @ design.state_set.c.T - design.state_set.b).reshape(runs * steps, -1).max(axis=0),
     )
 
@@ -253,7 +248,7 @@ def together(parts: list[Totals]) -> Totals:
 
 def ellipsoid_scale(design: Design) -> float:
     """Return the factor of Σ in the 95 % ellipsoid of a single state: the χ² quantile with n_x degrees of freedom."""
-    return float(2.0 * gammaincinv(0.5 * design.plant.n_x, LIKELIHOOD))
+    return chi2_quantile(LIKELIHOOD, design.plant.n_x)
 
 
 def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
@@ -327,8 +322,7 @@ def _flier(
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
     """Yield a function that maps tasks to their results, in order."""
     if runs <= HERE_UP_TO:
-        crew = RunnerOfDesign(setups)
-        yield lambda tasks: map(crew.fly, tasks)
+        yield lambda tasks: map(partial(_flown, [ChunkRunner(setup) for setup in setups]), tasks)
         return
     with processes(workers) as pool, TemporaryDirectory() as folder:
         # Not with each task: designs and libraries are larger than what a pipe holds.
@@ -340,25 +334,19 @@ def _flier(
             raise UavctlError("a worker process ended before its runs; take fewer --workers, or free memory") from error
 
 
-class RunnerOfDesign:
-    """Runners by design, each made once."""
-
-    def __init__(self, setups: Sequence[Setup]) -> None:
-        self._designs = [setup.design for setup in setups]
-        self._pilots = [ChunkRunner(setup) for setup in setups]
-
-    def fly(self, task: ChunkTask) -> Flights:
-        """Fly the runs of one task; those of the first one are kept for the figures."""
-        chunk = self._pilots[task.which].fly(task.seed, task.first, task.runs, task.steps)
-        kept = 0 if task.first else DRAWN
-        return Flights(total(chunk, self._designs[task.which]), chunk.flown.states[:kept].copy())
-
-
 @cache
-def _crew(path: Path) -> RunnerOfDesign:
-    """Return the runners of a worker process, made for its first task."""
-    return RunnerOfDesign(pickle.loads(path.read_bytes()))
+def _crew(path: Path) -> list[ChunkRunner]:
+    """One runner a design, of a worker process; made for its first task."""
+    return [ChunkRunner(setup) for setup in pickle.loads(path.read_bytes())]
 
 
 def _fly(path: Path, task: ChunkTask) -> Flights:
-    return _crew(path).fly(task)
+    return _flown(_crew(path), task)
+
+
+def _flown(crew: Sequence[ChunkRunner], task: ChunkTask) -> Flights:
+    """The runs of one task; those of the first one are kept for the figures."""
+    runner = crew[task.which]
+    chunk = runner.fly(task.seed, task.first, task.runs, task.steps)
+    kept = 0 if task.first else DRAWN
+    return Flights(total(chunk, runner.design), chunk.flown.states[:kept].copy())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.errors import UsageError
-from uavctl.lab.identify.fit import ROUGH, AxisFit, Block, fit_axes, halves, predict_ahead, standard_errors
+from uavctl.lab.identify.fit import AHEAD_S, ROUGH, AxisFit, fit_axes, halves, held_out, standard_errors
 from uavctl.lab.identify.history import Stretch
 from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, Free, LinearMotion
-from uavctl.lab.identify.result import AXES, AxisResponse, Identification, LinkFit
+from uavctl.lab.identify.result import AxisResponse, Identification, LinkFit
+from uavctl.smpc.plant import AXES
 
 # How a vehicle answers by one configuration and by another, and which of the two tells a flight better.
 #
@@ -31,8 +32,6 @@ from uavctl.lab.identify.result import AXES, AxisResponse, Identification, LinkF
 
 
 Array = NDArray[np.float64]
-
-AHEAD_S = (0.25, 0.5, 1.0, 2.0)
 
 
 class PredictionErrors(msgspec.Struct, frozen=True, kw_only=True):
@@ -126,24 +125,9 @@ def held_out_errors(
         dead_time_s: Dead time as fitted [s].
         dt_s: One step [s].
     """
-    times, both = (dt_s, *AHEAD_S), halves(flown)
-    squares, counts = np.zeros((len(axes), len(times))), np.zeros((len(axes), len(times)))
-    for half, other in (both, both[::-1]):
-        counting = [replace(stretch, counted=_within(half, stretch.times_s)) for stretch in flown]
-        fits = fit_axes(counting, places, models, dead_time_s, [None] * len(models), ROUGH)
-        for row, (place, fit) in enumerate(zip(places, fits, strict=True)):
-            for column, ahead in enumerate(predict_ahead(flown, place, fit, times)):
-                wrong = ahead.errors_m[_within(other, ahead.times_s, times[column])]
-                squares[row, column] += float(np.sum(wrong**2))
-                counts[row, column] += len(wrong)
-    rms = np.sqrt(squares / np.maximum(counts, 1.0))
-    return PredictionErrors(axes=tuple(axes), ahead_s=times, rms_m=tuple(map(tuple, rms.tolist())))
-
-
-def _within(blocks: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
-    """Return whether one of some blocks contains both each time and the time so much later."""
-    held = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in blocks]
-    return np.asarray(np.logical_or.reduce(held), dtype=np.bool_)
+    times = (dt_s, *AHEAD_S)
+    found = held_out(flown, halves(flown), places, models, dead_time_s, [None] * len(models), times, ROUGH)
+    return PredictionErrors(axes=tuple(axes), ahead_s=times, rms_m=tuple(map(tuple, found.rms_m.tolist())))
 
 
 LEAST_R2 = 0.5  # of the motion of the next second; below, nothing of an axis is taken over
@@ -167,11 +151,11 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     """One value of the configuration beside what the flight shows."""
 
     key: str
-    axis: str  # empty where it is of all
-    unit: str
+    axis: str = ""  # empty where it is of all
+    unit: str = ""
     old: float
-    flight: float | None  # what the flight says; None where it says nothing
-    std: float | None  # standard error of that
+    flight: float | None = None  # what the flight says; None where it says nothing
+    std: float | None = None  # standard error of that
     new: float  # what is written
     reason: str  # why it is changed, or kept
 
@@ -244,7 +228,6 @@ def tuned(config: Config, found: Identification) -> Tuned:
         dead_s, dead_why, new_errors = config.plant.dead_time_s, _NO_BETTER, old_errors
     dead = Change(
         key="plant.dead_time_s",
-        axis="",
         unit="s",
         old=config.plant.dead_time_s,
         flight=round(found.fits[0].dead_time_s + ramp_s, _DIGITS),
@@ -359,17 +342,14 @@ def _links(config: Config, link: LinkFit) -> Iterator[Change]:
     sure = link.loss - CERTAIN * link.loss_std
     old = config.link.loss
     if config.link.model == "bernoulli" and not config.link.probability:
+        why = _TOLD if sure > old else "kept: the flight lost no more; a day that is worse has to be reckoned with"
         yield Change(
             key="link.loss",
-            axis="",
-            unit="",
             old=old,
             flight=round(link.loss, _DIGITS),
             std=link.loss_std,
             new=round(link.loss, _DIGITS) if sure > old else old,
-            reason=_TOLD
-            if sure > old
-            else "kept: the flight lost no more; a day that is worse has to be reckoned with",
+            reason=why,
         )
     latest_s = link.delay_s + link.jitter_s
     believed_s = config.link.delay_s + config.link.jitter_s
@@ -381,11 +361,9 @@ def _links(config: Config, link: LinkFit) -> Iterator[Change]:
             why = f"kept: over {STALL_S:g} s late is no link's; a computer or the cameras stood still: see to that"
         yield Change(
             key="link.jitter_s",
-            axis="",
             unit="s",
             old=config.link.jitter_s,
             flight=flight_s,
-            std=None,
             new=flight_s if later and not stalled else config.link.jitter_s,
             reason=why,
         )
@@ -406,30 +384,12 @@ def _weights(config: Config, errors: PredictionErrors) -> Iterator[Change]:
             why = "kept: inputs are as quick already"
         else:
             why = f"kept: the next {QUICK_AHEAD_S:g} s are told to {1e3 * wrong_m:.0f} mm only"
-        yield Change(
-            key="cost.input",
-            axis=name,
-            unit="",
-            old=old,
-            flight=None,
-            std=None,
-            new=quick if lower else old,
-            reason=why,
-        )
+        yield Change(key="cost.input", axis=name, old=old, new=quick if lower else old, reason=why)
 
 
 def _raised(key: str, axis: str, unit: str, old: float, flight: float) -> Change:
-    larger = flight > old
-    return Change(
-        key=key,
-        axis=axis,
-        unit=unit,
-        old=old,
-        flight=flight,
-        std=None,
-        new=flight if larger else old,
-        reason=_TOLD if larger else "kept: the flight was calmer; another day is not",
-    )
+    why = _TOLD if flight > old else "kept: the flight was calmer; another day is not"
+    return Change(key=key, axis=axis, unit=unit, old=old, flight=flight, new=max(old, flight), reason=why)
 
 
 def _name(row: Change) -> str:

@@ -21,8 +21,8 @@ from uavctl.errors import UsageError
 from uavctl.lab.trial import room_of
 from uavctl.records import Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.plant import AXES
 
-AXES = ("north", "east", "down")
 DOWN = 2
 RESERVE_M = 0.15  # between the fence's reserve and a waypoint: gusts, and what the model does not know yet
 LEAST_WAY_M = (0.6, 0.6, 0.4)  # between two waypoints; on a shorter one an axis hardly gets to move

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from logs.recording.flight import FlightData
+from logs.recording.summary import position_error_m
 from logs.report.page import Mark, PageSection, grid, page, table
 from logs.report.plots import DASHED, DOTTED
 from logs.report.svg import Drawing, canvas, colour
 from uavctl.lab.tune.change import Change, PredictionErrors, TunedResult
-from uavctl.lab.tune.excitation import AXES, SafeBox
+from uavctl.lab.tune.excitation import SafeBox
 from uavctl.lab.tune.run_folder import PLANNED_AHEAD_S, TuneComparison, TuneProgress, holding
+from uavctl.smpc.plant import AXES
 
 # A tuning run in words and rows, as terminal and page show them.
 
@@ -155,7 +155,7 @@ def _held(before: FlightData, after: FlightData) -> Drawing:
             held, steps = holding(flight), flight.steps
             if not held.any():
                 continue
-            off = np.linalg.norm((steps.state - steps.target)[:, list(flight.design.position_index)], axis=1)[held]
+            off = position_error_m(flight)[held]
             ax.plot(steps.t_s[held] - steps.t_s[held][0], 100.0 * off, color=colour(role))
         ax.set_ylim(bottom=0.0)
     return Drawing("held", drawn.svg, "distance from the last place over the time of holding, of both flights")

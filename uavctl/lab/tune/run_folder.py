@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
 from logs.recording.outputs import write_whole
+from logs.recording.summary import position_error_m
 from uavctl.config import Config
-from uavctl.config.load import dump_config, parse
+from uavctl.config.load import dotted, dump_config, parse
 from uavctl.errors import UsageError
+from uavctl.lab.trial import beyond_m, rms_m
 from uavctl.lab.tune.change import PredictionErrors, TunedResult
 from uavctl.lab.tune.excitation import SETTLES_S, SafeBox
 from uavctl.records import ControlMode
+from uavctl.smpc.plant import AXES
 
 # Two flights of the same mission, before and after: how well the place was held, and how well plans came true.
 
@@ -69,7 +72,7 @@ def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox 
     """
     steps = flight.steps
     held = holding(flight)
-    distances = np.linalg.norm((steps.state - steps.target)[:, list(flight.design.position_index)], axis=1)[held]
+    distances = position_error_m(flight)[held]
     hold_s = float(np.count_nonzero(held)) * flight.design.dt_s
     enough = hold_s >= LEAST_HOLD_S
     planned = plan_errors_m(flight)
@@ -78,9 +81,9 @@ def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox 
         judged_by="truth" if steps.from_truth else "estimate",
         flown_s=round(len(steps) * flight.design.dt_s, 6),
         hold_s=round(hold_s, 6),
-        hold_rms_m=_rms(distances) if enough else None,
+        hold_rms_m=rms_m(distances) if enough else None,
         hold_max_m=float(distances.max()) if enough else None,
-        plan_rms_m=_rms(planned) if len(planned) else None,
+        plan_rms_m=rms_m(planned) if len(planned) else None,
         beyond_box_m=None if box is None else _beyond(flight, box),
         fallbacks=fallbacks,
     )
@@ -138,13 +141,8 @@ def _beyond(flight: FlightData, box: SafeBox) -> float | None:
     if not tracked:
         return None
     positions = steps.state[tracked][:, list(flight.design.position_index)]
-    axes = [("north", "east", "down").index(axis) for axis in flight.design.axes]
-    lower, upper = np.array(box.lower)[axes], np.array(box.upper)[axes]
-    return float(np.maximum(lower - positions, positions - upper).max())
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    axes = [AXES.index(axis) for axis in flight.design.axes]
+    return float(beyond_m(positions, np.array(box.lower)[axes], np.array(box.upper)[axes]).max())
 
 
 STATE, SETTINGS, TUNED, PAGE, FIT_PAGE = "tune.json", "configuration.toml", "tuned.toml", "tune.html", "identified.html"
@@ -283,8 +281,8 @@ def read_tuned(path: Path) -> Config:
     """
     text = path.read_text(encoding="utf-8")
     config = parse(text, str(path)).config
-    there = dict(_dotted(tomllib.loads(text), ""))
-    lacking = [key for key, _ in _dotted(tomllib.loads(dump_config(config)), "") if key not in there]
+    there = dict(dotted(tomllib.loads(text)))
+    lacking = [key for key, _ in dotted(tomllib.loads(dump_config(config))) if key not in there]
     if lacking:
         more = f" and {len(lacking) - 1} more keys" if len(lacking) > 1 else ""
         raise UsageError(
@@ -304,23 +302,15 @@ def _read(path: Path) -> TuneProgress:
 def _differences(settings: Path, text: str) -> Iterator[str]:
     """Return the first keys in which two configurations differ, with both values."""
     try:
-        old = dict(_dotted(tomllib.loads(settings.read_text(encoding="utf-8")), ""))
+        old = dict(dotted(tomllib.loads(settings.read_text(encoding="utf-8"))))
     except (OSError, tomllib.TOMLDecodeError):
         return
-    new = dict(_dotted(tomllib.loads(text), ""))
+    new = dict(dotted(tomllib.loads(text)))
     keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
     for key in keys[:_MOST_TOLD]:
         yield f"{key} = {old.get(key)} there, {new.get(key)} here"
     if len(keys) > _MOST_TOLD:
         yield f"{len(keys) - _MOST_TOLD} more"
-
-
-def _dotted(table: Mapping[str, object], path: str) -> Iterator[tuple[str, object]]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _dotted(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
 
 
 def _asked_otherwise(there: TuneAsked, here: TuneAsked) -> Iterator[str]:

@@ -24,6 +24,7 @@ from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
+from uavctl.lab.trial import vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
@@ -545,7 +546,7 @@ def _lost(before: Capture, after: Capture, usual_us: float, path: _Path, noise: 
         where, how_fast = path.at(at_ns)
         by_m = where + noise() - before.seen.position_m
         by_mps = how_fast - path.at(before.at_ns)[1]
-        found.append(Capture(at_ns, before.seen, _vec3(by_m), _vec3(by_mps), stamp_us))
+        found.append(Capture(at_ns, before.seen, vec3(by_m), vec3(by_mps), stamp_us))
     return found
 
 
@@ -582,7 +583,3 @@ def _stamp(capture: Capture) -> int:
 def _number(capture: Capture) -> int:
     """Return the offset of the sequence number in the head of a frame."""
     return 4 if capture.seen.frame.data[0] == 0xFD else 2
-
-
-def _vec3(values: Array) -> Vec3:
-    return float(values[0]), float(values[1]), float(values[2])

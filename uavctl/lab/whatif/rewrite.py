@@ -52,7 +52,8 @@ class SourceFrames:
         """Return the position that a frame holds, if any."""
         for message in decode(frame.data).messages:
             if isinstance(message, Position):
-                return PositionFrame(frame, message, self._to_ned(message))
+                where = message.position_m
+                return PositionFrame(frame, message, where if message.local_ned else self._frame(message).to_ned(where))
         return None
 
     def moved(self, seen: PositionFrame, by_m: Vec3, by_mps: Vec3, *, stamp_us: int | None = None) -> bytes:
@@ -76,9 +77,6 @@ class SourceFrames:
         if stamp_us is not None:
             _stamp(message, stamp_us)
         return packed(message, seen.frame)
-
-    def _to_ned(self, position: Position) -> Vec3:
-        return position.position_m if position.local_ned else self._frame(position).to_ned(position.position_m)
 
     def _from_ned(self, position: Position, vector: Vec3) -> Vec3:
         return vector if position.local_ned else self._frame(position).velocity_from_ned(vector)
