@@ -10,7 +10,7 @@ from rich.console import Console
 from uavctl.build import library as library_store
 from uavctl.build.controller import build_design
 from uavctl.build.library import Advance, StoredLibrary, library_for
-from uavctl.cli import prepare
+from uavctl.cli import common, prepare
 from uavctl.config import load_config
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
@@ -58,7 +58,8 @@ def test_a_terminal_shows_component_and_gap(
     design: Design, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     terminal = Console(force_terminal=True, width=150, record=True, stderr=True)
-    monkeypatch.setattr(prepare, "messages", lambda: terminal)
+    for module in (common, prepare):
+        monkeypatch.setattr(module, "messages", lambda: terminal)
     _ready(design)
     shown = capsys.readouterr().err
     assert "component 1, 40 policies, worst gap 2e-05" in shown

@@ -49,6 +49,7 @@ def test_a_flight_of_200_steps_replays_identically() -> None:
     assert result.decisions == 2000
 
 
+@pytest.mark.slow
 def test_paper_costs_what_the_paper_s_example_costs() -> None:
     # 60 runs of 50 steps: 56.2e3 on average (theory, section 7). Twenty runs scatter by a few percent.
     flights = [paper_flight(seed)[1] for seed in range(20)]

@@ -119,6 +119,7 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
     assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in lock_paths(url))
 
 
+@pytest.mark.slow
 def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]

@@ -172,6 +172,7 @@ def test_ardupilot_dead_reckons_worse_by_what_its_message_keeps(
     assert most < 0.7
 
 
+@pytest.mark.slow
 @BOTH
 def test_the_attitude_told_in_flight_errs_by_a_third_of_a_degree(name: str, request: pytest.FixtureRequest) -> None:
     records: list[InertialRecord] = request.getfixturevalue(name)

@@ -82,6 +82,7 @@ def test_one_run_has_all_figures(result: BenchResult) -> None:
     assert json.loads(msgspec.json.encode(result)) == json.loads(json.dumps(found, allow_nan=False))
 
 
+@pytest.mark.slow
 def test_ratios_are_of_the_medians_shown(result: BenchResult) -> None:
     library_ms = result.library_us.p50 / 1e3
     assert result.ratio_printed_library == pytest.approx(result.printed_ms / library_ms)

@@ -68,6 +68,7 @@ def test_the_document_has_every_figure_and_both_designs(found: dict[str, Any]) -
         assert ElementTree.parse(name).getroot().tag.endswith("svg")
 
 
+@pytest.mark.slow
 def test_both_designs_meet_the_same_losses(found: dict[str, Any]) -> None:
     four, three = found["variants"]
     assert four["age_distribution"] == three["age_distribution"]

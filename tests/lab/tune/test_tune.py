@@ -210,6 +210,7 @@ def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, F
     assert told.new_errors.overall_m == pytest.approx(told.old_errors.overall_m, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, FlightData, Identification]) -> None:
     _, flown, _ = flight
     figures = figures_of(flown, "flight", 0, BOX)

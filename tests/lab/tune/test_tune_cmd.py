@@ -57,6 +57,7 @@ def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
     assert new[0][3] < 0.7 * old[0][3] and new[1][3] < 0.7 * old[1][3]
 
 
+@pytest.mark.slow
 def test_all_files_of_a_recording_are_read(done: Path) -> None:
     first = done / BEFORE / "flight.mcap"
     assert len(segment_files(first)) > 1

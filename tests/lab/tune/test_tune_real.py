@@ -101,6 +101,7 @@ def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder:
     assert not not_agreed.rig.peers.autopilot.pilot.armed
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
     stamp = (folder / STATE).read_bytes()
     again = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
@@ -150,6 +151,7 @@ def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
         tune_flight.where_it_stands(config)
 
 
+@pytest.mark.slow
 def test_the_state_is_that_of_the_document(done: Tuned, folder: Path) -> None:
     state = json.loads((folder / STATE).read_text())
     assert all(done.document[key] == value for key, value in state.items())

@@ -74,6 +74,7 @@ def test_mcap_decodes_every_message_of_every_topic(
         assert all(earlier[1] <= later[1] for earlier, later in pairwise(messages))
 
 
+@pytest.mark.slow
 def test_our_own_records_are_there_and_json(recording: Path) -> None:
     with recording.open("rb") as file:
         kinds: dict[str, set[str]] = defaultdict(set)

@@ -70,6 +70,7 @@ def test_the_printed_form_of_an_axis_that_nothing_disturbs() -> None:
     )
 
 
+@pytest.mark.slow
 def test_shapes_cover_what_they_are_to_cover() -> None:
     plants = {shape.name: case(shape.name).design for shape in SHAPES if shape.horizon <= 20}
     assert any(design.plant.n_w > design.plant.n_x for design in plants.values())

@@ -70,6 +70,7 @@ def test_the_certificate_is_never_wrong(name: str) -> None:
     assert set(methods) == {"frozen", "mixture", "exact"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_library_alone_is_certified_too_or_says_that_it_is_not(name: str) -> None:
     one = case(name)
