@@ -198,13 +198,12 @@ in `RETURNING`.
   has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
   `ctl engage` comes first. A flight that the pilot began is released.
 * `unsafe`: on the way up the positions cannot be the vehicle's own (they jump, or contradict what it feels or its own
-  velocity), or are beyond the limits of `[sets]` by more than
-  `envelope.outside_m`, or none has come for a horizon. The climb is broken off and the vehicle asked to land; positions
-  that cannot be its own are not relayed any more.
-* Landing: once the vehicle has shown that it lands, or has answered ACCEPTED, another mode is the pilot's. While it
-  still shows the mode of before, landing is asked for again: nobody can tell a pilot who takes back the very same mode
-  within a second from a vehicle that has not begun to land. What we took off is asked to land as long as it is heard
-  in the air, up to ten times `land_s`; that `land_s` is over is told.
+  velocity), or are beyond the limits of `[sets]` by more than `envelope.outside_m`, or none has come for a horizon. The
+  climb is broken off and the vehicle asked to land. Positions further off what it feels than noise explains are not
+  relayed, nor any until for 3 s none has been: a vehicle that lands needs them once they are right again.
+* Landing: once the vehicle has shown that it lands, another mode is the pilot's. So it is once landing was granted: at
+  once, or after 2 s where it is the mode of before, which a slow vehicle may still be in. What we took off is asked
+  to land as long as it is heard in the air, up to ten times `land_s`; that `land_s` is over is told.
 * PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
   (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
 * What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that

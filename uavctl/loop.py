@@ -59,6 +59,7 @@ SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
+MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
@@ -111,7 +112,8 @@ class ControlLoop:
         self._motion: VehicleMotion | None = None
         self._decision: Decision | None = None
         self._orders: deque[Command] = deque()
-        self._misled = False  # positions jumped under a vehicle on its way up or down: none is passed on any more
+        # The last time at which positions could not be those of the vehicle on its way up or down; None before.
+        self._misled_ns: int | None = None
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
         self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands = config.fallback.land or config.relay.enabled
@@ -238,9 +240,13 @@ class ControlLoop:
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
         autopilot = "" if self._vehicle is None else self._vehicle.autopilot
         # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
-        self._misled = self._misled or (out.astray and self._hand_over.has_begun)
-        if self._relays and not self._misled and not disbelieves(self._state):
-            for data in self._links[VEHICLE].relay(self._relay, at_ns, autopilot, refused=out.refused):
+        if out.astray and self._hand_over.has_begun:
+            self._misled_ns = at_ns
+        misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
+        if self._relays and not misled and not disbelieves(self._state):
+            for data in self._links[VEHICLE].relay(
+                self._relay, at_ns, autopilot, refused=inp.samples if out.leaps else out.refused
+            ):
                 send(self._outgoing(VEHICLE, data, at_ns))
         answers: tuple[tuple[Command, Event], ...] = ()
         if self._adrift:
@@ -274,7 +280,7 @@ class ControlLoop:
         """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
         if not self.course.died:
             try:
-                self._state, out = step(self._state, inp, self._controller)
+                self._state, out = step(self._state, inp, self._controller, carried=self._hand_over.has_begun)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
                 notices.append(self._die(error, inp.at_ns))
                 return self._without_core(inp, land=self._lands or self._hand_over.ours)

@@ -259,7 +259,7 @@ class FlightCourse:
     def _disarm(self, one: Passage) -> None:
         if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
             self._find(Cause.DISARMED if self._aloft else Cause.NOT_RISEN, "")
-        elif one.before is HandoverState.RELEASED and self._found is Cause.PILOT:
+        elif one.before is HandoverState.RELEASED and self._found is Cause.PILOT and self._aloft:
             self._found, self._why = Cause.PILOT_LANDED, ""
         elif one.before in (HandoverState.FAILSAFE, HandoverState.RELEASED) and self._found is Cause.FAILSAFE:
             self._found = Cause.FAILSAFE_LANDED
@@ -313,9 +313,8 @@ class FlightCourse:
             return ""
         mode = f"in mode {vehicle.mode}"
         if not vehicle.armed:
-            down = (
-                "it is disarmed" if self._found in (Cause.DISARMED, Cause.NOT_RISEN) else "it has landed and disarmed"
-            )
+            flew = self._aloft and self._found is not Cause.DISARMED
+            down = "it has landed and disarmed" if flew else "it is disarmed"
             return down if self._armed else "it was not armed"
         heard = ""
         if silent(self._now_ns, vehicle):

@@ -56,6 +56,22 @@ def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
 
 @pytest.mark.slow
 @pytest.mark.fault(66)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for_that(autopilot: str) -> None:
+    """Without positions from then on PX4, its velocity led astray, rose for minutes and went 1.4 km."""
+    begin_s = climbs_at_s(autopilot) + 4.2
+    flight = Flight(
+        autopilot,
+        *RELAYED,
+        f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 0.2:.2f}]]",
+        "sim.camera.other_body_m=[0.0,0.0,0.0]",
+    ).relayed()
+    side_m, height_m = furthest(flight)
+    assert side_m < SIDE_M and height_m < CEILING_M
+
+
+@pytest.mark.slow
+@pytest.mark.fault(66)
 @CASES
 @pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
 def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_s: float, silence: str) -> None:

@@ -138,6 +138,7 @@ class StepOutput(msgspec.Struct, frozen=True):
     link: LinkEstimate | None = None  # link estimate; at boundaries that were not missed
     unsafe: str = ""  # why a vehicle in the air that others fly must not climb on by its positions; empty if it may
     astray: bool = False  # that is because positions cannot be its own
+    leaps: bool = False  # the newest position is further off what it feels than noise explains
 
 
 def initial_state() -> ControlState:
@@ -154,11 +155,15 @@ def disbelieves(state: ControlState) -> bool:
     return state.breach.code in OF_POSITIONS or not state.watching.answered
 
 
-def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[ControlState, StepOutput]:
+def step(
+    state: ControlState, inp: StepInput, controller: Controller, *, carried: bool = False
+) -> tuple[ControlState, StepOutput]:
     """Run one control tick.
 
     Args:
         inp: All that this tick may know; its number is greater than the last one's.
+        carried: Whether the vehicle is on its way up or down at our request: positions that jump are refused until
+            they are back. On a flight of others they are where the estimate begins anew.
 
     Returns:
         The state for the next tick, and what to send and record.
@@ -170,7 +175,9 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     before = mode_of(state)
     vehicle = inp.vehicle
     armed = vehicle is not None and vehicle.armed
-    lost = intake.moved and before in _NOT_FLOWN
+    not_flown = before in _NOT_FLOWN
+    jumped = intake.moved and not_flown and carried
+    lost = intake.moved and not_flown and not jumped
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
     if inp.inertial:
@@ -185,8 +192,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     if before is ControlMode.WAIT and intake.absurd and _is_ours(inp.vehicle) and controller.envelope is not None:
         breach = ABSURD  # nothing will be flown on them, and whoever waits in the air lands
     clean_ns = intake.clean_ns
-    moved = intake.moved or (intake.absurd and before not in _NOT_FLOWN)
-    if breach is not None or (moved and not lost):
+    moved = (intake.moved or intake.absurd) and not not_flown
+    if breach is not None or moved:
         clean_ns = min(clean_ns or inp.at_ns, watching.clean_ns or inp.at_ns)
         intake = _cleaned(intake, clean_ns, controller)
         tick = place(state, inp, intake.history, controller)
@@ -223,14 +230,20 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
     aloft, felt, strange, unsafe = NOT_WATCHING, state.felt, None, ""
-    if armed and lost:
-        unsafe = "positions have jumped further than the vehicle can have come"
-    elif armed and before in _NOT_FLOWN:
+    if not_flown and (armed or carried):
         aloft, felt, strange = _aloft(state, tick, intake, inp, controller)
-        if strange is not None:
+        if jumped:
+            unsafe = "positions have jumped further than the vehicle can have come"
+        elif strange is not None:
             unsafe = strange.text
-        elif vehicle is not None and not vehicle.landed:
+        elif armed and vehicle is not None and not vehicle.landed:
             unsafe = _unsafe(tick, inp, controller)
+    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,)
+    if strange is not None and carried:
+        clean_ns = aloft.clean_ns or inp.at_ns
+        history = without(controller.kalman, history, lambda sample: captured_ns(sample) > clean_ns)
+        aloft = NOT_WATCHING
+    astray = jumped or strange is not None
     inertial = _inertial(state, tick, inp, controller)
     bias = _flown_against(state, tick, inp)
     at_bounds = at_bound(bias, controller.kalman.bias_bounds, state.at_bounds) if bias else state.at_bounds
@@ -244,6 +257,7 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         coming=coming,
         aloft=aloft,
         felt=felt,
+        strayed=not_flown and (armed or carried) and (state.strayed or astray),
         accel_mps2=ZERO if setpoint is None else setpoint.accel_mps2,
     )
     plan, mission = choice.state.plan, choice.state.mission
@@ -288,7 +302,8 @@ def step(state: ControlState, inp: StepInput, controller: Controller) -> tuple[C
         link=link,
         land=mode is ControlMode.LAND and before is not ControlMode.LAND,
         unsafe=unsafe,
-        astray=(armed and lost) or strange is not None,
+        astray=astray,
+        leaps=leaps,
     )
 
 
@@ -306,7 +321,8 @@ def _aloft(
     known = inp.at_ns - felt_ns <= MOTION_NS
     seen = seen_of(tick, inp, feels if known else ZERO, controller.plant, intake.accepted)
     watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
-    counts = breach is not None and (known or breach.code == VELOCITY)
+    # Once positions were wrong its own velocity may be, too: they are all that its estimate has.
+    counts = breach is not None and (not state.strayed if breach.code == VELOCITY else known)
     return watching, (feels, felt_ns), breach if counts else None
 
 

@@ -23,6 +23,7 @@ GRACE_NS = 300_000_000
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
 SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
 MUST_LAND = 10  # times `land_s` for which landing is asked for: as long as a battery lasts
+NONE = 0.1  # share below which there was no climb yet
 LOW = 0.3  # share of the take-off height below which a climb that has ended was none
 LEAVING = frozenset({HandoverState.MODE, HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
 _UNDER_WAY = LEAVING | {
@@ -41,6 +42,7 @@ _ARMED = (
 )
 _OR_ENGAGE = ", and ask for that with `uavctl ctl engage`"
 BROKEN_OFF = "the climb is broken off: "
+_OR_PILOT = "it is slow, or the pilot has taken it back"
 _DISARMED = "the vehicle has disarmed itself"
 _LEFT = "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
 
@@ -165,7 +167,7 @@ def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
     taken = (
         state is HandoverState.FAILSAFE and there.seen is HandoverEvent.OTHER
     )  # time is up, but the pilot has it: nothing is asked
-    if there.seen is HandoverEvent.GRANTED or taken:
+    if there.seen in (HandoverEvent.GRANTED, HandoverEvent.REFUSED) or taken:
         return there
     why = _given_up(progress, view)
     return GuardResult(HandoverEvent.REFUSED, why) if why else there
@@ -255,21 +257,24 @@ def _has_started_since(progress: Progress, view: HandoverView) -> bool:
     return view.up_s / SLOWEST + LATEST_S < (view.at_ns - progress.flown_ns) / 1e9
 
 
-def _for_mode(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+def _for_mode(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     profile = profile_of(vehicle)
     if vehicle.armed:
         return GuardResult(HandoverEvent.OTHER)
     if vehicle.alone and vehicle.mode == profile.take_off:
         return GuardResult(HandoverEvent.GRANTED)
     # A mode that nobody here asked for is the pilot's; the one of before may be that of a vehicle that is slow.
-    taken = vehicle.alone and vehicle.mode not in (profile.take_off, progress.left_mode)
-    return GuardResult(HandoverEvent.OTHER if taken else HandoverEvent.PENDING)
+    if vehicle.alone and vehicle.mode not in (profile.take_off, progress.left_mode):
+        return GuardResult(HandoverEvent.OTHER)
+    if _shows_granted(progress, vehicle, SHOWN_NS):
+        return GuardResult(HandoverEvent.REFUSED, f"{progress.request.given_up(view.at_ns, at_once=True)}; {_OR_PILOT}")
+    return GuardResult(HandoverEvent.PENDING)
 
 
-def _shows_granted(progress: Progress, vehicle: VehicleStatus) -> bool:
+def _shows_granted(progress: Progress, vehicle: VehicleStatus, after_ns: int = GRACE_NS) -> bool:
     """Whether the last heartbeat is from after the request was granted, and so shows what became of it."""
     granted_ns = progress.request.granted_ns
-    return granted_ns is not None and vehicle.at_ns > granted_ns + GRACE_NS
+    return granted_ns is not None and vehicle.at_ns > granted_ns + after_ns
 
 
 def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
@@ -288,6 +293,8 @@ def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) ->
     profile = profile_of(vehicle)
     if vehicle.mode not in profile.climbing:
         return GuardResult(HandoverEvent.FAILSAFE if fails(vehicle) else HandoverEvent.OTHER)
+    if vehicle.mode != profile.take_off and vehicle.landed and _climbed(progress, view, 0.0) < NONE:
+        return GuardResult(HandoverEvent.OTHER)  # no climb has ended on the ground
     share = _climbed(progress, view, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
     ended = profile.climbs_on_arming and vehicle.mode != profile.take_off  # below the height: as high as it goes
     return GuardResult(
@@ -344,10 +351,11 @@ def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus)
         return GuardResult(HandoverEvent.PENDING)
     if asking:
         # Asked for in the middle of a climb, any mode of the climb may still be shown; after it was granted, only the
-        # one of before may, by a vehicle that has not begun to land.
+        # one of before may, for a while, by a vehicle that has not begun to land.
         passing = vehicle.external or vehicle.mode in profile.climbing
-        changed = vehicle.mode != progress.left_mode and _shows_granted(progress, vehicle)
-        return GuardResult(HandoverEvent.PENDING if passing and not changed else HandoverEvent.OTHER)
+        for_ns = SHOWN_NS if vehicle.mode == progress.left_mode else GRACE_NS
+        taken = not passing or _shows_granted(progress, vehicle, for_ns)
+        return GuardResult(HandoverEvent.OTHER if taken else HandoverEvent.PENDING)
     if ours and progress.lands_failing and profile.climbs_on_arming and vehicle.mode == profile.take_off:
         shown = vehicle.at_ns > progress.since_ns + SHOWN_NS
         return GuardResult(HandoverEvent.FAILSAFE if shown else HandoverEvent.PENDING)

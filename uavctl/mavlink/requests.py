@@ -99,9 +99,9 @@ class PendingRequest:
         self._next_ns = at_ns + self._patience.answer_ns
         return self.ask
 
-    def given_up(self, at_ns: int) -> str:
-        """Return why the request is given up; empty while it may still succeed."""
-        over = at_ns - self._begun_ns >= self._patience.limit_ns
+    def given_up(self, at_ns: int, *, at_once: bool = False) -> str:
+        """Return why the request is given up; empty while it may still succeed (`at_once`: it may not)."""
+        over = at_once or at_ns - self._begun_ns >= self._patience.limit_ns
         out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
