@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from take_off_rig import RELAYED, Flight
+from take_off_rig import GOAL, RELAYED, Flight
 
 from uavctl.mavlink.handover_states import HandoverState
 
@@ -56,18 +56,23 @@ def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
 
 @pytest.mark.slow
 @pytest.mark.fault(66)
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for_that(autopilot: str) -> None:
+@pytest.mark.parametrize(("autopilot", "after_s"), [("px4", 4.4), ("ardupilot", 3.5)])  # it has just left the ground
+def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for_that(
+    autopilot: str, after_s: float
+) -> None:
     """Without positions from then on PX4, its velocity led astray, rose for minutes and went 1.4 km."""
-    begin_s = climbs_at_s(autopilot) + 4.2
+    begin_s = climbs_at_s(autopilot) + after_s
     flight = Flight(
         autopilot,
         *RELAYED,
+        "estimator.inertial_std_mps2=0.2",
+        "estimator.inertial_bias_s=5.0",
+        "link.burst_enter=0.001",
         f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 0.2:.2f}]]",
         "sim.camera.other_body_m=[0.0,0.0,0.0]",
     ).relayed()
     side_m, height_m = furthest(flight)
-    assert side_m < SIDE_M and height_m < CEILING_M
+    assert side_m < GOAL[0] + 0.3 and height_m < CEILING_M  # one that takes no harm flies to its goal
 
 
 @pytest.mark.slow

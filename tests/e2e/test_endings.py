@@ -73,6 +73,11 @@ def deafen(kind: str) -> Callable[[Endings], None]:
     return do
 
 
+def hear(rig: Endings) -> None:
+    """From now on the vehicle hears everything again."""
+    rig.hears = lambda data: True
+
+
 # As ordered
 
 
@@ -274,14 +279,15 @@ def test_landing_fails(tmp_path: Path, typed: Type) -> None:
 @pytest.mark.slow
 @pytest.mark.fault(67)
 def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path, "hand_over.land_s=4.0", "link.uplink_blackout=[[8.0, 35.0]]")
+    rig = Endings(tmp_path, "hand_over.land_s=8.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
+    rig.at(HandoverState.LANDING, hear, after_s=12.0)
     told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
     assert "landed and disarmed" in told.ending["sentence"] and "asked on" in told.console
 
 
 @pytest.mark.slow
 def test_positions_that_jump_in_the_climb_break_it_off(tmp_path: Path, typed: Type) -> None:
-    swapped = ("sim.camera.swapped=[[4.6, 60.0]]", "sim.camera.other_body_m=[2.0, 1.5, -0.5]")
+    swapped = ("sim.camera.swapped=[[1.6, 60.0]]", "sim.camera.other_body_m=[2.0, 1.5, -0.5]")
     told = typed(Endings(tmp_path, *swapped), Cause.BROKEN_OFF, *TAKE_OFF)
     assert "jumped" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
@@ -368,7 +374,7 @@ def test_the_connection_is_closed(tmp_path: Path, typed: Type) -> None:
 def test_the_controller_fails_and_the_relay_goes_on(
     tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise ArithmeticError("the core is broken")
 
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")

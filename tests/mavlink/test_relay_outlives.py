@@ -31,10 +31,12 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """What makes the core fail from then on."""
     broken: list[bool] = []
 
-    def faulty(state: ControlState, inp: StepInput, controller: Controller) -> tuple[ControlState, StepOutput]:
+    def faulty(
+        state: ControlState, inp: StepInput, controller: Controller, *, carried: bool
+    ) -> tuple[ControlState, StepOutput]:
         if broken:
             raise ArithmeticError("the core is broken")
-        return step(state, inp, controller)
+        return step(state, inp, controller, carried=carried)
 
     monkeypatch.setattr(control, "step", faulty)
     return lambda: broken.append(True)

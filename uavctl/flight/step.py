@@ -162,8 +162,7 @@ def step(
 
     Args:
         inp: All that this tick may know; its number is greater than the last one's.
-        carried: Whether the vehicle is on its way up or down at our request: positions that jump are refused until
-            they are back. On a flight of others they are where the estimate begins anew.
+        carried: Whether the vehicle is on its way up or down at our request.
 
     Returns:
         The state for the next tick, and what to send and record.
@@ -176,8 +175,8 @@ def step(
     vehicle = inp.vehicle
     armed = vehicle is not None and vehicle.armed
     not_flown = before in _NOT_FLOWN
-    jumped = intake.moved and not_flown and carried
-    lost = intake.moved and not_flown and not jumped
+    lost = intake.moved and not_flown
+    jumped = lost and carried
     if lost:
         intake = forget(controller.kalman, intake, inp.at_ns)
     if inp.inertial:
@@ -238,7 +237,7 @@ def step(
             unsafe = strange.text
         elif armed and vehicle is not None and not vehicle.landed:
             unsafe = _unsafe(tick, inp, controller)
-    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,)
+    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,) and _feels(state, inp)
     if strange is not None and carried:
         clean_ns = aloft.clean_ns or inp.at_ns
         history = without(controller.kalman, history, lambda sample: captured_ns(sample) > clean_ns)
@@ -318,12 +317,17 @@ def _aloft(
         return NOT_WATCHING, state.felt, None
     felt = [one.accel_mps2 for one in inp.inertial if all(map(math.isfinite, one.accel_mps2))]
     feels, felt_ns = (_mean(felt), inp.at_ns) if felt else state.felt
-    known = inp.at_ns - felt_ns <= MOTION_NS
+    known = _feels(state, inp)
     seen = seen_of(tick, inp, feels if known else ZERO, controller.plant, intake.accepted)
     watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
     # Once positions were wrong its own velocity may be, too: they are all that its estimate has.
     counts = breach is not None and (not state.strayed if breach.code == VELOCITY else known)
     return watching, (feels, felt_ns), breach if counts else None
+
+
+def _feels(state: ControlState, inp: StepInput) -> bool:
+    """Whether the vehicle's inertial sensors tell how it accelerates."""
+    return bool(inp.inertial) or inp.at_ns - state.felt[1] <= MOTION_NS
 
 
 def _mean(vectors: Sequence[Vec3]) -> Vec3:
