@@ -206,3 +206,16 @@ def test_an_interruption_is_one_line(tmp_path: Path) -> None:
     rest = [line for line in lines if not line.startswith("import time:")]
     process.stderr.close()
     assert (process.wait(), rest) == (130, ["interrupted\n"])
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(["campaign", "x.toml"], "uavctl[campaign]"), (["replay", "x.mcap"], '"replay"'), (["flyy"], '"fly"')],
+)
+def test_without_the_extras_a_command_says_what_it_needs_and_a_wrong_one_is_refused(
+    words: list[str], told: str
+) -> None:
+    code = "import sys; sys.modules['pyarrow'] = None; from uavctl.cli.app import run; sys.exit(run(sys.argv[1:]))"
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 2 and done.stdout == ""
+    assert told in done.stderr and done.stderr.startswith("error:") and done.stderr.count("\n") == 1

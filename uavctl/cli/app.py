@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 
 from cyclopts import App, CycloptsError
 from rich.markup import escape
@@ -48,6 +49,7 @@ _COMMANDS = {
 }
 for _name, (_path, _help) in _COMMANDS.items():
     app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
+_EXTRAS = {"pyarrow": "campaign"}  # of a package that a command cannot do without
 app.register_install_completion_command(add_to_startup=False)
 
 
@@ -59,9 +61,17 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         imported: Called before the command runs, when its modules are there.
     """
     try:
+        _know(arguments)
         command, bound, _ = app.parse_args(list(arguments), exit_on_error=False, print_error=False)
         imported()
         result = command(*bound.args, **bound.kwargs)
+    except ImportError as error:
+        missing = error.__cause__ if error.__cause__ is not None else error
+        extra = _EXTRAS.get(getattr(missing, "name", None) or "")
+        if extra is None:
+            raise
+        text = f"{arguments[0]} needs a package that is not installed: pip install 'uavctl[{extra}]'"
+        return _refuse([text], UsageError.exit_code)
     except CycloptsError as error:
         return _refuse([str(error)], UsageError.exit_code)
     except ConfigError as error:
@@ -73,6 +83,20 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
     except OSError as error:  # a file that no command foresaw: a full disk, a name that is too long
         return _refuse([f"{error.filename or 'system'}: {error.strerror or error}"], UavctlError.exit_code)
     return result if isinstance(result, int) else 0
+
+
+def _know(arguments: Sequence[str]) -> None:
+    """Refuse a command that there is none of, before all of them are imported to find one like it.
+
+    Raises:
+        UsageError: There is none.
+    """
+    name = arguments[0] if arguments else "-"
+    if name.startswith("-") or name in app:
+        return
+    near = get_close_matches(name, _COMMANDS, 1)
+    did = f' Did you mean "{near[0]}"?' if near else f" Commands are {', '.join(_COMMANDS)}."
+    raise UsageError(f'Unknown command "{name}".{did}')
 
 
 def _refuse(problems: Sequence[str], exit_code: int) -> int:
