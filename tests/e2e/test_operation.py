@@ -27,14 +27,14 @@ from uavctl.config import load_config
 from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def _library() -> None:
     """The daemons find the policy library in the cache, so that their time limits are for flying."""
     library_for(build_design(load_config("room-hahn-stursberg")))
 
 
 @pytest.fixture
-def air() -> Iterator[Scene]:
+def air(_library: None) -> Iterator[Scene]:
     with scene() as found:
         yield found
 

@@ -45,6 +45,21 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was interrupted before its first flight; one more flight fails the test."""
+
+    def pressed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "begun"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tune_cmd, "fly_once", pressed)
+        assert run(words(folder, "--set", "log.segment_bytes=1000000")) == tune_cmd.INTERRUPTED
+    monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown"))
+    return folder
+
+
 @pytest.mark.slow
 def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
     for name in (TUNED, PAGE, FIT_PAGE, STATE):
@@ -65,6 +80,7 @@ def test_all_files_of_a_recording_are_read(done: Path) -> None:
     assert state["comparison"]["before"]["flown_s"] > 25.0
 
 
+@pytest.mark.slow
 def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(done: Path) -> None:
     flown = [parse(header(done / name / "flight.mcap").config_toml, name).config for name in (BEFORE, AFTER)]
     made = load_config(str(done / TUNED))
@@ -75,6 +91,7 @@ def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(done
     assert "plant.dead_time_s" in (done / TUNED).read_text().split("\n\n")[0]
 
 
+@pytest.mark.slow
 def test_the_page_has_its_pictures_in_words(done: Path) -> None:
     page = (done / PAGE).read_text()
     figures = re.findall(r'<figure id="([\w-]+)"', page)
@@ -82,6 +99,7 @@ def test_the_page_has_its_pictures_in_words(done: Path) -> None:
     assert page.count('aria-label="') >= len(figures)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_done_flies_no_more(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamp = (done / STATE).read_bytes()
     with short_flights():
@@ -115,8 +133,8 @@ def test_a_run_goes_on_after_the_last_step_that_is_done(
     assert (folder / PAGE).is_file()
 
 
-def test_another_configuration_is_refused_by_its_key(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = typed(capsys, *words(done))
+def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = typed(capsys, *words(begun))
     assert (code, out) == (2, "")
     assert "log.segment_bytes" in err
 
@@ -256,17 +274,19 @@ def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(don
     assert left_whole(config, tmp_path) is None
 
 
-@pytest.mark.usefixtures("no_flight")
-def test_a_tuned_configuration_that_was_cut_is_not_flown(
-    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = copy(after="")
-    lines = (folder / TUNED).read_text().splitlines(keepends=True)
+def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    errors = {"axes": [], "ahead_s": [], "rms_m": []}
+    ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
+    link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
+    noted = {"before": "before/flight.mcap", "tuned": {"changes": [], "warnings": [], **ranges, **link}}
+    state = json.loads((begun / STATE).read_text())
+    (begun / STATE).write_text(json.dumps({**state, **noted}))
+    lines = (begun / SETTINGS).read_text().splitlines(keepends=True)
     cut = "".join(lines[: len(lines) // 2])
-    (folder / TUNED).write_text(cut)
-    code, out, err = again(capsys, folder)
-    assert (code, out) == (2, "") and str(folder / TUNED) in " ".join(err.split())
-    assert (folder / TUNED).read_text() == cut and (folder / AFTER / "flight.mcap").exists()
+    (begun / TUNED).write_text(cut)
+    code, out, err = again(capsys, begun)
+    assert (code, out) == (2, "") and str(begun / TUNED) in " ".join(err.split())
+    assert (begun / TUNED).read_text() == cut and not (begun / AFTER).exists()
 
 
 @pytest.mark.slow
@@ -285,28 +305,20 @@ def test_ctrl_c_beside_a_flight_keeps_what_is_done(
     assert document["stopped"] and document["before"] and str(folder) in " ".join(err.split())
 
 
-@pytest.mark.usefixtures("no_flight")
-def test_a_second_run_in_the_same_folder_is_refused(
-    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = copy(after="")
-    stamp = (folder / STATE).read_bytes()
-    with sole_run(folder):
-        code, out, err = again(capsys, folder)
+def test_a_second_run_in_the_same_folder_is_refused(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamp = (begun / STATE).read_bytes()
+    with sole_run(begun):
+        code, out, err = again(capsys, begun)
     assert (code, out) == (2, "") and "--folder" in err
-    assert (folder / STATE).read_bytes() == stamp
+    assert (begun / STATE).read_bytes() == stamp
 
 
-@pytest.mark.usefixtures("no_flight")
-def test_a_folder_that_takes_no_more_is_told_before_a_flight(
-    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = copy(before="", after="", tuned=None)
-    stamp = (folder / STATE).read_bytes()
-    (folder / f"{STATE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
-    code, out, err = again(capsys, folder)
+def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamp = (begun / STATE).read_bytes()
+    (begun / f"{STATE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
+    code, out, err = again(capsys, begun)
     assert (code, out) == (1, "") and STATE in err
-    assert (folder / STATE).read_bytes() == stamp
+    assert (begun / STATE).read_bytes() == stamp
 
 
 def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Path) -> None:
