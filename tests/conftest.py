@@ -7,16 +7,13 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
-from logs.recording.flight import FlightData
-from logs.recording.reader import read
-from logs.recording.summary import FlightSummary
-from logs.report.flight_page import write_report
-from uavctl.loop import ControlLoop
-from uavctl.records import Event
+if TYPE_CHECKING:
+    from logs.recording.summary import FlightSummary
 
 CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
@@ -63,11 +60,12 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
 def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What fails in the controller fails the test too, though in flight the positions for the vehicle go on."""
 
-    def fail(loop: ControlLoop, error: Exception, at_ns: int) -> Event:
+    def fail(loop: object, error: Exception, at_ns: int) -> None:
         raise error
 
+    # By its name: the process that hands the tests out, and runs none, would load all that flies.
     if "control_may_fail" not in request.fixturenames:
-        monkeypatch.setattr(ControlLoop, "_die", fail)
+        monkeypatch.setattr("uavctl.loop.ControlLoop._die", fail)
 
 
 @pytest.fixture
@@ -80,6 +78,10 @@ def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process for each would load matplotlib again and again; test_loopback.py draws one as it is."""
 
     def draw(path: Path, summary: FlightSummary, page: Path) -> None:
+        from logs.recording.flight import FlightData
+        from logs.recording.reader import read
+        from logs.report.flight_page import write_report
+
         write_report(FlightData.from_records(read(path), path), summary, page)
 
     monkeypatch.setattr("uavctl.cli.flying.draw_page", draw)

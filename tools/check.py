@@ -1,4 +1,4 @@
-"""All checks of the tree: the quick ones side by side, then the tests; the first that fails ends the run.
+"""All checks of the tree, two side by side, the tests last; the first that fails ends the run.
 
 `make test` runs this, `make test-all` and continuous integration with `--all`; `--write-docs` only writes the generated
 pages.
@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +21,8 @@ from pathlib import Path
 from docs import PAGES, ROOT
 
 BIN = Path(sys.executable).parent
+# Policy libraries, each under the hash of its design and of the code that makes it: the next run makes none again.
+CACHE = ROOT / ".uavctl_cache"
 # Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.
 _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
@@ -64,7 +68,7 @@ def check_pages() -> str:
     return ""
 
 
-def check_wheel(cache: str) -> str:
+def check_wheel() -> str:
     """Build the wheel, install it outside the checkout, and fly from there."""
     with tempfile.TemporaryDirectory(prefix="uavctl-wheel-") as name:
         folder = Path(name)
@@ -75,52 +79,61 @@ def check_wheel(cache: str) -> str:
         run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel])
         # -P and PYTHONPATH: the installed package, not the checkout beside the working directory.
         flight = ("loopback", "--config", "paper", "--duration", "20", "--json", "--out", str(folder / "flights"))
-        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": cache}
+        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": str(CACHE)}
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
             raise StageError(f"the wheel was not what was imported, but {where.strip()}")
         return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
 
 
-def check_tests(cache: str, *, everything: bool) -> None:
-    """All tests, or those that are not slow; no test at all is a failure (exit code 5).
+def check_tests(failed: threading.Event, *, everything: bool) -> str:
+    """All tests, or those that are not slow; no test at all is a failure (exit code 5). They end early if `failed`.
 
     A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     command += [] if everything else ["-m", "not slow"]
-    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": cache}, check=False)
-    if done.returncode != 0:
-        raise StageError(f"pytest: exit code {done.returncode}")
+    with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": str(CACHE)}) as process:
+        while process.poll() is None:
+            if failed.wait(0.2):
+                process.send_signal(signal.SIGINT)
+                process.wait()
+                raise StageError("ended, for another check has failed")
+    if process.returncode != 0:
+        raise StageError(f"pytest: exit code {process.returncode}")
+    return ""
 
 
-def stages(cache: str, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
-    """All but the tests, what takes longest first; policy libraries are kept in `cache`."""
-    wheel = (("wheel, outside the checkout", lambda: check_wheel(cache)),)
+def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
+    """All checks: what is told soonest first, and the types beside the tests, which take longest."""
+    wheel = (("wheel, outside the checkout", check_wheel),)
     return (
-        ("mypy", lambda: run([BIN / "mypy"])),
-        *(wheel if everything else ()),
         ("ruff check", lambda: run([BIN / "ruff", "check"])),
         ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
         ("import contracts", lambda: run([BIN / "lint-imports"])),
         ("generated pages of docs/", check_pages),
+        *(wheel if everything else ()),
+        ("mypy", lambda: run([BIN / "mypy"])),
+        ("pytest", lambda: check_tests(failed, everything=everything)),
     )
 
 
-def passes(name: str, stage: Callable[[], str]) -> bool:
-    """Run a stage and say how it ended."""
+def take(name: str, stage: Callable[[], str], failed: threading.Event) -> None:
+    """Run a stage, unless another has failed, and say how it ended."""
+    if failed.is_set():
+        return
     start = time.monotonic()
     try:
         stage()
     except StageError as error:
+        failed.set()
         say(f"{error}\nFAILED  {name}")
-        return False
+        return
     say(f"ok  {name} ({time.monotonic() - start:.1f} s)")
-    return True
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the stages, two at a time, then the tests; 0 if all of them pass. `--all`: the wheel and slow tests too."""
+    """Run the stages, two at a time; 0 if all of them pass. `--all`: the wheel and slow tests too."""
     if list(arguments) == ["--write-docs"]:
         for page, text in PAGES.items():
             page.write_text(text(), encoding="utf-8")
@@ -129,17 +142,10 @@ def main(arguments: Sequence[str]) -> int:
     if arguments and not everything:
         say("give nothing, --all or --write-docs")
         return 2
-    with tempfile.TemporaryDirectory(prefix="uavctl-check-cache-") as cache:
-        with ThreadPoolExecutor(2) as pool:
-            if not all(list(pool.map(lambda one: passes(*one), stages(cache, everything=everything)))):
-                return 1
-        say("pytest ...")
-        try:
-            check_tests(cache, everything=everything)
-        except StageError as error:
-            say(f"{error}\nFAILED  pytest")
-            return 1
-    return 0
+    failed = threading.Event()
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda one: take(*one, failed), stages(failed, everything=everything)))
+    return int(failed.is_set())
 
 
 if __name__ == "__main__":
