@@ -77,6 +77,7 @@ def test_several_positions_of_a_step_come_one_after_the_other() -> None:
     assert [model.outage(steps) for steps in range(4)] == pytest.approx([1.0, *np.cumprod(gone)])
 
 
+@pytest.mark.slow
 def test_losses_known_ahead_count_as_the_worst_of_them_in_every_step() -> None:
     given = config("link.probability=[0.4, 0.9, 0.6]")
     known = newest(given.link, 1.0, chances())

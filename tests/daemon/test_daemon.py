@@ -60,6 +60,7 @@ def test_who_asks_for_the_time_is_answered_before_the_next_tick_and_a_replay_say
     assert result.identical, result.first_difference
 
 
+@pytest.mark.slow
 def test_a_flood_of_such_questions_is_answered_in_part_and_costs_no_tick() -> None:
     calm, flooded = Bench(), Bench()
     calm.fly(duration_s=2.0)

@@ -11,6 +11,7 @@ from chaos import runs, soak_core
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, ControlMode, Vec3
 
 
+@pytest.mark.slow
 @pytest.mark.fault(3)
 def test_the_fallback_takes_over_in_the_tick_in_which_the_age_reaches_the_horizon_and_in_no_later_one() -> None:
     count = soak_core(6_000, seed=3, orders=False)
@@ -19,6 +20,7 @@ def test_the_fallback_takes_over_in_the_tick_in_which_the_age_reaches_the_horizo
     assert count.falls > 12
 
 
+@pytest.mark.slow
 @pytest.mark.fault(24)
 @pytest.mark.parametrize("seed", [24])
 def test_every_setpoint_is_finite_bounded_and_slew_limited_with_faults_of_all_kinds(seed: int) -> None:

@@ -470,6 +470,7 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
     assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
 
 
+@pytest.mark.slow
 def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

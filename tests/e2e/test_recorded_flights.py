@@ -524,6 +524,7 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
     assert np.all(np.abs(where_m) < (3.0, 2.5)) and furthest_m > 20.0
 
 
+@pytest.mark.slow
 def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):

@@ -44,6 +44,7 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
     assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
 
 
+@pytest.mark.slow
 def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = 0
 

@@ -135,6 +135,7 @@ def test_an_exception_is_a_finding(faulty: Prepared, monkeypatch: pytest.MonkeyP
     assert fly_faults(faulty, 3, 1e-6, warm_up=0).wrong == {3: ("ZeroDivisionError: planted",)}
 
 
+@pytest.mark.slow
 def test_the_tool_runs_from_anywhere_and_refuses_nothing_to_fly(tmp_path: Path) -> None:
     command = [sys.executable, str(TOOL), "--seeds=0"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -42,7 +42,7 @@ def test_the_whole_way(autopilot: str, plant: str) -> None:
     assert flight.commands() == wanted
 
 
-@BOTH
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=pytest.mark.slow), "ardupilot"])
 def test_the_same_flight_replays_identically(autopilot: str) -> None:
     flight = Flight(autopilot).take_off().run(6.0)
     flight.loop.order(Command(order=Order.GOTO, position_m=(0.0, 0.0, -1.0)))

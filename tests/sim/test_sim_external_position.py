@@ -176,6 +176,7 @@ def test_px4_lands_five_seconds_after_the_loss() -> None:
 
 # px4-sih-relay-released-in-climb: no place on the globe, and from 10 to 43 s in AUTO.TAKEOFF at the height;
 # px4-sih-offboard-accel: GPS, and AUTO.LOITER from 0.5 m below the height on. 3 and 2 are landed states.
+@pytest.mark.slow
 @pytest.mark.parametrize(("placed", "mode", "state"), [(False, "AUTO.TAKEOFF", 3), (True, "AUTO.LOITER", 2)])
 def test_px4_without_a_place_on_the_globe_hovers_in_its_take_off_mode(placed: bool, mode: str, state: int) -> None:
     one = indoors("px4", "VISION_POSITION_ESTIMATE")

@@ -405,6 +405,7 @@ def test_px4_s_take_off_mode_climbs_to_its_parameter() -> None:
 
 
 # Heights above the floor 0.5, 1, 2 and 4 s after 0.03 m, of the take-offs to these heights.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "height_m", "recorded_m"),
     [

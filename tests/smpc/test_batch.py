@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from library_rig import case, near, small, uniform
 from numpy.typing import NDArray
 
@@ -67,6 +68,7 @@ def test_the_order_and_the_company_of_states_change_nothing() -> None:
     np.testing.assert_array_equal(alone, together.inputs)
 
 
+@pytest.mark.slow
 def test_late_positions_are_answered_by_the_late_design() -> None:
     design = small(late=1)
     solver = LibrarySolver(design, make_library(design, most=12))

@@ -8,6 +8,7 @@ from functools import cache, cached_property
 
 import cvxpy as cp
 import numpy as np
+import pytest
 from design_rig import one_axis, paper_plant, spec
 from full_problem import backoff_table, horizons
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from uavctl.smpc.sets import Polytope
 Array = NDArray[np.float64]
 
 PRESETS = ("paper", "room-hahn-stursberg")
+# For most tests of both, two axes will do for a person who waits.
+EACH_PRESET = ("paper", pytest.param("room-hahn-stursberg", marks=pytest.mark.slow))
 # Stages and rows that a margin may miss by: 1e-6 of the row's unit.
 KEPT = 1e-6
 

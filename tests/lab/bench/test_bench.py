@@ -91,6 +91,7 @@ def test_ratios_are_of_the_medians_shown(result: BenchResult) -> None:
     assert 0.0 < result.library_us.p50 <= result.library_us.p99 <= result.library_us.max
 
 
+@pytest.mark.slow
 def test_the_conditioned_decision_is_timed_on_the_same_states(result: BenchResult) -> None:
     ours = result.conditioned
     assert ours is not None
@@ -135,6 +136,7 @@ def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> 
     assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max
 
 
+@pytest.mark.slow
 def test_a_flight_s_own_decisions_are_asked_again() -> None:
     """As many as the flight's plans, and each as hard."""
     config = load_config(
@@ -176,6 +178,7 @@ def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytes
     assert f"{document['flight']['questions']} of its own flight" in shown
 
 
+@pytest.mark.slow
 def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
     assert result.cost_difference is not None and result.cost_difference < 1e-6
     assert result.certificate_excess < 1e-7
@@ -188,6 +191,7 @@ def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
         assert (share > 0.0) == (median is not None)
 
 
+@pytest.mark.slow
 def test_the_library_is_weighed(result: BenchResult, library: Library) -> None:
     parts = library.variants[0]
     assert result.library_policies == [len(part.level) for part in parts] == [6, 6]
@@ -196,6 +200,7 @@ def test_the_library_is_weighed(result: BenchResult, library: Library) -> None:
     assert 0.0 < result.ready_s < result.wall_s
 
 
+@pytest.mark.slow
 def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list[tuple[str, int, int | None]]) -> None:
     last = {what: (done, total) for what, done, total in told}
     assert last.pop("making the library") == (0, None)
@@ -293,6 +298,7 @@ def test_cases_are_run_in_turns_without_garbage_collection() -> None:
     assert found[0].of(FROZEN).size == 0  # none has a plan
 
 
+@pytest.mark.slow
 def test_a_slow_case_is_spread_over_the_runs() -> None:
     often, once = Stub(), Stub()
     points = [np.array([float(i)]) for i in range(5)]
@@ -330,6 +336,7 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
     return given
 
 
+@pytest.mark.slow
 def test_the_command_writes_one_document(
     measured: list[tuple[float, int, int]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -341,6 +348,7 @@ def test_the_command_writes_one_document(
     assert (seed, states) == (3, 9)
 
 
+@pytest.mark.slow
 def test_the_command_shows_ratios_and_shares(
     measured: list[tuple[float, int, int]], result: BenchResult, capsys: pytest.CaptureFixture[str]
 ) -> None:

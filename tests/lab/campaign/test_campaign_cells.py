@@ -117,6 +117,7 @@ def test_runs_start_where_they_are_told(tmp_path: Path) -> None:
     np.testing.assert_array_equal(box.disturbances, starts("").disturbances)
 
 
+@pytest.mark.slow
 def test_every_kind_of_controller_flies(tmp_path: Path) -> None:
     kinds = ("smpc", "lqg", "packetised", "worst-case-delay", "hold-last", "zero-on-loss", "pid")
     found = cells(tmp_path, "steps = 6\n", *(controller(kind) for kind in kinds))

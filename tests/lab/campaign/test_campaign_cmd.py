@@ -175,6 +175,7 @@ def test_another_campaign_does_not_go_on(spec: Path, flown: Path, capsys: pytest
     assert contents(flown) == before
 
 
+@pytest.mark.slow
 def test_fewer_runs_and_a_table_for_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -227,6 +227,7 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
     assert len(labels) == html.count("<figure")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cells", "rows", "said"),
     [

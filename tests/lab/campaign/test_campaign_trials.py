@@ -145,6 +145,7 @@ def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypa
     assert [(row["run"], row["error"]) for row in dead] == [(0, "it died"), (1, "it died")]
 
 
+@pytest.mark.slow
 def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
     told, cells = summarise_trial(flown)
@@ -160,6 +161,7 @@ def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> 
     assert "own loop" in page and "Not flown, or failed" in page and "too sure" in page
 
 
+@pytest.mark.slow
 def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flown.parent / "small.toml"
     capsys.readouterr()

@@ -68,6 +68,7 @@ def share(rests: NDArray[np.float64]) -> float:
     return math.prod((sides[axis, True] - sides[axis, False]) / size for axis, size in room.items())
 
 
+@pytest.mark.slow
 def test_the_page_shows_them_and_older_tables_have_none(tmp_path: Path) -> None:
     figures = {"near_s": [3.0, 4.0, 9.0], "nearer_s": [5.0, math.inf, math.inf], "hold_rms_m": [0.1, 0.2, 0.4]}
     figures["beyond_m"] = [-0.5, 0.25, -0.5]

@@ -174,6 +174,7 @@ def test_a_flight_is_the_run_to_what_float32_leaves(link: LinkConfig) -> None:
     assert largest_difference(in_the_linear_world(link, 4), truths) > 1.0  # another run is another flight
 
 
+@pytest.mark.slow
 def test_they_are_the_same_until_no_plan_is_left() -> None:
     """Then the flight core brakes tick by tick, and the linear world step by step."""
     run = in_the_linear_world(BURSTS, 6)

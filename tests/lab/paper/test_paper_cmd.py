@@ -119,6 +119,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.Cap
     assert "--out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_slow_part_is_in_the_document_when_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

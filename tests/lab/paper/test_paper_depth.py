@@ -85,6 +85,7 @@ def test_designs_that_were_tried_are_told_with_the_reason(depth: Depth) -> None:
     assert joint.cost == pytest.approx(59569.4, abs=0.5)
 
 
+@pytest.mark.slow
 def test_complexity_is_measured_where_there_is_a_design(depth: Depth) -> None:
     assert [(one.tau, one.horizon) for one in depth.complexity] == [(2, 12), (3, 12), (4, 12), (2, 10), (3, 11)]
     for one in depth.complexity:

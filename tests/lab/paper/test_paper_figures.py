@@ -59,6 +59,7 @@ def words(root: ElementTree.Element) -> set[str]:
     return {"".join(one.itertext()).strip() for one in root.iter(f"{SVG}text")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 7, 40])
 def test_trajectories_show_box_ellipsoid_start_and_every_run(design: Design, runs: int) -> None:
     root = ElementTree.fromstring(trajectories_svg(states(runs), design))

@@ -142,6 +142,7 @@ def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> No
     assert found.fallback == 0.0
 
 
+@pytest.mark.slow
 def test_an_eight_is_tracked_along_its_own_time() -> None:
     found = fly(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
     assert 0.0 < found.tracking_m < found.tracking_max_m < 0.6

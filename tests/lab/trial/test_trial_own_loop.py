@@ -118,6 +118,7 @@ def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
     assert (told - heard).total() <= 0.05 * len(passed)  # single precision rounds some of them otherwise
 
 
+@pytest.mark.slow
 @BOTH
 def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: AutopilotName) -> None:
     overheard, peers, config = flight_of_own(autopilot, TUNED)

@@ -52,6 +52,7 @@ def test_the_flight_that_might_have_been_is_the_one_that_is_then_flown(
     assert ages[0] == ages[1]
 
 
+@pytest.mark.slow
 def test_another_link_loses_what_it_would_have_lost() -> None:
     changes = ("link.loss=0.1", "schedule.delays=5")
     other = Relinked(history(PAPER), config_of(PAPER, *changes).link, config_of(PAPER).sim.seed, 0.0)

@@ -158,6 +158,7 @@ def test_other_files_are_told(flown: Path, tmp_path: Path, capsys: pytest.Captur
     assert code in (1, 2) and str(text) in " ".join(errors.split())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_figures")
 def test_a_torn_recording_is_flown_to_its_end(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     torn = tmp_path / "torn.mcap"

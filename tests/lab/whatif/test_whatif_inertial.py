@@ -212,6 +212,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(
     assert course.inertial_moved > 500 and course.inertial_left_out <= 1
 
 
+@pytest.mark.slow
 def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
     def blind(data: bytes) -> bytes:
         return b"".join(
@@ -233,6 +234,7 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
     assert "inertial-doubted" not in inertial_events(memory) and hold_m(memory, TARGET) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_the_dead_time_belongs_to_the_model(case: Case) -> None:
     response = response_of(history(case), config_of(case).plant)

@@ -267,6 +267,7 @@ def test_wrong_words(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no such recording" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_pyarrow_the_extra_is_named(flown: Path) -> None:
     program = (
         "import sys\nsys.modules['pyarrow'] = None\nfrom uavctl.cli.app import run\n"

@@ -45,6 +45,7 @@ def incoming(packets: Sequence[bytes], link: str = "vehicle") -> list[tuple[int,
     return [(1_000_000 * number, link, False, data) for number, data in enumerate(packets)]
 
 
+@pytest.mark.slow
 def test_mavlogdump_finds_every_packet(tmp_path: Path) -> None:
     flight = view_rig.record(tmp_path / "flight.mcap")
     exported = export_tlog(flight, tmp_path / "a.tlog")

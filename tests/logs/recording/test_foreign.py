@@ -86,6 +86,7 @@ def test_two_directions_on_two_topics_out_of_order_in_the_file_beside_others(tmp
     assert alone.topics == ("/to_vehicle",) and all(one.outgoing for one in alone.packets)
 
 
+@pytest.mark.slow
 def test_our_own_raw_topics_without_anything_else(tmp_path: Path) -> None:
     memory = lockstep("paper", 12.0, "solver.method=exact")
     raw = [(topic, at, one) for topic, at, one in memory.entries if isinstance(one, Datagram)]

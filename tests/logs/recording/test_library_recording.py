@@ -100,6 +100,7 @@ def test_it_replays_without_a_cache(
     assert not (tmp_path / "none").exists()  # nothing was made, either
 
 
+@pytest.mark.slow
 def test_it_replays_with_its_own_library_when_the_cache_has_another(
     flown: Path, stored: StoredLibrary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -187,6 +187,7 @@ def test_a_part_that_waits_first_tells_when_it_was_taken_over(flight: FlightData
     assert "took over 0.5 s after" in text
 
 
+@pytest.mark.slow
 def test_a_whole_flight_is_no_part(flight: FlightData) -> None:
     assert "art of a flight" not in " ".join(words_of(flight).text)
 

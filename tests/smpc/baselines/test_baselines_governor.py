@@ -24,6 +24,7 @@ def sigma(given: ControlProblem, steps: int) -> Array:
     return np.asarray(np.sqrt(np.diagonal(given.state_set.c @ cov @ given.state_set.c.T)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_the_governor_keeps_the_next_mean_its_margin_and_is_as_near_to_the_regulator_as_that_allows(name: str) -> None:
     given, rng = problem(name, slack_linear=1e3, slack_quadratic=10.0), np.random.default_rng(4)

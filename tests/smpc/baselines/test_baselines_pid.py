@@ -149,6 +149,7 @@ def test_the_tuner_s_cost_is_the_world_s(scene: Scene) -> None:
     assert _costs(given, some, PAPER_START, newest, disturbances)[0] == pytest.approx(wanted, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_tuned_gains_beat_all_of_300_random_ones_and_are_the_same_each_time(scene: Scene) -> None:
     given, newest, disturbances = scene
     tuned = tune(given, PAPER_START, newest, disturbances)

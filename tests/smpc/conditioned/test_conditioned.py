@@ -361,6 +361,7 @@ def test_no_step_is_outside_more_often_than_promised(loss: float, target: tuple[
         assert 0.3 * ALLOWED < settled < ALLOWED
 
 
+@pytest.mark.slow
 def test_it_spends_what_a_margin_as_cautious_as_the_printed_design_leaves_unused() -> None:
     """On common draws, from the paper's start; a margin tuned to the same violations costs as little as this does."""
     given = problem("paper")

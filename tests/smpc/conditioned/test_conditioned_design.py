@@ -78,6 +78,7 @@ def test_places_that_the_scheme_cannot_rest_at_are_refused(tmp_path: Path, capsy
     assert "--goto: " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_no_other_design")
 @pytest.mark.parametrize("overrides", [["link.loss=0.6"], [*QUICK, "smpc.horizon=48", "link.loss=0.8"]])
 def test_losses_that_the_other_scheme_refuses_are_flown(overrides: list[str]) -> None:

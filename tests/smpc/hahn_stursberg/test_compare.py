@@ -55,6 +55,7 @@ def test_states_are_seeded_and_in_the_box() -> None:
     assert not np.array_equal(seeded_states(limits, target, 500, 4)[0], points)
 
 
+@pytest.mark.slow
 def test_the_paper_s_gain_beside_the_best() -> None:
     told: list[str] = []
     found = compare_gains(spec("paper"), 0.9 * START, 5, 0, told.append)
@@ -119,6 +120,7 @@ def test_synthesise_as_typed(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     assert design["stationary_cost"] == found["after"]["stationary_cost"]
 
 
+@pytest.mark.slow
 def test_synthesise_shows_people_a_table_and_the_fragment(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = typed(capsys, "design", "--config", "paper", "--synthesize", "--states", "1")
     assert code == 0

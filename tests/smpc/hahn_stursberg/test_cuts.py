@@ -57,5 +57,6 @@ def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
 
 
 @pytest.mark.fault(52)
-def test_cut_anywhere(cuts: Cuts) -> None:
-    assert all_wrong(cuts, cuts.drawn(20, seed=1)) == {}
+@pytest.mark.parametrize("number", [6, pytest.param(20, marks=pytest.mark.slow)])
+def test_cut_anywhere(cuts: Cuts, number: int) -> None:
+    assert all_wrong(cuts, cuts.drawn(number, seed=1)) == {}

@@ -54,6 +54,7 @@ def test_cost_is_that_of_the_printed_problem(name: str) -> None:
     assert made.answer.cost == pytest.approx(printed.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_printed_form_of_an_axis_that_nothing_disturbs() -> None:
     made = case("calm axis, no column")
     calm, windy = sorted(decompose(made.design), key=lambda part: part.e.shape[1])

@@ -128,6 +128,7 @@ def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
     np.testing.assert_allclose(beliefs[-1].cov[:9, :9], form.estimate_cov, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_bound_holds_at_nearly_every_arrival() -> None:
     """Loss 0.3: every deviation in at least 99 % of arrivals, whatever the phase of the positions."""
     moved = [0, 1, 3, 4, 6, 7]  # nothing disturbs the accelerations
@@ -222,6 +223,7 @@ def test_a_disturbed_state_that_no_position_shows_is_refused() -> None:
     assert caught.value.key == "risk.estimate"
 
 
+@pytest.mark.slow
 def test_a_configuration_plans_with_one_plant_and_estimates_with_the_other() -> None:
     config = load_config("room-hahn-stursberg", ["risk.estimate=innovations"])
     design, controller, plant = build_design(config), build_controller(config), build_plant(config)

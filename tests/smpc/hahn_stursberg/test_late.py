@@ -194,6 +194,7 @@ def test_an_age_without_a_design_is_named() -> None:
     assert caught.value.key in ("smpc.delta_x", "smpc.delta_u")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "steps", "tail"),
     [
@@ -338,6 +339,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
         assert np.all(backoff[1:6] > on_time.backoff_x[1:6])
 
 
+@pytest.mark.slow
 def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> None:
     config = load_config("room-hahn-stursberg", list(LATE_LINK))
     lower, upper = np.array(config.sets.state_lower), np.array(config.sets.state_upper)

@@ -46,6 +46,7 @@ def test_the_same_design_and_seed_give_the_same_bytes_and_another_seed_others() 
     assert first.design_id == design.design_id
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_there_is_a_library_for_every_age_and_component_and_progress_is_told() -> None:
     design = small(late=2)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from full_problem import gains, margins
 from library_rig import (
+    EACH_PRESET,
     KEPT,
     KINDS,
-    PRESETS,
     Asked,
     all_kinds,
     asked,
@@ -56,7 +56,7 @@ def answered(name: str) -> list[tuple[Asked, Answer, Answer]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_certificate_is_never_wrong(name: str) -> None:
     methods: Counter[str] = Counter()
     for _, answer, exact in answered(name):
@@ -71,7 +71,7 @@ def test_the_certificate_is_never_wrong(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_library_alone_is_certified_too_or_says_that_it_is_not(name: str) -> None:
     one = case(name)
     missed = 0
@@ -116,7 +116,7 @@ def independent_cost(design: Design, name: str, ask: Asked, answer: Answer, cova
     return cost
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) -> None:
     """(19) from M: tightened rows of all stages, the terminal condition with all disturbances, rest from N on."""
     one = case(name)
@@ -149,7 +149,7 @@ def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) 
     assert checked.total() > 30  # of 70: from many states no place to rest is within the room's reach
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_what_the_constraints_are_held_to_can_be_missed(name: str) -> None:
     """Gains a tenth larger, or a mean that is moved, are found out."""
     one = case(name)
@@ -177,7 +177,7 @@ def bits_of(solver: LibrarySolver, asks: list[Asked]) -> list[bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_same_question_same_bits_whatever_came_before(name: str) -> None:
     one = case(name)
     asks = list(all_kinds(one.design, 51, 3))
@@ -198,6 +198,7 @@ def test_same_question_same_bits_whatever_came_before(name: str) -> None:
     assert bits_of(used, [asks[k] for k in quick]) == [fresh[k] for k in quick]
 
 
+@pytest.mark.slow
 def test_another_process_gives_the_same_bits() -> None:
     name, one = "paper", case("paper")
     asks = list(all_kinds(one.design, 53, 2))
@@ -220,7 +221,7 @@ def test_another_process_gives_the_same_bits() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_an_answer_every_time_and_what_gave_way_is_named(name: str) -> None:
     one = case(name)
     design, kinds = one.design, Counter[str]()
@@ -246,7 +247,7 @@ def test_an_answer_every_time_and_what_gave_way_is_named(name: str) -> None:
     assert {"state", "equilibrium"} <= set(kinds)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_without_the_exact_program_a_mixture_or_infeasible_and_never_an_exception(name: str) -> None:
     one = case(name)
     exact, seen = exact_solver(name), Counter[SolveStatus]()
@@ -264,7 +265,7 @@ def test_without_the_exact_program_a_mixture_or_infeasible_and_never_an_exceptio
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e160, 1e300])
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_numbers_that_are_none_fail_without_a_plan(name: str, bad: float) -> None:
     one = case(name)
     design, home = one.design, one.design.target
@@ -291,7 +292,7 @@ def test_a_position_later_than_the_design_knows_fails() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_along_closed_loops_every_answer_is_certified_and_nearly_all_to_a_tenth_of_that(name: str) -> None:
     """`tools/accept_library.py` does it with thousands of states."""
     one, rng = case(name), np.random.default_rng(81)
@@ -312,6 +313,7 @@ def test_along_closed_loops_every_answer_is_certified_and_nearly_all_to_a_tenth_
 # --- late positions --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_late_positions_have_libraries_of_their_own_that_agree_with_the_exact_program() -> None:
     design = small(late=1)
     solver, exact = LibrarySolver(design, make_library(design, most=16)), ConicSolver(design)

@@ -318,6 +318,7 @@ def test_a_file_is_plain_data(data: bytes) -> None:
     assert library_id == decode(data).library_id and design_id == decode(data).library.design_id
 
 
+@pytest.mark.slow
 def test_a_check_counts_answers_and_finds_the_worst_gap(design: Design, library: Library) -> None:
     found = check_library(design, library, states=12)
     assert found == check_library(design, library, states=12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from library_rig import KINDS, PRESETS, Case, all_kinds, asked, design_of, exact_gains, mean_optimum
+from library_rig import EACH_PRESET, KINDS, PRESETS, Case, all_kinds, asked, design_of, exact_gains, mean_optimum
 from numpy.typing import NDArray
 from optimisation_cases import coupled
 from scipy.linalg import null_space
@@ -153,7 +153,7 @@ def test_backoffs_that_no_gain_moves_are_those_of_the_open_loop(design: Design, 
     assert checked > 0
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones_for_the_reference(name: str) -> None:
     design = design_of(name)
     free, m_x = design.horizon - design.terminal.tau, design.state_set.b.size
@@ -172,7 +172,7 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_its_policy(name: str) -> None:
     """Back-offs of the exact gains, the mean solved by another solver: the exact optimum, whatever is known ahead."""
     design = design_of(name)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from library_rig import PRESETS, Asked, all_kinds, case, mean_optimum
+from library_rig import EACH_PRESET, PRESETS, Asked, all_kinds, case, mean_optimum
 from numpy.typing import NDArray
 
 from uavctl.records import SolveStatus
@@ -34,7 +34,7 @@ def optima(name: str) -> list[Optimum]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_optimum_is_between_the_bounds(name: str) -> None:
     one = case(name)
     gaps = []
@@ -50,7 +50,7 @@ def test_the_optimum_is_between_the_bounds(name: str) -> None:
     assert np.median(gaps) < 1e-4
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_a_mixture_is_a_plan_that_keeps_its_rows_and_costs_what_it_says(name: str) -> None:
     one = case(name)
     mixed_any = 0
@@ -85,7 +85,8 @@ def test_a_mixture_is_a_plan_that_keeps_its_rows_and_costs_what_it_says(name: st
     assert mixed_any > 5
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_mean_is_the_best_under_the_mixture_s_backoffs(name: str) -> None:
     one = case(name)
     for ask, i, _, _ in optima(name)[::6]:
@@ -151,7 +152,7 @@ def test_any_multipliers_give_a_bound(seed: int, noise: float, name: str) -> Non
     assert noise > 0.0 or bound == undisturbed
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_cuts_raised_by_one_per_cent_are_found_wrong(name: str) -> None:
     """What the checks above can see: the bound is linear in the cuts' level, and near the target that is nearly all."""
     wrong = 0

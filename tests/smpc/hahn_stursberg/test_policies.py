@@ -10,7 +10,7 @@ import pytest
 from full_problem import Margins, gains, horizons, margins
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from library_rig import PRESETS, all_kinds, asked, design_of, mean_optimum
+from library_rig import EACH_PRESET, PRESETS, all_kinds, asked, design_of, mean_optimum
 from numpy.typing import NDArray
 from optimisation_cases import coupled
 
@@ -119,7 +119,7 @@ def keeps(design: Design, i: int, theta: Array) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_every_cut_is_below_the_cost_of_every_feasible_policy(name: str) -> None:
     design, rng = design_of(name), np.random.default_rng(10)
     for i, policies in enumerate(pool(name)):
@@ -139,7 +139,7 @@ def test_every_cut_is_below_the_cost_of_every_feasible_policy(name: str) -> None
         assert far > 5
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_every_cut_touches_its_own_policy_and_one_per_cent_more_would_be_wrong(name: str) -> None:
     for policies in pool(name):
         assert len(policies) > 5
@@ -224,7 +224,7 @@ def test_a_cut_from_noise_alone_is_a_bound(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_best_policy_is_the_exact_program_s(name: str) -> None:
     """With its back-offs the mean, solved by another solver, and J_cov add up to the exact optimum."""
     design = design_of(name)

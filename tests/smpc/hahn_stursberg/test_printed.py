@@ -60,6 +60,7 @@ def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: Pr
     assert "(no lower bound known), slack 0" in console.file.getvalue()
 
 
+@pytest.mark.slow
 def test_joint_problem_has_the_cost_of_its_axes(design: Design) -> None:
     part = PrintedProblem(design, whole(design)).solve(START, ORIGIN)
     assert part.status in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE)
@@ -108,6 +109,7 @@ def test_an_interrupt_is_no_breakdown(solver: PrintedSolver, monkeypatch: pytest
         solver.solve(0, START, ORIGIN)
 
 
+@pytest.mark.slow
 def test_iteration_limit_is_told() -> None:
     assert PrintedSolver(paper(max_iterations=3)).solve(0, START, ORIGIN).status is SolveStatus.ITERATION_LIMIT
 

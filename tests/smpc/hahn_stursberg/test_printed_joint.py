@@ -20,6 +20,7 @@ def test_the_joint_form_does_not_end_optimal_under_the_solver_s_own_settings() -
     assert answer.status in (SolveStatus.INACCURATE, SolveStatus.FAILED)
 
 
+@pytest.mark.slow
 def test_with_more_regularization_it_ends_optimal_at_the_cost_of_the_axes() -> None:
     design = build_design(load_config("paper"))
     joint = PrintedSolver(design, joint=True).solve(0, START, design.target)

@@ -81,6 +81,7 @@ def never_costs_more(kind: Kind, less: list[Answer], more: list[Answer]) -> None
 # --- back-offs --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_backoffs_grow_with_the_age_of_what_is_known(kind: Kind) -> None:
     """Until the first feedback the state is known from stage 0 alone: its age is the stage."""
     for answer in answers(kind, paper_spec(), states(5, 1)):

@@ -59,6 +59,7 @@ def test_each_unit_by_itself(state: float, input: float, cost: float) -> None:
         same_plan(name, Units.of(case(name).design.plant, state, input, cost))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_prices_are_per_unit_and_are_converted_with_it(seed: int) -> None:
     """A start outside the limits, so that slack and terminal miss are paid for, with the paper's plant."""
@@ -104,6 +105,7 @@ def test_parts_of_a_step_are_exact_in_any_units() -> None:
 # --- tolerances and far states ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["coupled 2", "lagged 1", "more disturbances than inputs", "H = 20, tau = 10"])
 def test_a_tighter_tolerance_gives_the_same_optimum(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regularisation and tolerance of the solver move the optimum by less than 1e-6."""

@@ -271,6 +271,7 @@ def test_an_undisturbed_axis_keeps_its_gain() -> None:
     assert found.spectral_radius < 1.0
 
 
+@pytest.mark.slow
 def test_what_the_estimate_does_not_know_takes_room_too() -> None:
     given = spec("paper", q_u=500.0 * np.eye(2), target_m=(0.0, 5.0, 0.0))
     kappa_x, kappa_u = terminal_factors(given)
