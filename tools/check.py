@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 
 from docs import PAGES, ROOT
@@ -144,7 +145,8 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     failed = threading.Event()
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda one: take(*one, failed), stages(failed, everything=everything)))
+        names, checks = zip(*stages(failed, everything=everything), strict=True)
+        list(pool.map(take, names, checks, repeat(failed)))  # read, so that no exception is lost
     return int(failed.is_set())
 
 

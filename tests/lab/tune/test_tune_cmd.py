@@ -275,7 +275,7 @@ def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(don
 
 
 def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    errors = {"axes": [], "ahead_s": [], "rms_m": []}
+    errors: dict[str, list[float]] = {"axes": [], "ahead_s": [], "rms_m": []}
     ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
     link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
     noted = {"before": "before/flight.mcap", "tuned": {"changes": [], "warnings": [], **ranges, **link}}
