@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import Memory, shared_loop
 
 from sim.simulation import Peers
 from uavctl.cli.ctl import _relay
@@ -20,7 +20,7 @@ class Flight:
 
     def __init__(self, name: str = "room-hahn-stursberg", *overrides: str) -> None:
         config = load_config(name, ['solver.method="exact"', *overrides])  # no library has to be made
-        self.loop = make_loop(config, Memory())
+        self.loop = shared_loop(config, Memory())
         self.peers = Peers(config, 0)
         self.lines: list[str] = []
         self.dropped = 0

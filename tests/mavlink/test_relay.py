@@ -8,7 +8,7 @@ from statistics import median
 from typing import Any
 
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import Memory, shared_loop
 from mavlink_rig import MS, SECOND, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
@@ -176,7 +176,7 @@ class Indoors:
             ],
         )
         self.memory = Memory()
-        self.loop = make_loop(self.config, self.memory)
+        self.loop = shared_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0, airborne=False)
         for parameter, value in EXTERNAL_ONLY[name].items():
             assert self.peers.autopilot.parameters.set(parameter, value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from loopback_rig import Memory, make_loop
+from loopback_rig import Memory, shared_loop
 from sim_rig import decode
 
 from sim.simulation import Peers
@@ -23,7 +23,7 @@ class Bench:
     def __init__(self, *overrides: str) -> None:
         self.config = load_config("room-hahn-stursberg", overrides)
         self.memory = Memory()
-        self.loop = make_loop(self.config, self.memory)
+        self.loop = shared_loop(self.config, self.memory)
         self.now_ns = 1
         self.peers = Peers(self.config, DT_NS)
         self.arrived: dict[str, list[tuple[bytes, int]]] = {"vehicle": [], "mocap": []}

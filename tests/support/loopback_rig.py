@@ -54,6 +54,11 @@ def _made(config: Config, library: Library | None) -> tuple[AnyDesign, Controlle
     return design, build_controller(config, design, library)
 
 
+def shared_loop(config: Config, sink: Sink) -> ControlLoop:
+    """The loop of a flight whose controller others fly with too, see `shared`; `make_loop` makes one of its own."""
+    return ControlLoop(config, shared(config)[1], sink, lambda: 0)
+
+
 def lockstep(name: str, duration_s: float, *overrides: str, library: Library | None = None) -> Memory:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
