@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from loopback_rig import Memory, lockstep, make_loop
+from loopback_rig import Memory, lockstep, make_loop, shared_loop
 from report_rig import unpaged
 
 from logs.recording.reader import lacks_end, records, segment_files
@@ -33,7 +33,7 @@ def flown() -> Memory:
 
 def replayed(flown: Memory, *overrides: str) -> ReplayResult:
     config = load_config("paper", overrides)
-    return replay(flown.entries, partial(make_loop, config), ignored=MAKERS)
+    return replay(flown.entries, partial(shared_loop, config), ignored=MAKERS)
 
 
 @pytest.mark.slow

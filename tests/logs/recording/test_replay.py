@@ -7,7 +7,7 @@ from functools import partial
 
 import msgspec
 import pytest
-from loopback_rig import Memory, lockstep, make_loop
+from loopback_rig import Memory, lockstep, make_loop, shared_loop
 from places import DATA
 
 from logs.recording.replay import replay
@@ -38,19 +38,19 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None
     nudged = (record.input[0] + 2.0**-50, *record.input[1:])
     changed = [*flown.entries]
     changed[at] = (topic, at_ns, msgspec.structs.replace(record, input=nudged))
-    result = replay(changed, lambda sink: make_loop(load_config("paper"), sink))
+    result = replay(changed, lambda sink: shared_loop(load_config("paper"), sink))
     first = result.first_difference
     assert first is not None
     assert (first.topic, first.field, first.at_ns) == ("/uavctl/decision", "input[0]", at_ns)
     assert first.recorded == repr(nudged[0]) and first.replayed == repr(record.input[0])
-    close = replay(changed, lambda sink: make_loop(load_config("paper"), sink), tolerance=1e-9)
+    close = replay(changed, lambda sink: shared_loop(load_config("paper"), sink), tolerance=1e-9)
     assert close.identical
 
 
 @pytest.mark.slow
 def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_are_others(flown: Memory) -> None:
     written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
-    replayed = partial(replay, make_loop=lambda sink: make_loop(load_config("paper"), sink))
+    replayed = partial(replay, make_loop=lambda sink: shared_loop(load_config("paper"), sink))
     whole = replayed(flown.entries)
     assert whole.identical and replayed(written) == whole
     otherwise = [
@@ -71,12 +71,12 @@ def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_a
 def test_a_topic_that_nobody_knows_is_told(flown: Memory) -> None:
     written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
     with pytest.raises(RecordingError, match="topic /uavctl/later is not known to this version"):
-        replay([*written, ("/uavctl/later", 7, b"{}")], lambda sink: make_loop(load_config("paper"), sink))
+        replay([*written, ("/uavctl/later", 7, b"{}")], lambda sink: shared_loop(load_config("paper"), sink))
 
 
 def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory) -> None:
     other = load_config("paper", ["cost.input=[0.2, 0.1]", "solver.method=exact"])
-    result = replay(flown.entries, lambda sink: make_loop(other, sink))
+    result = replay(flown.entries, lambda sink: shared_loop(other, sink))
     first = result.first_difference
     assert first is not None and first.topic == "/uavctl/plan"
     assert first.at_ns == flown.of(Plan)[0].base_ns
@@ -89,7 +89,7 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
         if isinstance(r, Datagram) and r.link == "mocap" and not r.outgoing
     )
     result = replay(
-        flown.entries[:position] + flown.entries[position + 1 :], lambda sink: make_loop(load_config("paper"), sink)
+        flown.entries[:position] + flown.entries[position + 1 :], lambda sink: shared_loop(load_config("paper"), sink)
     )
     assert not result.identical
 
@@ -98,7 +98,7 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
 def test_what_the_loop_says_beyond_the_recording_is_found(flown: Memory) -> None:
     for kind in (Plan, Setpoint, Event):
         poorer = [entry for entry in flown.entries if not isinstance(entry[2], kind)]
-        result = replay(poorer, lambda sink: make_loop(load_config("paper"), sink))
+        result = replay(poorer, lambda sink: shared_loop(load_config("paper"), sink))
         assert not result.identical and result.first_difference is not None
         assert result.first_difference.recorded == "nothing"
 
@@ -112,7 +112,7 @@ def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: Memory) 
 
 
 def test_a_recording_without_a_decision_is_not_identical(flown: Memory) -> None:
-    result = replay(flown.entries[:1], lambda sink: make_loop(load_config("paper"), sink))
+    result = replay(flown.entries[:1], lambda sink: shared_loop(load_config("paper"), sink))
     assert not result.identical and result.decisions == 0
 
 
