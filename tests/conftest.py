@@ -75,14 +75,20 @@ def control_may_fail() -> None:
 
 @pytest.fixture(autouse=True)
 def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process for each would load matplotlib again and again; test_loopback.py draws one as it is."""
+    """Here, and without their figures, at which tests/logs/report looks: tests of flights read what a page says.
+
+    A process for each would load matplotlib again and again; test_loopback.py draws one as it is.
+    """
 
     def draw(path: Path, summary: FlightSummary, page: Path) -> None:
+        from report_rig import unwritten
+
         from logs.recording.flight import FlightData
         from logs.recording.reader import read
         from logs.report.flight_page import write_report
 
-        write_report(FlightData.from_records(read(path), path), summary, page)
+        with unwritten():
+            write_report(FlightData.from_records(read(path), path), summary, page)
 
     monkeypatch.setattr("uavctl.cli.flying.draw_page", draw)
 
