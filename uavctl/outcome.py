@@ -120,6 +120,7 @@ class FlightCourse:
     _failsafes: int = 0  # number of failsafes that have ended by themselves
     _armed: bool = False  # it has been armed
     _aloft: bool = False  # it has been in the air, as far as it tells
+    _taken: bool = False  # the pilot has taken over
     _fails: bool = False  # it landed by a failsafe of its own while, or after, it was asked to
     _vehicle: VehicleStatus | None = None
     _positions: bool = False  # there has been an estimate
@@ -174,7 +175,7 @@ class FlightCourse:
             one.before is HandoverState.FAILSAFE and one.after is HandoverState.CLIMBING
         ):
             self._failsafes += self._found is Cause.FAILSAFE
-            self._found, self._why = None, ""
+            self._found, self._why, self._taken = None, "", False
         self.engaged = self.engaged or one.after is HandoverState.ENGAGED
         if one.seen is HandoverEvent.REBOOT:
             self._find(Cause.RESTARTED, "")
@@ -190,8 +191,9 @@ class FlightCourse:
             self._disarm(one)
         elif one.after is HandoverState.RELEASED and one.before is not HandoverState.RETURNING:
             own = one.before is HandoverState.ENGAGED and vehicle is not None and fails(vehicle)
-            if self._found is Cause.FAILSAFE and not own:
-                self._found = None
+            if not own and (self._found is Cause.FAILSAFE or self._found in WANTED):
+                self._found = None  # the landing that was asked for does not come
+            self._taken = not own
             self._find(Cause.FAILSAFE if own else Cause.PILOT, _mode(vehicle) if own else "")
         elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
             self._asked = Cause.ORDERED
@@ -213,6 +215,8 @@ class FlightCourse:
             what += "; a failsafe of the vehicle's own had acted and ended"
         elif self._fails and cause in WANTED:
             what += "; a failsafe of the vehicle's own acted in the landing"
+        if self._taken and cause not in (Cause.PILOT, Cause.PILOT_LANDED):
+            what += "; the pilot has taken over"
         text = f"{what}{f', {_BEFORE}' if early else ''}{f'; {where}' if where else ''}"
         good = cause in WANTED and not (early or missed or self._failed)
         return make_ending(cause, text, as_ordered=good, exit_code=128 + self._signal if self._signal else None)

@@ -52,25 +52,32 @@ class ViewMaker(Protocol):
 
 
 class DerivedTopics:
-    """Derives messages for viewers from records, and passes both on to a watcher.
+    """Derives messages for viewers from records, and passes both on to those who look on.
 
     Args:
         views: makes the messages for viewers; None: there are none.
         watch: is given definition, log time [ns] and bytes of each message, soon after its record was taken;
             returns at once and raises nothing.
+        look: is given each record then, the same way.
 
     Attributes:
         unseen: number of records that no messages for viewers could be made of; the recording has them.
         reason: why, for the newest of them.
     """
 
-    def __init__(self, views: ViewMaker | None = None, watch: Watcher | None = None) -> None:
-        self._views, self._watch = views, watch
+    def __init__(
+        self,
+        views: ViewMaker | None = None,
+        watch: Watcher | None = None,
+        look: Callable[[Record], None] = lambda _: None,
+    ) -> None:
+        self._views, self._watch, self._look = views, watch, look
         self.unseen = 0
         self.reason = ""
 
     def beside(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
         """Return topic, log time [ns] and message of all that is derived from a record, whose message is `data`."""
+        self._look(record)
         made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
         if self._watch is not None:
             for name, time_ns, message in ((topic, at_ns, data), *made):

@@ -32,7 +32,7 @@ from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
 from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.step import disbelieves
-from uavctl.records import ControlMode, Vec3, VehicleStatus
+from uavctl.records import ControlMode, InertialSample, Vec3, VehicleStatus
 
 MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
 N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
@@ -164,3 +164,21 @@ def test_what_jumped_is_told_to_nobody(end: FallbackEnd, silent: bool) -> None:
     old = Watching(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
     assert disbelieves(ControlState(fallback=fallback, breach=outside, watching=old)) == silent
     assert not disbelieves(ControlState())
+
+
+def climbing(accel_mps2: Vec3 | None) -> list[str]:
+    """What is held against positions that leap 0.6 m about, of an armed vehicle that others fly; with what it feels."""
+    ours = changed(make_controller(), envelope=changed(PARAMETERS, axes=(True, False, False), disagreement_mps=1e3))
+    said = [sample(START_NS + n * 2 * TICK_NS, position_m=(0.6 * (n // 10 % 2), 0.0, 0.0)) for n in range(N_TICKS // 2)]
+    given = inputs_of(range(N_TICKS), said, status=lambda tick: vehicle(external=False))
+    felt = () if accel_mps2 is None else (InertialSample(at_ns=START_NS, accel_mps2=accel_mps2),)
+    outputs = run(ours, [replace(one, inertial=felt) for one in given])
+    return [output.unsafe for output in outputs]
+
+
+@pytest.mark.fault(66)
+def test_inertial_data_that_are_no_numbers_are_nothing_that_the_vehicle_feels() -> None:
+    found = climbing((0.0, 0.0, 0.0))
+    assert any(found)
+    assert not any(climbing(None))
+    assert climbing((float("nan"), 0.0, 0.0)) == climbing(None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hand_over_rig import ACCEPTED, LAND, Rig
+from hand_over_rig import ACCEPTED, DENIED, LAND, SECOND, Rig
 
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
@@ -139,3 +139,60 @@ def test_nothing_is_broken_off_while_nothing_climbs() -> None:
     rig = Rig().to(HandoverState.ENGAGED)
     rig.tick(unsafe="it is 0.7 m beyond the limit of down")
     assert rig.is_in(HandoverState.ENGAGED) and not rig.codes("refused")
+
+
+@pytest.mark.fault(25, 68)
+@pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("px4", "AUTO.LOITER"), ("ardupilot", "STABILIZE")])
+@pytest.mark.parametrize("end", ["controller", "time", "order"])
+@pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED])
+def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
+    autopilot: str, mode: str, end: str, state: HandoverState
+) -> None:
+    if state is not HandoverState.ENGAGED and mode == "AUTO.LOITER":
+        mode = "ALTCTL"  # PX4's hold is where its climb ends
+    rig = Rig(autopilot).to(HandoverState.CLIMBING)
+    rig.be(landed=False)
+    if state is not HandoverState.CLIMBING:
+        rig.tick(up_m=1.9)
+    if state is HandoverState.ENGAGED:
+        rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+        rig.run(1.0, until=HandoverState.ENGAGED)
+    assert rig.is_in(state)
+    rig.run(0.5)
+    asked = len(rig.asked)
+    rig.be(mode=mode)
+    if end == "controller":
+        rig.tick(land=True, ready=False)
+    elif end == "time":
+        rig.tick(stop=True, ready=False)
+    else:
+        rig.tick(commands=(LAND,))
+    rig.run(5.0)
+    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+
+
+@pytest.mark.fault(67)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_what_is_armed_for_a_take_off_is_asked_to_land_until_it_is_disarmed(autopilot: str) -> None:
+    """It refuses, on the ground, and would climb by itself once nobody asks any more."""
+    rig = Rig(autopilot).to(HandoverState.CLIMBING)
+    rig.tick(commands=(LAND,))
+    for _ in range(100):
+        rig.answer(DENIED, RequestKind.LAND)
+        rig.run(0.3)
+    assert rig.is_in(HandoverState.LANDING) and not rig.hand_over.finished
+    assert rig.asked[-1][0] > rig.view.at_ns - 2 * SECOND
+    rig.be(armed=False)
+    rig.run(1.0)
+    assert rig.is_in(HandoverState.DONE)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_climb_that_is_told_late_does_not_keep_the_controller_from_watching_what_it_flies(ours: bool) -> None:
+    rig = Rig("ardupilot").to(HandoverState.CLIMBING if ours else HandoverState.READY)
+    if ours:
+        rig.tick(up_m=1.9)
+    rig.be(mode="GUIDED", armed=True, landed=False, own_climb=True)
+    rig.run(1.0, until=HandoverState.ENGAGED)
+    flown = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    assert flown is not None and flown.own_climb is not ours  # of another one's climb nobody knows when it ends

@@ -12,7 +12,7 @@ from sim_rig import bench
 from sim.server import Seat, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.app import run
-from uavctl.cli.sim import LANDED, line, view, watching
+from uavctl.cli.sim import HEADINGS, LANDED, line, scene_of, view, watching
 from uavctl.config import load_config
 
 ANY = "udpin://127.0.0.1:0"
@@ -57,6 +57,18 @@ def test_the_table_has_a_row_for_each_vehicle_and_takes_no_text_for_markup() -> 
     assert max(map(len, narrow.splitlines())) <= 80
     for told in (*TOLD, "[red]Failsafe activated[/]"):  # below each other, and none of it cut
         assert told in narrow
+
+
+def test_the_live_page_tells_the_same() -> None:
+    found = scene_of((ONE, replace(ONE, system_id=2, faults=())))
+    assert [body.at_m for body in found.bodies] == [ONE.position_m] * 2
+    told = " ".join(f"{one.name} {one.value}" for one in found.figures)
+    for name in HEADINGS[4:-1]:
+        assert f"{ONE.system_id}: {name}" in told and f"2: {name}" in told
+    assert {one.level for one in found.figures} == {"plain", "warn"} and bool(ONE.faults)
+    assert [event.text for event in found.events] == [f"{ONE.system_id}: {ONE.text}", f"2: {ONE.text}"]
+    alone = scene_of((ONE,)).headline
+    assert ONE.mode in alone and LANDED[ONE.phase] in alone
 
 
 def test_the_line_tells_the_same() -> None:

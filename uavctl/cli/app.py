@@ -34,6 +34,10 @@ _LONGEST_HALF = 500  # characters of a problem at either end
 _COMMANDS = {
     "loopback": ("loopback:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
     "fly": ("fly:fly", "Fly a real vehicle: the flight daemon on a real link."),
+    "fleet": (
+        "fleet:fleet_app",
+        "Fly several vehicles from one file, apart from each other: check, fly, status, land.",
+    ),
     "sim": ("sim:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
     "check": ("check:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
     "design": ("design:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -169,13 +170,22 @@ def bars(*more: ProgressColumn, auto_refresh: bool = True) -> Progress:
     return Progress(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
 
 
+class _Messages(Console):
+    """Standard error, which may be gone: a flight does not end because nobody reads its messages any more."""
+
+    def on_broken_pipe(self) -> None:
+        """Send what comes to nobody, where rich would end the program."""
+        with open(os.devnull, "w") as nobody:  # noqa: PTH123 (a name of the system's, not a path)
+            os.dup2(nobody.fileno(), sys.stderr.fileno())
+
+
 def messages() -> Console:
     """Return the console for messages and progress: standard error.
 
     Called interactive also where it is a file or a pipe: there rich shows no progress, but else would leave an empty
     line where the bar would have been.
     """
-    return Console(stderr=True, force_interactive=True)
+    return _Messages(stderr=True, force_interactive=True)
 
 
 def warn(text: str) -> None:

@@ -70,7 +70,7 @@ for _name, _help in _ORDERS.items():
 @ctl_app.command
 def status(*, which: Which = ANY) -> int:
     """Say how the flight is doing. Exit code 1: no daemon answers."""
-    reply = _ask(ControlRequest(ask="status"), which)
+    reply = ask(ControlRequest(ask="status"), control_folder(which.control), which.vehicle)
     if reply.status is None:
         raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
     found = reply.status
@@ -90,7 +90,7 @@ def _place(text: str) -> Vec3:
 
 
 def _order(request: ControlRequest, which: Which) -> int:
-    reply = _ask(request, which)
+    reply = ask(request, control_folder(which.control), which.vehicle)
     if which.json:
         Common(json=True).show({"ok": reply.ok, "text": reply.text}, str)
     else:
@@ -99,13 +99,13 @@ def _order(request: ControlRequest, which: Which) -> int:
     return 0 if reply.ok else 1
 
 
-def _ask(request: ControlRequest, which: Which) -> Reply:
+def ask(request: ControlRequest, folder: Path, vehicle: str | None) -> Reply:
     """Return the daemon's answer to a request.
 
     Raises:
         NotReachedError: none, or more than one, or no answer.
     """
-    with _reach(control_folder(which.control), which.vehicle) as connection:
+    with _reach(folder, vehicle) as connection:
         try:
             connection.sendall(msgspec.json.encode(request) + b"\n")
             line = b""

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Protocol
 
@@ -243,9 +244,19 @@ MAX_NOTICES = 100  # the same, of the hand-over
 REFRESH_S = 0.25
 SIGNALLED = 128  # exit codes of a process that a signal has ended are this much higher than its number
 LIVE_PORT = 8765  # where Foxglove looks first
-Live = Annotated[bool, Parameter(negative=(), help="serve the topics to a viewer on this machine; needs uavctl[live]")]
+Live = Annotated[
+    bool,
+    Parameter(
+        negative=(),
+        help="show the flight in a browser on this machine and, with uavctl[live], serve its topics to Foxglove",
+    ),
+]
 LivePort = Annotated[
-    int | None, Parameter(help=f"TCP port of the live view, 0 is any free one; else {LIVE_PORT}", validator=FREE_PORT)
+    int | None,
+    Parameter(
+        help=f"TCP port for Foxglove, 0 is any free one; else {LIVE_PORT}. The page's is the next one",
+        validator=FREE_PORT,
+    ),
 ]
 # How long another thread may keep the control thread waiting for the interpreter [s].
 SWITCH_INTERVAL_S = 0.0005
@@ -280,17 +291,31 @@ def live_view_port(*, live: bool, port: int | None) -> int | None:
 
 @contextmanager
 def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
-    """Make what looks on at a flight: views in its recording and, with a port, a live view.
+    """Make what looks on at a flight: views in its recording and, with a port, a live page and a live view.
+
+    Args:
+        live_port: TCP port of the view, the page's is the next one; 0: any free ones.
 
     Raises:
-        UsageError: there can be no live view.
+        UsageError: there can be no live page, or no live view.
     """
+    if live_port is None:
+        yield DerivedTopics(Views())
+        return
+    from logs.live import FlightScene, live_page  # nobody looks: nothing of it is loaded
 
     def tell(port: int) -> None:
-        messages().print(f'live view: ws://localhost:{port} (Foxglove, "Open connection")', soft_wrap=True)
+        messages().print(f'for Foxglove: ws://localhost:{port} ("Open connection")', soft_wrap=True)
 
-    with live_view(live_port, on_open=tell) as watch:
-        yield DerivedTopics(Views(), watch)
+    flight, has_sdk = FlightScene(), find_spec("foxglove") is not None
+    with (
+        live_page(flight.scene, live_port and live_port + 1) as address,
+        live_view(live_port if has_sdk else None, on_open=tell) as watch,
+    ):
+        messages().print(f"live page: {address}", soft_wrap=True)
+        if not has_sdk:
+            messages().print("nothing for Foxglove: that takes pip install 'uavctl[live]'", soft_wrap=True)
+        yield DerivedTopics(Views(), watch, flight.see)
 
 
 def recording_path(out: Path | None, name: str) -> Path:

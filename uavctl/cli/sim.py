@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -31,6 +31,9 @@ from uavctl.mavlink.connection import MOCAP
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
 from uavctl.records import Truth, Vec3
+
+if TYPE_CHECKING:
+    from logs.live import Level, LiveScene
 
 # The simulated peers behind a door of their own, so that signing can be tried without a vehicle.
 
@@ -168,8 +171,11 @@ def line(one: VehicleSnapshot) -> str:
 def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]], None]]:
     """Show snapshots of vehicles given to the yielded function: a live table, or a line each second without a terminal.
 
-    A thread of its own draws, so whoever tells never waits, not even for a terminal that has stopped.
+    The same is on a page for browsers on this machine. A thread of its own draws, so whoever tells never waits, not
+    even for a terminal that has stopped.
     """
+    from logs.live import live_page  # nobody looks: nothing of it is loaded
+
     latest: list[tuple[VehicleSnapshot, ...]] = []
     done = threading.Event()
 
@@ -179,26 +185,55 @@ def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]
     draw = _draw if console.is_terminal else _write
     if not console.is_terminal:
         console.print("--view: no terminal to draw in, so a line a second", soft_wrap=True)
-    thread = threading.Thread(target=draw, args=(console, latest, done), name="view", daemon=True)
-    thread.start()
-    try:
-        yield tell
-    finally:
-        done.set()
-        thread.join(END_S)
+    with live_page(lambda: scene_of(latest[0]) if latest else None, 0) as address:
+        thread = threading.Thread(target=draw, args=(console, address, latest, done), name="view", daemon=True)
+        thread.start()
+        try:
+            yield tell
+        finally:
+            done.set()
+            thread.join(END_S)
 
 
-def _draw(console: Console, latest: list[tuple[VehicleSnapshot, ...]], done: threading.Event) -> None:
+def scene_of(looks: Looks) -> LiveScene:
+    """Return what a live page shows of simulated vehicles."""
+    from logs.live import LiveScene, SceneBody, SceneEvent, SceneFigure
+
+    figures, events = [], []
+    for one in looks:
+        level: Level = "warn" if one.faults else "plain"
+        cells = zip(HEADINGS[4:-1], _cells(one)[4:-1], strict=True)
+        name = f"{one.system_id}: " if len(looks) > 1 else ""
+        figures += [SceneFigure(f"{name}{heading}", cell, level) for heading, cell in cells]
+        if one.text:
+            events.append(SceneEvent(one.time_s, "plain", f"{name}{one.text}"))
+    told = [f"{one.mode}, {'armed' if one.armed else 'disarmed'}, {LANDED[one.phase]}" for one in looks]
+    return LiveScene(
+        title="uavctl sim",
+        time_s=max(one.time_s for one in looks),
+        headline=told[0] if len(told) == 1 else f"{len(told)} vehicles",
+        level="plain",
+        bodies=tuple(SceneBody(f"vehicle {one.system_id}", one.position_m) for one in looks),
+        figures=tuple(figures),
+        events=tuple(events),
+    )
+
+
+Latest = list[tuple[VehicleSnapshot, ...]]
+
+
+def _draw(console: Console, address: str, latest: Latest, done: threading.Event) -> None:
     # Standard output stays what it is: the line that says that the ports are open may go to another program.
     with Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         ended = False
         while not ended:
             ended = done.wait(REFRESH_S)
             for looks in latest:
-                live.update(view(looks), refresh=True)
+                live.update(Group(f"live page: {address}", view(looks)), refresh=True)
 
 
-def _write(console: Console, latest: list[tuple[VehicleSnapshot, ...]], done: threading.Event) -> None:
+def _write(console: Console, address: str, latest: Latest, done: threading.Event) -> None:
+    console.print(f"live page: {address}", soft_wrap=True)
     ended = False
     while not ended:
         ended = done.wait(LINE_S)
@@ -256,7 +291,11 @@ def sim(
         ),
     ] = 1,
     view: Annotated[
-        bool, Parameter(negative=(), help="show on standard error what happens; without a terminal a line a second")
+        bool,
+        Parameter(
+            negative=(),
+            help="show what happens on standard error, without a terminal a line a second, and in a browser",
+        ),
     ] = False,
 ) -> int:
     """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""

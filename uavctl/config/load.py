@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 from msgspec import NODEFAULT, Meta
@@ -397,6 +397,25 @@ def _short(value: object) -> str:
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
 
 
+D = TypeVar("D", bound=Section)
+
+
+def read_document(section: type[D], path: Path) -> tuple[D | None, Source, list[ConfigProblem]]:
+    """Read a TOML file that is one section; with the places of its keys, and the problems found.
+
+    Raises:
+        ConfigError: it cannot be read, or is no TOML.
+    """
+    try:
+        text = "\n".join(read_lines(path)) + "\n"
+    except DataFileError as error:
+        raise ConfigError(error.reasons) from error
+    table = parse_toml(text, str(path))
+    found = list(oversized(table))
+    document = None if found else decode(section, table, "", found, {})
+    return cast(D | None, document), Source(str(path), key_lines(text)), found
+
+
 # A list of faults from a TOML file of its own: the same tables as `[[sim.fault]]`, headed `[[fault]]`.
 
 
@@ -421,19 +440,11 @@ def with_faults(config: Config, path: Path, check: Check) -> Config:
     Raises:
         ConfigError: With all problems found in the file, each with its line.
     """
-    try:
-        text = "\n".join(read_lines(path)) + "\n"
-    except DataFileError as error:
-        raise ConfigError(error.reasons) from error
-    found: list[ConfigProblem] = []
-    table = parse_toml(text, str(path))
-    found.extend(oversized(table))
-    script = None if found else decode(_FaultFile, table, "", found, {})
-    given = script.fault if isinstance(script, _FaultFile) else ()
+    script, source, found = read_document(_FaultFile, path)
+    given = () if script is None else script.fault
     found.extend(faults("fault", given, config.sim.plant))
     found.extend(check(config.sim.autopilot, given, "fault"))
     if found:
-        source = Source(str(path), key_lines(text))
         raise ConfigError(tuple(source.tell(problem) for problem in found))
     sim = msgspec.structs.replace(config.sim, fault=(*config.sim.fault, *given))
     return msgspec.structs.replace(config, sim=sim)

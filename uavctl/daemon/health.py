@@ -78,6 +78,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     who_flies: str = ""  # state of the hand-over
     ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
     relay: RelayHealth | None = None  # None where no positions are passed on
+    let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
 
 
 class Flight(Protocol):
@@ -193,6 +194,7 @@ class HealthWatch:
             who_flies=flight.who_flies.value,
             ending=flight.course.told,
             relay=self._relay(),
+            let_go=flight.let_go,
         )
 
     def _relay(self) -> RelayHealth | None:

@@ -81,7 +81,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     watching: Watching = NOT_WATCHING  # state of the envelope check in this flight
     aloft: Watching = NOT_WATCHING  # the same of positions while the vehicle is armed and others fly it
     strayed: bool = False  # these could not be its own, at some time since it was armed
-    felt: tuple[Vec3, int] = (ZERO, 0)  # acceleration that the vehicle felt last [m/s²], and when [ns]
+    felt: tuple[Vec3, int] | None = None  # acceleration that the vehicle felt last [m/s²], and when [ns]; None before
     breach: Breach | None = None  # the breach that it found; None for none
     # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since
     recalled: bool = False

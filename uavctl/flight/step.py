@@ -237,7 +237,7 @@ def step(
             unsafe = strange.text
         elif armed and vehicle is not None and not vehicle.landed:
             unsafe = _unsafe(tick, inp, controller)
-    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,) and _feels(state, inp)
+    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,) and _felt(state, inp) is not None
     if strange is not None and carried:
         clean_ns = aloft.clean_ns or inp.at_ns
         history = without(controller.kalman, history, lambda sample: captured_ns(sample) > clean_ns)
@@ -308,26 +308,28 @@ def step(
 
 def _aloft(
     state: ControlState, tick: Tick, intake: MeasurementUpdate, inp: StepInput, controller: Controller
-) -> tuple[Watching, tuple[Vec3, int], Breach | None]:
+) -> tuple[Watching, tuple[Vec3, int] | None, Breach | None]:
     """Hold the positions of an armed vehicle that others fly against its own senses.
 
     What its inertial sensors feel takes the place of what was sent. Without them its own velocity is all there is.
     """
     if controller.envelope is None:
         return NOT_WATCHING, state.felt, None
-    felt = [one.accel_mps2 for one in inp.inertial if all(map(math.isfinite, one.accel_mps2))]
-    feels, felt_ns = (_mean(felt), inp.at_ns) if felt else state.felt
-    known = _feels(state, inp)
-    seen = seen_of(tick, inp, feels if known else ZERO, controller.plant, intake.accepted)
+    felt = _felt(state, inp)
+    known = felt is not None
+    seen = seen_of(tick, inp, ZERO if felt is None else felt[0], controller.plant, intake.accepted)
     watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
     # Once positions were wrong its own velocity may be, too: they are all that its estimate has.
     counts = breach is not None and (not state.strayed if breach.code == VELOCITY else known)
-    return watching, (feels, felt_ns), breach if counts else None
+    return watching, felt, breach if counts else None
 
 
-def _feels(state: ControlState, inp: StepInput) -> bool:
-    """Whether the vehicle's inertial sensors tell how it accelerates."""
-    return bool(inp.inertial) or inp.at_ns - state.felt[1] <= MOTION_NS
+def _felt(state: ControlState, inp: StepInput) -> tuple[Vec3, int] | None:
+    """Return the acceleration that the vehicle felt last [m/s²], and when [ns]; None where it is too old or none."""
+    felt = [one.accel_mps2 for one in inp.inertial if all(map(math.isfinite, one.accel_mps2))]
+    if felt:
+        return _mean(felt), inp.at_ns
+    return state.felt if state.felt is not None and inp.at_ns - state.felt[1] <= MOTION_NS else None
 
 
 def _mean(vectors: Sequence[Vec3]) -> Vec3:

@@ -142,6 +142,9 @@ class HandOver:
         if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._now.stands_by:
             return vehicle
         if self.state is HandoverState.ENGAGED:
+            if self.ours:
+                # It tells once a second whether it climbs by itself, and it was we who ended that.
+                vehicle = msgspec.structs.replace(vehicle, own_climb=False)
             past = self._now.shows_the_past(vehicle)
             return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
         return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")

@@ -153,22 +153,23 @@ def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
     vehicle, state = view.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
         return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
-    if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
-        return GuardResult(HandoverEvent.LAND)
-    if state is HandoverState.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
-        return GuardResult(
-            HandoverEvent.LAND
-        )  # the controller has ended without a landing, and nobody else has what we took off
-    if state in _CLIMBS and view.unsafe:
-        return GuardResult(HandoverEvent.UNSAFE, f"{BROKEN_OFF}{view.unsafe}")
     there = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not silent(view.at_ns, vehicle):
         there = _LOOKS.get(state, _around)(progress, view, vehicle)
-    taken = (
-        state is HandoverState.FAILSAFE and there.seen is HandoverEvent.OTHER
-    )  # time is up, but the pilot has it: nothing is asked
-    if there.seen in (HandoverEvent.GRANTED, HandoverEvent.REFUSED) or taken:
+    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
+    if there.seen is HandoverEvent.OTHER and not lands and state not in (HandoverState.WAITING, HandoverState.READY):
+        return there  # whatever ends the flight: what the pilot has taken is asked for nothing
+    if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
+        return GuardResult(HandoverEvent.LAND)
+    if state is HandoverState.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
+        # The controller has ended without a landing, and nobody else has what we took off.
+        return GuardResult(HandoverEvent.LAND)
+    if state in _CLIMBS and view.unsafe:
+        return GuardResult(HandoverEvent.UNSAFE, f"{BROKEN_OFF}{view.unsafe}")
+    if there.seen in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
         return there
+    if there.seen is HandoverEvent.DISARMED and state is HandoverState.LANDING:
+        return there  # whatever it answered, it is down
     why = _given_up(progress, view)
     return GuardResult(HandoverEvent.REFUSED, why) if why else there
 
@@ -186,11 +187,11 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
 
 
 def _must_land(progress: Progress, view: HandoverView) -> bool:
-    """Whether it is asked to land, whatever it answers: what we took off and hear in the air has nobody else."""
+    """Whether it is asked to land, whatever it answers: what we took off, or armed for that, has nobody else."""
     vehicle = view.vehicle
     if progress.state is not HandoverState.LANDING or progress.ordered_ns is None or vehicle is None:
         return False
-    heard = vehicle.armed and not vehicle.landed and not silent(view.at_ns, vehicle)
+    heard = vehicle.armed and not silent(view.at_ns, vehicle)
     return heard and view.at_ns - progress.since_ns < round(MUST_LAND * progress.config.land_s * 1e9)
 
 

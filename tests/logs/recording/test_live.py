@@ -144,7 +144,7 @@ def test_the_end_does_not_wait_for_a_stalled_viewer() -> None:
 
 
 @pytest.mark.slow
-def test_a_flight_in_real_time_is_the_same_beside_a_stalled_viewer(tmp_path: Path) -> None:
+def test_a_flight_in_real_time_is_the_same_beside_viewers_that_have_stalled(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "uavctl", "loopback", "--udp", "--config", "paper", "--duration", "4"]
     command += ["--set", "solver.method=exact"]  # it needs no policy library
     command += ["--live", "--live-port", "0", "--out", str(tmp_path), "--json"]
@@ -153,10 +153,15 @@ def test_a_flight_in_real_time_is_the_same_beside_a_stalled_viewer(tmp_path: Pat
             assert flight.stderr is not None
             said = iter(flight.stderr.readline, "")
             port = next((int(found[1]) for line in said if (found := re.search(r"ws://localhost:(\d+)", line))), 0)
-            assert port, "it ended before it served anything"
+            page = next((int(found[1]) for line in said if (found := re.search(r"http://localhost:(\d+)", line))), 0)
+            assert port and page, "it ended before it served anything"
+            # A page that asks for states, and takes none.
+            stalled = socket.create_connection(("127.0.0.1", page))
+            stalled.sendall(b"GET /scenes HTTP/1.1\r\nHost: localhost\r\n\r\n")
             with Viewer(port, receive_bytes=4096) as viewer:
                 viewer.subscribe(viewer.channels({"/uavctl/decision", "/plot/age", "/view/scene/path"}))
                 out, _ = flight.communicate(timeout=60)
+            stalled.close()
         finally:
             flight.kill()
     summary = json.loads(out)

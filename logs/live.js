@@ -1,0 +1,159 @@
+"use strict";
+// Draws what comes from /scenes. Paths are collected here, from the moment on at which the page was opened.
+const PATH = 300, MINUTE_S = 60;
+const byId = (id) => document.getElementById(id);
+const paths = new Map(), ages = [];
+let scene = null, heard = 0;
+
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
+
+function canvasOf(id) {
+  const canvas = byId(id), ratio = window.devicePixelRatio || 1, width = canvas.clientWidth;
+  const height = Number(canvas.dataset.height || (canvas.dataset.height = canvas.getAttribute("height")));
+  canvas.style.height = height + "px";
+  canvas.width = width * ratio;
+  canvas.height = height * ratio;
+  const pen = canvas.getContext("2d");
+  pen.scale(ratio, ratio);
+  pen.font = "12px system-ui, sans-serif";
+  return [pen, width, height];
+}
+
+// A view from above: across = east, up = north; from the south: across = east, up = height.
+function drawView(id, up) {
+  const [pen, width, height] = canvasOf(id);
+  const flat = (at) => [at[1], up === 2 ? -at[2] : at[0]];
+  const seen = [];
+  const corners = (box) => {
+    if (!box) return null;
+    const low = box.lower_m, high = box.upper_m;
+    const span = up === 2 ? [high[2] === null ? null : -high[2], low[2] === null ? null : -low[2]] : [low[0], high[0]];
+    return {left: low[1], right: high[1], bottom: span[0], top: span[1]};
+  };
+  const box = corners(scene.box), margins = corners(scene.margins);
+  for (const body of scene.bodies) seen.push(flat(body.at_m));
+  for (const path of paths.values()) for (const at of path) seen.push(flat(at));
+  if (scene.target_m) seen.push(flat(scene.target_m));
+  if (box) {
+    for (const x of [box.left, box.right]) if (x !== null) seen.push([x, seen.length ? seen[0][1] : 0]);
+    for (const y of [box.bottom, box.top]) if (y !== null) seen.push([seen.length ? seen[0][0] : 0, y]);
+  }
+  if (!seen.length) return;
+  const xs = seen.map((at) => at[0]), ys = seen.map((at) => at[1]);
+  const x0 = Math.min(...xs), x1 = Math.max(...xs), y0 = Math.min(...ys), y1 = Math.max(...ys);
+  const scale = Math.min((width - 60) / Math.max(x1 - x0, 1), (height - 50) / Math.max(y1 - y0, 1));
+  const px = (x) => width / 2 + (x - (x0 + x1) / 2) * scale, py = (y) => height / 2 - (y - (y0 + y1) / 2) * scale;
+  const line = (points, ink, wide, dash) => {
+    pen.strokeStyle = ink; pen.lineWidth = wide; pen.setLineDash(dash || []);
+    pen.beginPath();
+    points.forEach((at, i) => (i ? pen.lineTo(px(at[0]), py(at[1])) : pen.moveTo(px(at[0]), py(at[1]))));
+    pen.stroke(); pen.setLineDash([]);
+  };
+  const frame = (sides, ink, dash) => {
+    const left = sides.left ?? x0, right = sides.right ?? x1, bottom = sides.bottom ?? y0, top = sides.top ?? y1;
+    if (sides.left !== null) line([[left, bottom], [left, top]], ink, 1.5, dash);
+    if (sides.right !== null) line([[right, bottom], [right, top]], ink, 1.5, dash);
+    if (sides.bottom !== null) line([[left, bottom], [right, bottom]], ink, 1.5, dash);
+    if (sides.top !== null) line([[left, top], [right, top]], ink, 1.5, dash);
+  };
+  if (box) frame(box, colour("muted"));
+  if (margins) frame(margins, colour("margin"), [5, 4]);
+  for (const [name, path] of paths) line(path.map(flat), name === "truth" ? colour("plain") : colour("good"), 1.5);
+  if (scene.plan.length) line(scene.plan.map(flat), colour("plan"), 2.5);
+  pen.fillStyle = colour("ink");
+  if (scene.target_m) {
+    const [x, y] = flat(scene.target_m);
+    line([[x - 8 / scale, y], [x + 8 / scale, y]], colour("ink"), 1.5);
+    line([[x, y - 8 / scale], [x, y + 8 / scale]], colour("ink"), 1.5);
+  }
+  for (const body of scene.bodies) {
+    const [x, y] = flat(body.at_m);
+    pen.fillStyle = colour(body.level);
+    pen.beginPath(); pen.arc(px(x), py(y), 5, 0, 7); pen.fill();
+    const room = px(x) + 8 + pen.measureText(body.name).width < width;
+    pen.textAlign = room ? "left" : "right";
+    pen.fillText(body.name, px(x) + (room ? 8 : -8), py(y) + (body.name === "truth" ? 14 : -6));
+  }
+  pen.textAlign = "left";
+  pen.fillStyle = colour("muted");
+  const rod = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50].find((metres) => metres * scale > 40) || 100;
+  pen.fillRect(10, height - 10, rod * scale, 2);
+  pen.fillText(rod + " m", 10, height - 15);
+}
+
+function drawAges() {
+  byId("ages").hidden = scene.age_s === null && !ages.length;
+  if (byId("ages").hidden || !ages.length) return;
+  const [pen, width, height] = canvasOf("age");
+  const now = ages[ages.length - 1][0], limit = scene.age_limit_s;
+  const most = Math.max(0.2, ...ages.map((one) => one[1])) * 1.15;
+  const px = (t) => width - 8 - ((now - t) / MINUTE_S) * (width - 48), py = (age) => height - 18 - (age / most) * (height - 34);
+  pen.fillStyle = colour("muted");
+  pen.fillText("0 s", 4, height - 14);
+  pen.fillText(most.toFixed(1) + " s", 4, 14);
+  pen.fillText("a minute ago", 40, height - 3);
+  pen.textAlign = "right"; pen.fillText("now", width - 8, height - 3); pen.textAlign = "left";
+  if (limit !== null && limit < most) {
+    pen.strokeStyle = colour("bad"); pen.setLineDash([5, 4]);
+    pen.beginPath(); pen.moveTo(40, py(limit)); pen.lineTo(width - 8, py(limit)); pen.stroke(); pen.setLineDash([]);
+    pen.fillText("plan's end", 44, py(limit) - 4);
+  }
+  pen.strokeStyle = colour("plan"); pen.lineWidth = 1.5; pen.beginPath();
+  ages.forEach(([t, age], i) => (i ? pen.lineTo(px(t), py(age)) : pen.moveTo(px(t), py(age))));
+  pen.stroke();
+}
+
+function row(cells, level) {
+  const tr = document.createElement("tr");
+  cells.forEach((text, i) => {
+    const cell = document.createElement(i ? "td" : "th");
+    cell.textContent = text;
+    if (i) cell.className = level;
+    tr.append(cell);
+  });
+  return tr;
+}
+
+function draw() {
+  byId("title").textContent = scene.title + ", " + scene.time_s.toFixed(1) + " s";
+  const head = byId("headline");
+  head.textContent = scene.headline;
+  head.className = scene.level;
+  drawView("above", 0);
+  drawView("side", 2);
+  drawAges();
+  byId("figures").replaceChildren(...scene.figures.map((one) => row([one.name, one.value], one.level)));
+  byId("events").replaceChildren(...scene.events.map((one) => {
+    const item = document.createElement("li");
+    item.className = one.level;
+    item.textContent = one.time_s.toFixed(1) + " s  " + one.text;
+    return item;
+  }));
+}
+
+const source = new EventSource("/scenes");
+source.onmessage = (message) => {
+  const next = JSON.parse(message.data);
+  heard = Date.now();
+  if (!next) return;
+  if (scene && next.time_s < scene.time_s) { paths.clear(); ages.length = 0; }
+  scene = next;
+  for (const body of scene.bodies) {
+    const path = paths.get(body.name) || [];
+    path.push(body.at_m);
+    if (path.length > PATH) path.shift();
+    paths.set(body.name, path);
+  }
+  if (scene.age_s !== null) ages.push([scene.time_s, scene.age_s]);
+  while (ages.length && ages[0][0] < scene.time_s - MINUTE_S) ages.shift();
+  draw();
+};
+// A state that is old looks like a vehicle that stands still, so the page says that it is.
+setInterval(() => {
+  if (heard && Date.now() - heard > 1000) {
+    const head = byId("headline");
+    head.textContent = "nothing has come for " + Math.round((Date.now() - heard) / 1000) + " s: the program has ended, or hangs";
+    head.className = "bad";
+  }
+}, 500);
+window.addEventListener("resize", () => scene && draw());

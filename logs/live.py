@@ -1,0 +1,322 @@
+"""Live page: what goes on now, for any browser on this machine.
+
+A `LiveScene` holds what is to be seen at a moment. A server of the standard library sends it ten times a second to
+each page that is open, as events of one long answer; without a page nothing is made. Whoever flies, or simulates, only
+leaves its newest state behind, and never waits.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import msgspec
+
+from logs.recording.derived_topics import tightened
+from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats, design_view
+from uavctl.errors import RecordingError, UsageError
+from uavctl.records import (
+    ControlMode,
+    Decision,
+    Estimate,
+    Event,
+    Header,
+    LinkEstimate,
+    Plan,
+    Record,
+    Setpoint,
+    Severity,
+    Timing,
+    Truth,
+    Vec3,
+    VehicleStatus,
+)
+
+HOST = "127.0.0.1"
+NAMES = frozenset({HOST, "localhost"})  # by which a page may ask: another one's would be a foreign site's
+PERIOD_S = 0.1  # between two states
+MOST_PAGES = 4  # open at once
+PATIENCE_S = 5.0  # a page that takes nothing for so long is let go
+MOST_EVENTS = 12
+PAGE = Path(__file__).with_name("live.html")
+SCRIPT = Path(__file__).with_name("live.js")
+R = TypeVar("R", bound=Record)
+Level = Literal["good", "warn", "bad", "plain"]
+_LEVELS: dict[Severity, Level] = {Severity.INFO: "plain", Severity.WARNING: "warn", Severity.ERROR: "bad"}
+_IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
+
+
+class SceneBody(msgspec.Struct, frozen=True):
+    """A vehicle, or an estimate of one."""
+
+    name: str
+    at_m: Vec3  # local NED
+    level: Level = "good"
+
+
+class SceneBox(msgspec.Struct, frozen=True):
+    """Limits of a place, local NED; an open side is null."""
+
+    lower_m: tuple[float | None, ...]
+    upper_m: tuple[float | None, ...]
+
+
+class SceneFigure(msgspec.Struct, frozen=True):
+    """A figure with its name."""
+
+    name: str
+    value: str
+    level: Level = "plain"
+
+
+class SceneEvent(msgspec.Struct, frozen=True):
+    """A message to a person."""
+
+    time_s: float
+    level: Level
+    text: str
+
+
+class LiveScene(msgspec.Struct, frozen=True):
+    """All that a page shows at a moment."""
+
+    title: str
+    time_s: float
+    headline: str
+    level: Level
+    bodies: tuple[SceneBody, ...] = ()
+    plan: tuple[Vec3, ...] = ()  # predicted places, local NED
+    target_m: Vec3 | None = None
+    box: SceneBox | None = None
+    margins: SceneBox | None = None  # what the plan's last stage leaves of the box
+    age_s: float | None = None
+    age_limit_s: float | None = None
+    figures: tuple[SceneFigure, ...] = ()
+    events: tuple[SceneEvent, ...] = ()
+
+
+class FlightScene:
+    """Keeps the newest record of each kind; whoever puts records never waits for whoever looks."""
+
+    def __init__(self) -> None:
+        self._newest: dict[type[Record], Record] = {}
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._design: DesignView | None = None
+
+    def see(self, record: Record) -> None:
+        """Take a record."""
+        self._newest[type(record)] = record
+        if isinstance(record, Event):
+            self._events.append(record)
+        elif isinstance(record, Header):
+            try:
+                self._design = design_view(record)
+            except RecordingError:
+                self._design = None  # the page then draws no limits
+
+    def scene(self) -> LiveScene | None:
+        """Return what is to be seen now; None before the first decision."""
+        decision, design = self._get(Decision), self._design
+        header, estimate, plan, truth = self._get(Header), self._get(Estimate), self._get(Plan), self._get(Truth)
+        if decision is None or header is None:
+            return None
+        age_s = None if estimate is None else max(0.0, estimate.age_s)
+        limit_s = None if design is None else design.horizon * design.dt_s
+        bodies = []
+        if estimate is not None and design is not None:
+            level: Level = "good" if decision.news else "warn"
+            place = design.position_of(estimate.mean)
+            bodies.append(SceneBody("estimate", place, level if decision.mode in _IN_CONTROL else "bad"))
+        if truth is not None:
+            bodies.append(SceneBody("truth", truth.position_m, "plain"))
+        current = plan if plan is not None and plan.seq == decision.plan_seq else None
+        level = _level_of(decision, age_s, limit_s)
+        return LiveScene(
+            title=f"{header.command.split(' ')[0] or 'flight'}: {header.design_id[:8]}",
+            time_s=(decision.at_ns - header.started_ns) * 1e-9,
+            headline=_headline(decision, age_s),
+            level=level,
+            bodies=tuple(bodies),
+            plan=() if current is None or design is None else _places(design, current),
+            target_m=None if decision.target is None or design is None else design.position_of(decision.target),
+            box=None if design is None else _box(design, design.state_box.lower, design.state_box.upper),
+            margins=None
+            if current is None or design is None
+            else _box(design, *tightened(design, current.backoff_x, -1)),
+            age_s=age_s,
+            age_limit_s=limit_s,
+            figures=tuple(self._figures(decision, current)),
+            events=tuple(
+                SceneEvent((event.at_ns - header.started_ns) * 1e-9, _LEVELS[event.severity], event.text)
+                for event in reversed(self._events.copy())
+            ),
+        )
+
+    def _figures(self, decision: Decision, plan: Plan | None) -> Iterator[SceneFigure]:
+        vehicle, setpoint = self._get(VehicleStatus), self._get(Setpoint)
+        link, timing = self._get(LinkEstimate), self._get(Timing)
+        if vehicle is None:
+            yield SceneFigure("vehicle", "not heard yet", "warn")
+        else:
+            armed = "armed" if vehicle.armed else "disarmed"
+            yield SceneFigure("vehicle", f"{vehicle.mode}, {armed}", "bad" if vehicle.failsafe else "plain")
+            if vehicle.battery_v is not None:
+                yield SceneFigure("battery", f"{vehicle.battery_v:.1f} V")
+        if link is not None:
+            lost = 1.0 - link.arrival_mean
+            yield SceneFigure("steps without news", f"{lost:.0%}", "warn" if link.below_promise else "plain")
+        if setpoint is not None:
+            told = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
+            limited = f" (limited: {', '.join(setpoint.limited)})" if setpoint.limited else ""
+            yield SceneFigure("setpoint N, E, D [m/s²]", told + limited, "warn" if limited else "plain")
+        if plan is not None:
+            gave = f", gave way by {plan.slack:.2g}" if plan.gave_way else ""
+            yield SceneFigure("plan", f"{plan.status.value}, {plan.method}{gave}", "warn" if gave else "plain")
+        if decision.unexplained_mps2 is not None:
+            yield SceneFigure("unexplained acceleration", f"{decision.unexplained_mps2:.2f} m/s²")
+        if timing is not None:
+            yield SceneFigure("tick late by", f"{timing.lateness_ns * 1e-6:.1f} ms")
+
+    def _get(self, kind: type[R]) -> R | None:
+        found = self._newest.get(kind)
+        return found if isinstance(found, kind) else None
+
+
+def _headline(decision: Decision, age_s: float | None) -> str:
+    age = "no position yet" if age_s is None else f"newest position {age_s:.2f} s old"
+    return (
+        f"{decision.mode.value}: {decision.reason or age}"
+        if decision.mode not in _IN_CONTROL
+        else (f"{decision.mode.value}: {age}")
+    )
+
+
+def _level_of(decision: Decision, age_s: float | None, limit_s: float | None) -> Level:
+    if decision.mode not in _IN_CONTROL:
+        return "bad"
+    return "warn" if age_s is None or (limit_s is not None and age_s > 0.5 * limit_s) else "good"
+
+
+def _places(design: DesignView, plan: Plan) -> tuple[Vec3, ...]:
+    rows = design.positions_of(plan.states).tolist()
+    return tuple((north, east, down) for north, east, down in rows)
+
+
+def _box(design: DesignView, lower: Floats, upper: Floats) -> SceneBox:
+    """Return the limits of the positions among those of the states."""
+    sides: list[tuple[float | None, ...]] = []
+    for limits in (lower, upper):
+        found: list[float | None] = [None, None, None]
+        for axis, index in zip(design.axes, design.position_index, strict=True):
+            if math.isfinite(limits[index]):
+                found[AXIS_NUMBER[axis]] = float(limits[index])
+        sides.append(tuple(found))
+    return SceneBox(*sides)
+
+
+Look = Callable[[], LiveScene | None]
+
+
+@contextmanager
+def live_page(look: Look, port: int) -> Iterator[str]:
+    """Serve the page on this machine alone; yields its address.
+
+    Args:
+        look: gives what is to be seen now, from any thread; None while there is nothing yet.
+        port: TCP port, 0 for a free one.
+
+    Raises:
+        UsageError: the port cannot be had.
+    """
+    if not 0 <= port <= 65535:
+        raise UsageError(f"live page: port {port}; ports are 1 to 65535, and 0 takes one that is free")
+    try:
+        server = _Server(look, port)
+    except OSError as error:
+        raise UsageError(
+            f"live page: port {port} cannot be had ({error.strerror}); choose another, or 0 for one that is free"
+        ) from error
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, name="live page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://localhost:{server.server_port}/"
+    finally:
+        server.ended.set()
+        server.shutdown()
+        server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False  # a page that has stalled takes its leave by itself
+
+    def __init__(self, look: Look, port: int) -> None:
+        self.look, self.ended = look, threading.Event()
+        self.seats = threading.BoundedSemaphore(MOST_PAGES)
+        super().__init__((HOST, port), _Handler)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing: a browser that goes away is no error."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = PATIENCE_S
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "uavctl", ""
+
+    def do_GET(self) -> None:
+        """Answer a page, its script, or its stream of states."""
+        if self.headers.get("Host", "").rsplit(":", 1)[0] not in NAMES:
+            self.send_error(HTTPStatus.FORBIDDEN, "only this machine, by the name of localhost")
+        elif self.path == "/":
+            self._file(PAGE, "text/html; charset=utf-8")
+        elif self.path == "/live.js":
+            self._file(SCRIPT, "text/javascript; charset=utf-8")
+        elif self.path == "/scenes":
+            self._scenes()
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: standard error is the flight's."""
+
+    def _file(self, path: Path, kind: str) -> None:
+        data = path.read_bytes()
+        self._begin(kind, length=len(data))
+        self.wfile.write(data)
+
+    def _scenes(self) -> None:
+        if not self.server.seats.acquire(blocking=False):
+            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_PAGES} pages are open")
+            return
+        try:
+            self._begin("text/event-stream")
+            self.close_connection = True
+            while not self.server.ended.is_set():
+                scene = self.server.look()
+                self.wfile.write(b"data: " + msgspec.json.encode(scene) + b"\n\n")
+                self.server.ended.wait(PERIOD_S)
+        except OSError:  # it has gone, or takes nothing any more
+            self.close_connection = True
+        finally:
+            self.server.seats.release()
+
+    def _begin(self, kind: str, length: int | None = None) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Content-Security-Policy", "default-src 'self'; style-src 'unsafe-inline'")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        if length is None:
+            self.send_header("Connection", "close")
+        else:
+            self.send_header("Content-Length", str(length))
+        self.end_headers()

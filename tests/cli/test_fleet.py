@@ -1,0 +1,217 @@
+"""`uavctl fleet`: what is refused, that boxes which are apart keep vehicles apart, and that all land together."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
+from patience import until
+
+from sim.server import Seat, serve_all
+from uavctl.cli.app import run
+from uavctl.cli.ctl import ask
+from uavctl.cli.fleet import Member, horizontally_apart_m, read_fleet
+from uavctl.config import load_config
+from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
+from uavctl.errors import ConfigError, NotReachedError
+from uavctl.records import Truth
+
+SPACING_M = 0.5
+WEST, EAST = (-2.5, -0.4), (0.4, 2.5)  # the vehicles' limits, east
+
+
+def entry(name: str, east_m: tuple[float, float], link: str, mocap: str = "udpin://127.0.0.1:0", *more: str) -> str:
+    """A vehicle's table."""
+    low, high = east_m
+    settings = [
+        f"sets.state_lower=[-3,-1.5,-inf,{low},-1.5,-inf,-2.5,-1,-inf]",
+        f"sets.state_upper=[3,1.5,inf,{high},1.5,inf,0,1,inf]",
+        f"target.position_m=[0.5,{(low + high) / 2:.2f},-1.2]",
+        *more,
+    ]
+    return (
+        f'[[vehicle]]\nname = "{name}"\nconfig = "room-px4"\nvehicle = "{link}"\nmocap = "{mocap}"\n'
+        f"set = {json.dumps(settings)}\n"
+    )
+
+
+A, B = "udpin://127.0.0.1:24541", "udpin://127.0.0.1:24542"
+HEAD = f"spacing_m = {SPACING_M}\n"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "fleet.toml"
+    path.write_text(HEAD + entry("west", WEST, A) + entry("east", EAST, B))
+    return path
+
+
+def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["fleet", "check", str(file), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in found["vehicles"]] == ["west", "east"]
+    assert found["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD + entry("a", WEST, A) + entry("b", (-0.2, 2.5), B), ("a and b", "0.20 m apart", "spacing_m")),
+        (HEAD + entry("a", WEST, A) + entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
+        (HEAD + entry("a", WEST, A) + entry("a", EAST, B), ("two vehicles are named a",)),
+        (HEAD + entry("a", WEST, A) + entry("b", EAST, A), ("one link", A)),
+        (HEAD, ("vehicle",)),
+        (entry("a", WEST, A), ("spacing_m",)),
+        ("spacing_m = 0\n" + entry("a", WEST, A), ("spacing_m",)),
+        (HEAD + entry("a", WEST, A) + "wings = 2\n", ("wings",)),
+        (HEAD + entry("a b", WEST, A), ("name",)),
+        (HEAD + entry("a", WEST, A, "", "link.loss=2"), ("a", "link.loss")),
+        (HEAD + '[[vehicle]]\nname = "a"\nconfig = "rom"\n', ("rom",)),
+        ("spacing_m = \n", ("fleet.toml:1",)),
+    ],
+)
+def test_a_fleet_that_cannot_be_flown_is_refused_with_the_place(
+    tmp_path: Path, text: str, words: tuple[str, ...]
+) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_fleet(path)
+    told = str(caught.value)
+    assert "fleet.toml:" in told
+    for word in words:
+        assert word in told
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["check"], ["status"], ["land"], ["fly", "--out", str(tmp_path / "out")]):
+        assert run(["fleet", *command[:1], str(tmp_path / "none.toml"), *command[1:]]) == 2
+        assert "none.toml" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_daemons_status_and_land_say_so(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fleet", "status", str(file), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out) == {"vehicles": {"west": None, "east": None}}
+    assert run(["fleet", "land", str(file)]) == 1
+    told = capsys.readouterr().err
+    assert "west: land not reached" in told and "east: land not reached" in told
+
+
+INTERVAL = st.tuples(st.floats(-5, 5), st.floats(0.01, 3)).map(lambda one: (one[0], one[0] + one[1]))
+BASE = load_config("room-px4")
+
+
+def member(north: tuple[float, float], east: tuple[float, float]) -> Member:
+    lower, upper = list(BASE.sets.state_lower), list(BASE.sets.state_upper)
+    (lower[0], upper[0]), (lower[3], upper[3]) = north, east
+    sets = replace(BASE.sets, state_lower=tuple(lower), state_upper=tuple(upper))
+    return Member("one", (), replace(BASE, sets=sets))
+
+
+@given(INTERVAL, INTERVAL, INTERVAL, INTERVAL)
+def test_places_in_two_boxes_are_as_far_apart_as_is_said(
+    north: tuple[float, float],
+    east: tuple[float, float],
+    other_north: tuple[float, float],
+    other_east: tuple[float, float],
+) -> None:
+    """By the corners, and where boxes overlap along an axis by a place that both have there."""
+    apart_m = horizontally_apart_m(member(north, east), member(other_north, other_east))
+    nearest = [
+        min((abs(a - b) for a, b in product(one, other)), default=0.0)
+        if one[1] < other[0] or other[1] < one[0]
+        else 0.0
+        for one, other in ((north, other_north), (east, other_east))
+    ]
+    assert max(apart_m, 0.0) == pytest.approx(max(nearest))
+
+
+@contextmanager
+def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
+    """Two simulated vehicles in the air, flown by `uavctl fleet fly`; with their true places."""
+    truths: dict[str, list[Truth]] = {"west": [], "east": []}
+    done, seats, tables = threading.Event(), [], []
+    for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
+        with port() as one, port() as other:
+            ports = int(one.getsockname()[1]), int(other.getsockname()[1])
+        vehicle, mocap = (f"127.0.0.1:{one}" for one in ports)
+        start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
+        config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
+        seats.append(Seat(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
+        tables.append(entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *PATIENT_DAEMON))
+    peers = threading.Thread(
+        target=serve_all,
+        args=(seats,),
+        kwargs={"duration_s": None, "airborne": True, "on_ready": lambda _: None, "stop": done.is_set},
+    )
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
+        path = Path(folder) / "fleet.toml"
+        path.write_text(HEAD + "".join(tables))
+        command = [sys.executable, "-m", "uavctl", "fleet", "fly", str(path), "--out", str(Path(folder) / "out")]
+        try:
+            environ = os.environ | {FOLDER_VARIABLE: str(Path(folder) / "c")}
+            fleet = subprocess.Popen(
+                [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
+            )
+            with ended(fleet):
+                # Nobody would fly them while the daemons begin.
+                until(lambda: all(one["pid"] for one in status(path)), "both daemons listen", pause_s=0.5)
+                peers.start()
+                until(lambda: all(one["mode"] == "track" for one in status(path)), "both are flown", pause_s=0.5)
+                yield path, truths, fleet
+        finally:
+            done.set()
+            if peers.ident is not None:
+                peers.join()
+
+
+def status(path: Path) -> list[dict[str, Any]]:
+    found = []
+    for one in read_fleet(path).members:
+        try:
+            health = ask(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
+        except NotReachedError:
+            health = None
+        found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["ctrl-c", "order", "a daemon is killed", "the fleet is killed"])
+def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None:
+    with flying() as (path, truths, fleet):
+        lands = set(truths)
+        if how == "ctrl-c":
+            fleet.send_signal(signal.SIGINT)
+        elif how == "order":
+            assert run(["fleet", "land", str(path), "--control", str(path.parent / "c")]) == 0
+        elif how == "a daemon is killed":
+            os.kill(status(path)[0]["pid"], signal.SIGKILL)
+            lands = {"east"}
+        else:
+            fleet.kill()
+        for name in lands:
+            until(lambda name=name: any(one.mode == "AUTO.LAND" for one in truths[name]), f"{name} lands")  # type: ignore[misc]
+        until(lambda: fleet.poll() is not None, "the end")
+    places = zip(truths["west"], truths["east"], strict=False)
+    flown = [(one.position_m, other.position_m) for one, other in places if one.mode == other.mode == "OFFBOARD"]
+    assert len(flown) > 5
+    assert min(max(abs(a - b) for a, b in zip(one[:2], other[:2], strict=True)) for one, other in flown) >= SPACING_M
