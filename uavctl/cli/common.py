@@ -60,12 +60,10 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
-        from sim.faults import problems  # a replay, which has a configuration of its own, needs no simulator
+        from sim.faults import check_faults  # a replay, which has a configuration of its own, needs no simulator
 
         loaded = load(self.config, self.overrides)
-        wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
-        if wrong:
-            raise ConfigError(tuple(loaded.source.tell(problem) for problem in wrong))
+        check_faults(loaded)
         return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:

@@ -16,6 +16,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
+from logs.recording.ends import final, new_recording, put_header
 from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
@@ -29,13 +30,10 @@ from uavctl.cli.flying import (
     checked_take_off,
     conclude,
     ending_noted,
-    final,
     goto_overrides,
     live_line,
     live_view_port,
-    new_recording,
     onlookers,
-    put_header,
     stand_by,
     stop_limit_s,
     stop_on_signals,

@@ -31,8 +31,9 @@ from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlo
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.build.controller import build_controller, design_of
 from uavctl.build.library import check_fits, decode
+from uavctl.build.prepared import Prepared, cpu, versions
 from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
-from uavctl.cli.prepare import Prepared, cpu, prepare, versions
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse
 from uavctl.errors import LibraryError, RecordingError, UsageError

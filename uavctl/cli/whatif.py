@@ -16,6 +16,7 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
+from logs.recording.ends import new_recording, put_header
 from logs.recording.export import known_number
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
@@ -26,9 +27,10 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
 from uavctl.build.controller import build_problem, design_of
+from uavctl.build.prepared import Prepared
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
-from uavctl.cli.flying import conclude, new_recording, put_header
-from uavctl.cli.prepare import Prepared, prepare, ready_library
+from uavctl.cli.flying import conclude
+from uavctl.cli.prepare import prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
