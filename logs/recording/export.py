@@ -17,12 +17,13 @@ import struct
 import types
 import typing
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import msgspec
@@ -31,9 +32,13 @@ from mcap.reader import make_reader
 
 from logs.recording.outputs import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
-from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view
+from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
+from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, UsageError
-from uavctl.records import Record, Vec3
+from uavctl.records import Header, Record, Vec3
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 Cell = int | float | bool | str | bytes | None
 _AXES = ("x", "y", "z")
@@ -189,6 +194,11 @@ class Tables:
     def __init__(self) -> None:
         self._tables: dict[str, _Table] = {}
 
+    def declare(self, topic: str) -> None:
+        """Make the tables of a topic, whether there are rows for them or not."""
+        for field, kind in self._table(topic, ("log_time_ns",), record_type(topic)).lists:
+            self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind)
+
     def learn(self, topic: str, record: Record) -> None:
         """Look at a record to find the columns that it needs; all records come before the first row is asked for."""
         table = self._table(topic, ("log_time_ns",), type(record))
@@ -224,6 +234,7 @@ class Tables:
 
 _BATCH_ROWS = 4096  # kept in memory for each Parquet table
 CSV_ENCODING = "utf-8"
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class TableFormat(StrEnum):
@@ -387,25 +398,41 @@ def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
         yield write
 
 
+def arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) -> pa.Table:
+    """Return rows as an Arrow table: NaN stays NaN, a missing value is null, bytes are bytes.
+
+    Raises:
+        RecordingError: A value has no place in it.
+    """
+    import pyarrow as pa
+
+    fields, arrays = _arrow_fields(columns), []
+    for place, (name, kind) in enumerate(fields):
+        try:
+            arrays.append(pa.array([row[place] for row in rows], type=kind))
+        except (OverflowError, pa.ArrowInvalid) as error:
+            raise RecordingError(f"column {name}: Arrow has no place for one of its values ({error})") from error
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType]]:
+    import pyarrow as pa
+
+    types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
+    return [(column.name, types[column.kind]) for column in columns]
+
+
 @contextmanager
 def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """Parquet with one row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
-    fields = [(column.name, types[column.kind]) for column in columns]
-    schema = pa.schema(fields)
+    schema = pa.schema(_arrow_fields(columns))
     rows: list[list[Cell]] = []
 
     def flush() -> None:
-        arrays = []
-        for place, (name, kind) in enumerate(fields):
-            try:
-                arrays.append(pa.array([row[place] for row in rows], type=kind))
-            except (OverflowError, pa.ArrowInvalid) as error:
-                raise RecordingError(f"column {name}: Parquet has no place for one of its values ({error})") from error
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        writer.write_table(arrow_table(columns, rows))
         rows.clear()
 
     def write(row: list[Cell]) -> None:
@@ -416,3 +443,69 @@ def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wri
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         yield write
         flush()
+
+
+# One table of a recording, in memory.
+
+
+def table_names(flight: Path) -> tuple[str, ...]:
+    """Return the tables that a recording can be had as: its topics of records, and the lists of records within.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    topics = {message.definition.topic for message in good_messages(flight)}
+    known = sorted(filter(is_known, topics))
+    return tuple(name for one in known for name in (one, *(f"{one}.{field}" for field, _ in _lists(record_type(one)))))
+
+
+def read_table(flight: Path, name: str) -> pa.Table:
+    """Return one table of a recording as Arrow, with two more columns after `log_time_ns`.
+
+    `time_s` is the time since the first record [s]; `utc` the time of day, where the flight was in real time.
+
+    Raises:
+        RecordingError: The recording cannot be read, or has no such table.
+    """
+    import pyarrow as pa
+
+    topic = name if is_known(name) else name.rpartition(".")[0]
+    tables = Tables()
+    found: list[tuple[int, Record]] = []
+    first_ns, zero_utc_ns = None, None
+    for message in good_messages(flight):
+        first_ns = message.at_ns if first_ns is None else first_ns
+        if message.definition.topic == HEADER:
+            zero_utc_ns = _zero_utc_ns(decode(HEADER, message.data, message.at_ns))
+        if message.definition.topic == topic and is_known(topic):
+            found.append((message.at_ns, decode(topic, message.data, message.at_ns)))
+    if found:
+        tables.declare(topic)
+    if name not in tables.columns():
+        names, why = table_names(flight), "was made for viewers" if is_view(name) else "is not in it"
+        raise RecordingError(f"{flight}: topic {name} {why}{find_nearest(name, names)}; there are {', '.join(names)}")
+    for _, record in found:
+        tables.learn(topic, record)
+    columns = tables.columns()[name]
+    every = (row for at_ns, record in found for row in tables.rows(topic, at_ns, record))
+    rows = [row for table, row in every if table == name]
+    told = arrow_table(columns, rows)
+    times_ns = [int(row[0] or 0) for row in rows]
+    seconds = pa.array([(at_ns - (first_ns or 0)) * 1e-9 for at_ns in times_ns], type=pa.float64())
+    told = told.add_column(1, "time_s", seconds)
+    if zero_utc_ns is None:
+        return told
+    utc = pa.array([at_ns + zero_utc_ns for at_ns in times_ns], type=pa.timestamp("ns", tz="UTC"))
+    return told.add_column(2, "utc", utc)
+
+
+def _zero_utc_ns(first: Record) -> int | None:
+    """Return UTC of time 0 of a recording's clock [ns since 1970]; None of a flight in virtual time."""
+    if not isinstance(first, Header) or not first.started_ns:
+        return None
+    try:
+        began = datetime.fromisoformat(first.started_utc)
+    except ValueError:
+        return None
+    began = began if began.tzinfo else began.replace(tzinfo=UTC)
+    return (began - _EPOCH) // timedelta(microseconds=1) * 1000 - first.started_ns

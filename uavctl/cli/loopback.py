@@ -48,7 +48,7 @@ from uavctl.daemon.daemon import fly
 from uavctl.daemon.realtime import collected_between_ticks
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
-from uavctl.lab.lockstep import TRUTH, LockstepFlight
+from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
 from uavctl.records import Sink, Truth
 
@@ -117,8 +117,7 @@ def fly_simulated(
         UavctlError: nothing was flown, and why.
     """
     config = _on_loopback(loaded.config) if udp else loaded.config
-    if config.duration_s < config.daemon.tick_s:
-        raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
+    check_length(config)
     with located(loaded):
         design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto)

@@ -9,33 +9,26 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.progress import TimeElapsedColumn
 
-from uavctl.build.controller import build_controller
-from uavctl.build.prepared import Prepared
+from uavctl.build import prepared
 from uavctl.cli.common import bars, messages
 from uavctl.config import Config
-from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign
+from uavctl.smpc.conditioned.planner import AnyDesign
 
 if TYPE_CHECKING:
     from uavctl.build.library import StoredLibrary
 
 
-def prepare(config: Config, design: AnyDesign) -> Prepared:
+def prepare(config: Config, design: AnyDesign) -> prepared.Prepared:
     """Make policy library and controller of a design.
 
     Raises:
         DesignError: The configuration asks for what the design cannot do.
     """
-    library = ready_library(config, design)
-    controller = build_controller(config, design, None if library is None else library.library)
-    return Prepared(config, design, library, controller)
+    return prepared.prepare(config, design, ready_library(config, design))
 
 
 def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
     """Return the policy library of a design that asks for one: from the cache, or made under a progress bar."""
-    if isinstance(design, ConditionedDesign) or not config.uses_library:
-        return None
-    from uavctl.build.library import library_for
-
     with ExitStack() as stack:
         bar: list[Callable[[str], None]] = []  # from the first round on: there is none for what the cache holds
 
@@ -44,7 +37,9 @@ def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
                 bar.append(stack.enter_context(_bar("policy library, made once for a design")))
             bar[0](f"policy library: {name}, {count} policies, worst gap {worst_gap:.0e}")
 
-        return library_for(design, advance, lambda text: messages().print(escape(text), style="yellow", soft_wrap=True))
+        return prepared.ready_library(
+            config, design, advance, lambda text: messages().print(escape(text), style="yellow", soft_wrap=True)
+        )
 
 
 @contextmanager

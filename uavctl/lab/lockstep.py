@@ -13,11 +13,23 @@ from logs.recording.topics import ENDED
 from logs.recording.views import Views
 from sim.simulation import World
 from uavctl.build.prepared import Prepared
+from uavctl.config.types import Config
+from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.outcome import Cause
 from uavctl.records import Received, Send, Ticked, Truth
 
 TRUTH = "/sim/truth"
+
+
+def check_length(config: Config) -> None:
+    """Refuse a flight without a tick.
+
+    Raises:
+        UsageError: It is shorter than one.
+    """
+    if config.duration_s < config.daemon.tick_s:
+        raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
 
 
 class Follower(Protocol):
