@@ -491,7 +491,7 @@ def read_table(flight: Path, name: str) -> pa.Table:
     rows = [row for table, row in every if table == name]
     told = arrow_table(columns, rows)
     times_ns = [int(row[0] or 0) for row in rows]
-    seconds = pa.array([(at_ns - (first_ns or 0)) * 1e-9 for at_ns in times_ns], type=pa.float64())
+    seconds = pa.array([(at_ns - (first_ns or 0)) / 1e9 for at_ns in times_ns], type=pa.float64())
     told = told.add_column(1, "time_s", seconds)
     if zero_utc_ns is None:
         return told
