@@ -178,7 +178,7 @@ def check(
             raise  # a URL that is none: usage
         items.append(item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS))
     report = Report(ok=not refusals(items, config.check), items=tuple(items))
-    common.show(report, lambda: _table(report))
+    common.show("check", report, lambda: _table(report))
     return 0 if report.ok else 1
 
 

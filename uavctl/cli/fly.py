@@ -190,7 +190,7 @@ def fly(
         as_realtime_process=realtime,
         view_port=view_port,
     )
-    common.show(summary, lambda: render(summary))
+    common.show("fly", summary, lambda: render(summary))
     return summary.ending.exit_code
 
 

@@ -52,7 +52,7 @@ def export(
         folder = out if out is not None else flight.with_name(f"{flight.stem}-{to}")
         with _progress() as watch:
             exported = export_tables(flight, folder, TableFormat(to), force=force, watch=watch)
-        Common(json=json).show(exported, lambda: _tables_picture(exported, folder))
+        Common(json=json).show("log/export", exported, lambda: _tables_picture(exported, folder))
         for topic, number in exported.unknown.items():
             warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
     if cut := lacks_end(flight):
@@ -63,7 +63,7 @@ def export(
 def _export_tlog(flight: Path, file: Path, link: str | None, *, force: bool, common: Common) -> None:
     with _progress() as watch:
         exported = export_tlog(flight, file, link=link, force=force, watch=watch)
-    common.show(exported, lambda: _tlog_picture(exported))
+    common.show("log/export-tlog", exported, lambda: _tlog_picture(exported))
     if exported.left_out_bytes:
         warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
 
@@ -198,7 +198,7 @@ for _name, (_path, _help) in _COMMANDS.items():
 def info(flight: Flight, /, *, json: Json = False) -> int:
     """Say what a recording holds: topics, rates, gaps, losses, and how it was made."""
     found = recording_info(flight)
-    Common(json=json).show(found, lambda: info_table(found))
+    Common(json=json).show("log/info", found, lambda: info_table(found))
     return 0
 
 
@@ -206,7 +206,7 @@ def info(flight: Flight, /, *, json: Json = False) -> int:
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
     """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
     result = restore(flight, out)
-    Common(json=json).show(result, lambda: _recover_table(result, out))
+    Common(json=json).show("log/recover", result, lambda: _recover_table(result, out))
     return 0 if result.lossless else RECOVERED_WITH_LOSS
 
 

@@ -53,7 +53,7 @@ def compare_command(
         found = compare(loaded)
     if out is not None:
         write_page(found, loaded, out)
-    Common(json=json).show(found, lambda: comparison_picture(found))
+    Common(json=json).show("log/compare", found, lambda: comparison_picture(found))
     return 0
 
 
@@ -122,5 +122,5 @@ def report(
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
-    Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
+    Common(json=json).show("log/report", document, lambda: render(summary, verdict_rows(judged.verdicts)))
     return 0

@@ -94,7 +94,7 @@ def loopback(
         out=out,
         view_port=view_port,
     )
-    common.show(summary, lambda: render(summary))
+    common.show("loopback", summary, lambda: render(summary))
     return summary.ending.exit_code
 
 

@@ -275,7 +275,7 @@ def whatif(
             page=str(path.with_name("what-if.html")),
         )
         write_whole(Path(result.page), write_page(result, sides[0], sides[2]))
-    Common(json=json).show(result, lambda: _picture(result))
+    Common(json=json).show("log/whatif", result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
 
