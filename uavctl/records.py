@@ -349,6 +349,10 @@ class Header(Record, frozen=True, kw_only=True):
     versions: dict[str, str]
     cpu: str
     library_id: str | None = None  # hash of the policy library; None if none was flown with
+    # UTC of time 0 of our clock [ns since 1970]; log times are this much later than the records' own. None in
+    # recordings of before: their log times are those of our clock
+    zero_utc_ns: int | None = None
+    platform: str = ""  # operating system and processor
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):

@@ -247,8 +247,11 @@ def says(record: Record, message: bytes) -> bool:
         return False
 
 
-def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
-    """Encode a record so that a reader gets the same back under this topic and log time [ns].
+def encode_message(topic: str, at_ns: int, record: Record, zero_utc_ns: int = 0) -> bytes:
+    """Encode a record so that a reader gets the same back under this topic and time [ns].
+
+    Args:
+        zero_utc_ns: what is added to its time in the file [ns].
 
     Raises:
         RecordingError: it would not, and why.
@@ -261,7 +264,7 @@ def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
         raise RecordingError(f"topic {topic} takes {expected.__name__}, not {type(record).__name__}")
     if isinstance(record, Datagram) and topic != raw_topic(record.link, outgoing=record.outgoing):
         raise RecordingError(f"topic {topic} is not that of connection {record.link}")
-    if not 0 <= at_ns <= _MAX_TIME_NS:
+    if at_ns < 0 or not 0 <= at_ns + zero_utc_ns <= _MAX_TIME_NS:
         raise RecordingError(f"topic {topic}: time {at_ns} ns does not fit a recording")
     return encode(record)
 

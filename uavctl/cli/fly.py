@@ -42,7 +42,7 @@ from uavctl.cli.flying import (
     tell_ending,
 )
 from uavctl.cli.prepare import prepare
-from uavctl.clock import Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
@@ -248,7 +248,7 @@ def fly_daemon(
             engagement.begin(loop)
             asked_for = False
             try:
-                put_header(recorder, prepared, monotonic_ns())
+                put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
                     messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)

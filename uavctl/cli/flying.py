@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import platform
 import shlex
 import signal
 import subprocess
@@ -34,6 +35,7 @@ from uavctl.build.controller import record_of, resting
 from uavctl.build.mission import build_mission
 from uavctl.cli.common import FREE_PORT, messages
 from uavctl.cli.prepare import Prepared, cpu, versions
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config import Config
 from uavctl.config.load import dump_config
 from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
@@ -313,8 +315,15 @@ def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path
         yield path
 
 
-def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None:
-    """Begin a recording with its header and library: everything needed to decide alike in a replay."""
+def put_header(
+    recorder: Recording, prepared: Prepared, started_ns: int, zero_utc_ns: int | None = VIRTUAL_ZERO_UTC_NS
+) -> None:
+    """Begin a recording with its header and library: everything needed to decide alike in a replay.
+
+    Args:
+        started_ns: when it begins, by the flight's clock.
+        zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
+    """
     config, design, library = prepared.config, prepared.design, prepared.library
     header = Header(
         started_ns=started_ns,
@@ -327,6 +336,8 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
         versions=versions(),
         cpu=cpu(),
         library_id=None if library is None else library.library_id,
+        zero_utc_ns=zero_utc_ns,
+        platform=platform.platform(),
     )
     recorder.put(HEADER, started_ns, header)
     if library is not None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,9 +13,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from logs.recording.attachments import layout_text
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import info as recording_info
+from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
@@ -97,6 +98,9 @@ def _tlog_picture(exported: ExportedTlog) -> RenderableType:
 # `uavctl log info` as a table.
 
 
+_SOME_PARAMETERS = 4
+
+
 def info_table(found: RecordingInfo) -> RenderableType:
     """Return a table of topics with rates and gaps, and below it further facts."""
     title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
@@ -140,6 +144,18 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
         yield f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})"
     if found.library is not None:
         yield f"policy library {found.library.library_id}, {found.library.bytes:,} bytes"
+    if found.begin_utc is not None:
+        yield f"begins at {found.begin_utc}"
+    for file in found.attachments:
+        yield f"attached: {file.name}, {file.bytes:,} bytes"
+    if found.parameters:
+        yield from _parameters(found.parameters)
+
+
+def _parameters(told: Mapping[str, VehicleParameter]) -> Iterator[str]:
+    some = ", ".join(f"{name} {one.value}" for name, one in [*told.items()][:_SOME_PARAMETERS])
+    more = "" if len(told) <= _SOME_PARAMETERS else " ...; --json has all"
+    yield f"vehicle parameters: {len(told)} ({some}{more})"
 
 
 def _loss(loss: PositionLoss) -> Iterator[str]:
@@ -213,7 +229,7 @@ def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")
 @log_app.command
 def layout() -> int:
     """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
-    sys.stdout.write(resources.files("logs").joinpath("foxglove-layout.json").read_text(encoding="utf-8"))
+    sys.stdout.write(layout_text())
     return 0
 
 

@@ -351,7 +351,7 @@ def _recorded(
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
     recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(Views()))
     try:
-        put_header(recorder, now, recorded.started_ns)
+        put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
         course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
     except BaseException:
         recorder.close()
