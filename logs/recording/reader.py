@@ -299,7 +299,11 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
 
 
 def _hint(path: Path) -> str:
-    return "; `uavctl log replay` and `uavctl identify` read a .tlog" if path.suffix == ".tlog" else ""
+    if path.suffix.lower() == ".tlog":
+        return "; `uavctl log info`, `report` and `replay`, and `uavctl identify` read a .tlog"
+    if path.suffix.lower() in (".ulg", ".bin"):
+        return "; it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
+    return ""
 
 
 def _whole(data: Buffer, at: int) -> int:

@@ -17,6 +17,7 @@ from logs.recording.attachments import layout_text
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import info as recording_info
+from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, is_tlog, read_flight
 from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
@@ -99,6 +100,12 @@ def _tlog_picture(exported: ExportedTlog) -> RenderableType:
 
 
 _SOME_PARAMETERS = 4
+
+
+def _tlog_info(told: MavlinkFlightInfo) -> RenderableType:
+    rows = ((Text(name), str(number)) for name, number in told.messages.items())
+    lines = [f"{name}: {value}" for name, value in facts_of(told)]
+    return Group(columns("", ("message", "number"), rows, fold=True), *map(Text, (*lines, *told.notes)))
 
 
 def info_table(found: RecordingInfo) -> RenderableType:
@@ -184,7 +191,10 @@ _COMMANDS = {
         differs on.
         """,
     ),
-    "report": ("log_report:report", "Write the page of a recording: one HTML file that needs nothing else."),
+    "report": (
+        "log_report:report",
+        "Write the page of a recording, or of a .tlog: one HTML file that needs nothing else.",
+    ),
     "compare": (
         "log_report:compare_command",
         "Put flights beside each other: parameters that differ, figures, and where they part.",
@@ -212,7 +222,11 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command
 def info(flight: Flight, /, *, json: Json = False) -> int:
-    """Say what a recording holds: topics, rates, gaps, losses, and how it was made."""
+    """Say what a recording, or a .tlog, holds: topics, rates, gaps, losses, and how it was made."""
+    if is_tlog(flight):
+        told = read_flight(flight).info
+        Common(json=json).show("log/info-tlog", told, lambda: _tlog_info(told))
+        return 0
     found = recording_info(flight)
     Common(json=json).show("log/info", found, lambda: info_table(found))
     return 0

@@ -120,6 +120,7 @@ def test_an_exported_tlog_has_the_same_times(tmp_path: Path) -> None:
     stamps = []
     while (message := log.recv_match()) is not None:
         stamps.append(round(message._timestamp * 1e6))
+    log.close()
     wanted = sorted(one.at_ns + ZERO_NS for one in flown().of(Datagram) if one.link == "vehicle")
     assert len(stamps) == len(wanted)
     assert all(abs(stamp - at_ns // 1000) <= 1 for stamp, at_ns in zip(stamps, wanted, strict=True))
