@@ -285,6 +285,17 @@ class Checked(Record, frozen=True, kw_only=True):
     hint: str
 
 
+class ToldParameter(Record, frozen=True, kw_only=True):
+    """A parameter that the vehicle told in the check before arming; a replay passes it over."""
+
+    at_ns: int
+    name: str
+    value: float
+    type: str  # of MAV_PARAM_TYPE: REAL32, INT32 ...
+    system: int
+    component: int
+
+
 class Ending(Record, frozen=True, kw_only=True):
     """End of the flight: the last word of the daemon, before its recording is closed."""
 

@@ -58,7 +58,7 @@ def of_parameters(parameters: Mapping[str, VehicleParameter], utc_ns: int) -> tu
     if not parameters:
         return ()
     return (
-        _file(PARAMETERS, "text/tab-separated-values", parameter_file(dict(parameters)), utc_ns),
+        _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters), utc_ns),
         Metadata(_VALUES, {name: str(one.value) for name, one in parameters.items()}),
         Metadata(_TYPES, {name: one.type for name, one in parameters.items()}),
     )

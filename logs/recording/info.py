@@ -13,9 +13,9 @@ import msgspec
 
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
-from logs.recording.topics import END, HEADER, LIBRARY, RECORDER, RecorderNote, decode, raw_link
+from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, raw_link
 from uavctl.errors import RecordingError
-from uavctl.records import Datagram, Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
+from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 
 _OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
 _LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
@@ -264,8 +264,8 @@ def info(path: Path) -> RecordingInfo:
             account.add(decode(topic, item.data, item.at_ns))
         elif topic in _NEWEST_TELLS:
             newest[topic] = item
-        elif (raw := raw_link(topic)) is not None:
-            parameters.take(Datagram(at_ns=item.at_ns, link=raw[0], outgoing=raw[1], data=item.data))
+        elif topic == PARAMETER or raw_link(topic) is not None:
+            parameters.take(decode(topic, item.data, item.at_ns))
         zero_utc_ns = item.zero_utc_ns
     for topic, item in newest.items():
         account.add(decode(topic, item.data, item.at_ns))

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping
 
 import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.mavlink.framing import MessageLayout, scan, text_of
-from uavctl.records import Datagram
+from uavctl.records import Datagram, Record, ToldParameter
 
 _HEARTBEAT, _PARAM_VALUE = mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_PARAM_VALUE
 _LAYOUTS = {
@@ -51,13 +51,20 @@ class ParameterReader:
     def __init__(self) -> None:
         self._rest: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
         self._lost: set[str] = set()  # links on which nobody knows where the next frame begins
+        self._before: dict[str, VehicleParameter] = {}  # told before the recording began
         self._told: dict[tuple[int, int, str], tuple[float, int]] = {}
         self._autopilots: dict[int, int] = {}  # MAV_AUTOPILOT by system, in the order in which they were heard
 
-    def take(self, datagram: Datagram) -> None:
-        """Take raw bytes; those that are sent, and what is no parameter, say nothing."""
-        if datagram.outgoing:
-            return
+    def take(self, record: Record) -> None:
+        """Take raw bytes, or what was told before; any other record, and what is sent, says nothing."""
+        if isinstance(record, ToldParameter):
+            value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
+            told = VehicleParameter(value=value, type=record.type, system=record.system, component=record.component)
+            self._before[record.name] = told
+        elif isinstance(record, Datagram) and not record.outgoing:
+            self._take_bytes(record)
+
+    def _take_bytes(self, datagram: Datagram) -> None:
         data, at = self._rest.pop(datagram.link, b"") + datagram.data, 0
         while at < len(data):
             begin = _next_frame(data, at)
@@ -106,18 +113,17 @@ class ParameterReader:
             for (system, component, name), (value, kind) in sorted(self._told.items(), key=_autopilot_last)
             if system == systems[0]
         }
-        return dict(sorted(found.items()))
+        return dict(sorted({**self._before, **found}.items()))
 
 
-def read_parameters(datagrams: Iterable[Datagram]) -> dict[str, VehicleParameter]:
-    """Return the parameters that the vehicle told in a recording's raw bytes, by name."""
-    reader = ParameterReader()
-    for one in datagrams:
-        reader.take(one)
-    return reader.parameters()
+def told_records(parameters: Mapping[str, VehicleParameter], at_ns: int) -> Iterator[ToldParameter]:
+    """Return records of parameters, for a recording that begins after they were told."""
+    for name, one in parameters.items():
+        where = {"system": one.system, "component": one.component}
+        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, **where)
 
 
-def parameter_file(parameters: dict[str, VehicleParameter]) -> str:
+def parameter_file(parameters: Mapping[str, VehicleParameter]) -> str:
     """Return parameters as a file of QGroundControl: system, component, name, value and type, parted by tabs."""
     head = "# Vehicle parameters, as PARAM_VALUE told them\n# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
     return head + "".join(

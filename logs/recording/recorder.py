@@ -302,7 +302,7 @@ class WriteQueue:
         if isinstance(record, Header):
             utc_ns = at_ns + self._files.zero_utc_ns
             self._files.attach(attachments.of_header(record, utc_ns), attachments.layout(utc_ns))
-        elif isinstance(record, Datagram):
+        else:
             self._parameters.take(record)
 
     def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:

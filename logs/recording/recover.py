@@ -16,6 +16,7 @@ from logs.recording.topics import (
     HEADER,
     HOLES,
     NO_END,
+    PARAMETER,
     RECORDER,
     RECOVERED,
     RecorderNote,
@@ -25,7 +26,7 @@ from logs.recording.topics import (
     raw_link,
 )
 from uavctl.errors import RecordingError
-from uavctl.records import Datagram, Header
+from uavctl.records import Header
 
 CHUNK_BYTES = 16384
 
@@ -136,11 +137,10 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
             if not item.repeated:
                 segment.add(QueuedMessage(item.definition, tally.messages, item.at_ns, item.data))
                 topic = item.definition.topic
-                if topic == HEADER or raw_link(topic) is not None:
+                if topic in (HEADER, PARAMETER) or raw_link(topic) is not None:
                     record = decode(topic, item.data, item.at_ns)
-                    if isinstance(record, Datagram):
-                        parameters.take(record)
-                    elif isinstance(record, Header):
+                    parameters.take(record)
+                    if isinstance(record, Header):
                         utc_ns = at_ns + zero_utc_ns
                         segment.attach((*attachments.of_header(record, utc_ns), *attachments.layout(utc_ns)))
     segment = segment or Segment(file, CHUNK_BYTES)

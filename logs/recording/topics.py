@@ -38,6 +38,7 @@ from uavctl.records import (
     Setpoint,
     StepInput,
     Timing,
+    ToldParameter,
     Truth,
     VehicleStatus,
     raw_topic,
@@ -45,6 +46,7 @@ from uavctl.records import (
 
 HEADER = "/uavctl/header"
 LIBRARY = "/uavctl/library"
+PARAMETER = "/uavctl/parameter"
 ENDED = "/uavctl/end"
 RECORDER = "/uavctl/recorder"
 # How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
@@ -116,6 +118,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/event", Event, "something worth telling a person"),
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
     Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
+    Topic(PARAMETER, ToldParameter, "a parameter that the vehicle told in the check before arming, one record each"),
     Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
     Topic("/uavctl/relay", RelayStats, "positions that were passed on to the vehicle, once a second, if any are"),

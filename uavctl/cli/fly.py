@@ -16,10 +16,12 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
+from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of
+from uavctl.check.findings import Item
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
@@ -234,7 +236,8 @@ def fly_daemon(
             design = design_of(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        from uavctl.cli.check import checked_before_arming, record_items  # an eighth of what loading `fly` would take
+        # an eighth of what loading `fly` would take
+        from uavctl.cli.check import checked_before_arming, record_items, record_parameters
 
         begun = time.perf_counter()
         with (
@@ -242,7 +245,10 @@ def fly_daemon(
             stop_on_signals() as stopped,
             connected(config) as connections,
         ):
-            checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
+            checked: tuple[Item, ...] = ()
+            told = ParameterReader()
+            if take_off_m is not None:
+                checked = checked_before_arming(config, connections, stopped, take_off_m, told)
             recorder = Recorder(path, config.log, onlookers=looking)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)
@@ -250,6 +256,7 @@ def fly_daemon(
             try:
                 put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
+                record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
                     messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
                 if tenure.left_ns is not None:
