@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,11 @@ from uavctl.records import Record, Vec3
 
 Cell = int | float | bool | str | bytes | None
 _AXES = ("x", "y", "z")
+_UTC = "utc"
+
+
+class Instant(int):
+    """Time in UTC [ns since 1970], which a table shows as a date."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class TableColumn:
     """One column of a table."""
 
     name: str
-    kind: type  # of its cells, one of `_LEAVES`
+    kind: type  # of its cells, one of `_LEAVES` or `Instant`
 
 
 class _Leaf:
@@ -162,7 +168,8 @@ class _Table:
         self._form.learn(record)
 
     def columns(self) -> tuple[TableColumn, ...]:
-        return (*(TableColumn(name, int) for name in self._lead), *self._form.columns(""))
+        lead = (TableColumn(name, Instant if name == _UTC else int) for name in self._lead)
+        return (*lead, *self._form.columns(""))
 
     def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
         self.rows += 1
@@ -182,20 +189,23 @@ def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struc
 class Tables:
     """Tables of a recording, by topic; a list of records within has the table `<topic>.<field>`.
 
-    Each table begins with `log_time_ns`. That of a list goes on with `row`, the row (from 0) of the topic's table that
-    the list belongs to, and `place`, the place in the list (from 0).
+    Each table begins with `log_time_ns`, the time by our clock, and `utc`, if the recording knows it. That of a list goes
+    on with `row`, the row (from 0) of the topic's table that the list belongs to, and `place`, the place in the list
+    (from 0).
     """
 
     def __init__(self) -> None:
         self._tables: dict[str, _Table] = {}
+        self.zero_utc_ns = 0  # UTC of time 0 [ns since 1970]; 0: not known
 
     def learn(self, topic: str, record: Record) -> None:
         """Look at a record to find the columns that it needs; all records come before the first row is asked for."""
-        table = self._table(topic, ("log_time_ns",), type(record))
+        times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
+        table = self._table(topic, times, type(record))
         table.learn(record)
         for field, kind in table.lists:
             for one in getattr(record, field):
-                self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind).learn(one)
+                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(one)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
         """Return the columns of each table, by its name."""
@@ -205,11 +215,12 @@ class Tables:
         """Return the rows of a record, each with its table's name; records come in the order of the recording."""
         table = self._tables[topic]
         number = table.rows
-        yield topic, table.row((at_ns,), record)
+        times = (at_ns, at_ns + self.zero_utc_ns) if self.zero_utc_ns else (at_ns,)
+        yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
             for place, one in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((at_ns, number, place), one)
+                yield name, self._tables[name].row((*times, number, place), one)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -333,6 +344,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
         nonlocal total
         for message in good_messages(flight):
             total += 1
+            tables.zero_utc_ns = message.zero_utc_ns
             if not is_known(message.definition.topic):
                 unknown[message.definition.topic] += 1
             yield message
@@ -370,10 +382,17 @@ def _writer(kind: TableFormat) -> _Writer:
     return _parquet_file
 
 
+def _date(utc_ns: Cell) -> str:
+    """Return a time in UTC [ns since 1970] as ISO 8601 has it, with all its digits."""
+    seconds, ns = divmod(int(utc_ns or 0), 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{ns:09d}Z"
+
+
 @contextmanager
 def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
     in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
+    instants = tuple(place for place, column in enumerate(columns) if column.kind is Instant)
     with path.open("w", newline="", encoding=CSV_ENCODING) as file:
         rows = csv.writer(file)
         rows.writerow([column.name for column in columns])
@@ -382,6 +401,8 @@ def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
             for place in in_bytes:
                 held = row[place]
                 row[place] = held.hex() if isinstance(held, bytes) else None
+            for place in instants:
+                row[place] = _date(row[place])
             rows.writerow(row)
 
         yield write
@@ -394,6 +415,7 @@ def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wri
     import pyarrow.parquet as pq
 
     types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
+    types[Instant] = pa.timestamp("ns", tz="UTC")
     fields = [(column.name, types[column.kind]) for column in columns]
     schema = pa.schema(fields)
     rows: list[list[Cell]] = []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import time
 from itertools import pairwise
 from pathlib import Path
 
 import msgspec
+import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 from mcap.reader import make_reader
 from pymavlink import mavutil  # type: ignore[attr-defined]
@@ -14,6 +18,7 @@ from recording_fakes import HEADER, Clock, flight, own
 from report_rig import unpaged
 from view_rig import flown, protobuf
 
+from logs.recording.export import TableFormat, export_tables
 from logs.recording.info import info
 from logs.recording.reader import read, walk
 from logs.recording.recorder import DerivedTopics, SyncRecorder
@@ -150,3 +155,18 @@ def test_a_recording_of_before_keeps_its_times(tmp_path: Path) -> None:
     assert [at_ns for topic, at_ns, _, _ in others_see(path) if topic != "/uavctl/recorder"] == [
         at_ns for _, at_ns, _ in flight(20)
     ]
+
+
+def test_tables_have_the_date_for_pandas(tmp_path: Path) -> None:
+    path = record(tmp_path / "flight.mcap")
+    for kind in TableFormat:
+        export_tables(path, tmp_path / kind.value, kind)
+    wanted = [at_ns + ZERO_NS for topic, at_ns, _ in ITEMS if topic == "/uavctl/setpoint"]
+    parquet = pyarrow.parquet.read_table(tmp_path / "parquet" / "uavctl.setpoint.parquet")
+    assert parquet.schema.field("utc").type == pyarrow.timestamp("ns", tz="UTC")
+    assert parquet.column("utc").cast(pyarrow.int64()).to_pylist() == wanted
+    assert parquet.column("log_time_ns").to_pylist() == [at_ns - ZERO_NS for at_ns in wanted]
+    with (tmp_path / "csv" / "uavctl.setpoint.csv").open(newline="") as file:
+        dates = [row["utc"] for row in csv.DictReader(file)]
+    assert [np.datetime64(date.removesuffix("Z")).astype(np.int64) for date in dates] == wanted
+    assert dates[0].startswith("2025-11-25T") and dates[0].endswith("Z")
