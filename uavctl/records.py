@@ -285,6 +285,17 @@ class Checked(Record, frozen=True, kw_only=True):
     hint: str
 
 
+class ToldParameter(Record, frozen=True, kw_only=True):
+    """A parameter that the vehicle told in the check before arming; a replay passes it over."""
+
+    at_ns: int
+    name: str
+    value: float
+    type: str  # of MAV_PARAM_TYPE: REAL32, INT32 ...
+    system: int
+    component: int
+
+
 class Ending(Record, frozen=True, kw_only=True):
     """End of the flight: the last word of the daemon, before its recording is closed."""
 
@@ -349,6 +360,10 @@ class Header(Record, frozen=True, kw_only=True):
     versions: dict[str, str]
     cpu: str
     library_id: str | None = None  # hash of the policy library; None if none was flown with
+    # UTC of time 0 of our clock [ns since 1970]; log times are this much later than the records' own. None in
+    # recordings of before: their log times are those of our clock
+    zero_utc_ns: int | None = None
+    platform: str = ""  # operating system and processor
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):

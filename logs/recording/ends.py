@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import shlex
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER, LIBRARY
 from uavctl.build.controller import record_of
 from uavctl.build.prepared import Prepared, cpu, versions
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.outcome import lacking
 from uavctl.records import Ending, Header, PolicyLibrary, Sink
@@ -40,10 +42,18 @@ def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path
         yield path
 
 
-def put_header(recorder: Sink, prepared: Prepared, started_ns: int, command: str | None = None) -> None:
+def put_header(
+    recorder: Sink,
+    prepared: Prepared,
+    started_ns: int,
+    zero_utc_ns: int | None = VIRTUAL_ZERO_UTC_NS,
+    command: str | None = None,
+) -> None:
     """Begin a recording with its header and library: everything needed to decide alike in a replay.
 
     Args:
+        started_ns: when it begins, by the flight's clock.
+        zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
         command: what it was made by; None: the command line of this process.
     """
     config, design, library = prepared.config, prepared.design, prepared.library
@@ -58,6 +68,8 @@ def put_header(recorder: Sink, prepared: Prepared, started_ns: int, command: str
         versions=versions(),
         cpu=cpu(),
         library_id=None if library is None else library.library_id,
+        zero_utc_ns=zero_utc_ns,
+        platform=platform.platform(),
     )
     recorder.put(HEADER, started_ns, header)
     if library is not None:

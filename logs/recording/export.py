@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,13 +35,18 @@ from logs.recording.reader import RecordedMessage, good_messages, lacks_end, seg
 from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
 from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, UsageError
-from uavctl.records import Header, Record, Vec3
+from uavctl.records import Record, Vec3
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 Cell = int | float | bool | str | bytes | None
 _AXES = ("x", "y", "z")
+_UTC = "utc"
+
+
+class Instant(int):
+    """Time in UTC [ns since 1970], which a table shows as a date."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class TableColumn:
     """One column of a table."""
 
     name: str
-    kind: type  # of its cells, one of `_LEAVES`
+    kind: type  # of its cells, one of `_LEAVES` or `Instant`
 
 
 class _Leaf:
@@ -167,7 +172,8 @@ class _Table:
         self._form.learn(record)
 
     def columns(self) -> tuple[TableColumn, ...]:
-        return (*(TableColumn(name, int) for name in self._lead), *self._form.columns(""))
+        lead = (TableColumn(name, Instant if name == _UTC else int) for name in self._lead)
+        return (*lead, *self._form.columns(""))
 
     def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
         self.rows += 1
@@ -187,25 +193,29 @@ def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struc
 class Tables:
     """Tables of a recording, by topic; a list of records within has the table `<topic>.<field>`.
 
-    Each table begins with `log_time_ns`. That of a list goes on with `row`, the row (from 0) of the topic's table that
-    the list belongs to, and `place`, the place in the list (from 0).
+    Each table begins with `log_time_ns`, the time by our clock, and `utc`, if the recording knows it. That of a list
+    goes on with `row`, the row (from 0) of the topic's table that the list belongs to, and `place`, the place in the
+    list (from 0).
     """
 
     def __init__(self) -> None:
         self._tables: dict[str, _Table] = {}
+        self.zero_utc_ns = 0  # UTC of time 0 [ns since 1970]; 0: not known
 
     def declare(self, topic: str) -> None:
         """Make the tables of a topic, whether there are rows for them or not."""
-        for field, kind in self._table(topic, ("log_time_ns",), record_type(topic)).lists:
-            self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind)
+        times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
+        for field, kind in self._table(topic, times, record_type(topic)).lists:
+            self._table(f"{topic}.{field}", (*times, "row", "place"), kind)
 
     def learn(self, topic: str, record: Record) -> None:
         """Look at a record to find the columns that it needs; all records come before the first row is asked for."""
-        table = self._table(topic, ("log_time_ns",), type(record))
+        times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
+        table = self._table(topic, times, type(record))
         table.learn(record)
         for field, kind in table.lists:
             for one in getattr(record, field):
-                self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind).learn(one)
+                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(one)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
         """Return the columns of each table, by its name."""
@@ -215,11 +225,12 @@ class Tables:
         """Return the rows of a record, each with its table's name; records come in the order of the recording."""
         table = self._tables[topic]
         number = table.rows
-        yield topic, table.row((at_ns,), record)
+        times = (at_ns, at_ns + self.zero_utc_ns) if self.zero_utc_ns else (at_ns,)
+        yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
             for place, one in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((at_ns, number, place), one)
+                yield name, self._tables[name].row((*times, number, place), one)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -234,7 +245,6 @@ class Tables:
 
 _BATCH_ROWS = 4096  # kept in memory for each Parquet table
 CSV_ENCODING = "utf-8"
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class TableFormat(StrEnum):
@@ -344,6 +354,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
         nonlocal total
         for message in good_messages(flight):
             total += 1
+            tables.zero_utc_ns = message.zero_utc_ns
             if not is_known(message.definition.topic):
                 unknown[message.definition.topic] += 1
             yield message
@@ -381,10 +392,17 @@ def _writer(kind: TableFormat) -> _Writer:
     return _parquet_file
 
 
+def _date(utc_ns: Cell) -> str:
+    """Return a time in UTC [ns since 1970] as ISO 8601 has it, with all its digits."""
+    seconds, ns = divmod(int(utc_ns or 0), 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{ns:09d}Z"
+
+
 @contextmanager
 def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
     in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
+    instants = tuple(place for place, column in enumerate(columns) if column.kind is Instant)
     with path.open("w", newline="", encoding=CSV_ENCODING) as file:
         rows = csv.writer(file)
         rows.writerow([column.name for column in columns])
@@ -393,6 +411,8 @@ def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
             for place in in_bytes:
                 held = row[place]
                 row[place] = held.hex() if isinstance(held, bytes) else None
+            for place in instants:
+                row[place] = _date(row[place])
             rows.writerow(row)
 
         yield write
@@ -419,6 +439,7 @@ def _arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType
     import pyarrow as pa
 
     types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
+    types[Instant] = pa.timestamp("ns", tz="UTC")
     return [(column.name, types[column.kind]) for column in columns]
 
 
@@ -460,9 +481,7 @@ def table_names(flight: Path) -> tuple[str, ...]:
 
 
 def read_table(flight: Path, name: str) -> pa.Table:
-    """Return one table of a recording as Arrow, with two more columns after `log_time_ns`.
-
-    `time_s` is the time since the first record [s]; `utc` the time of day, where the flight was in real time.
+    """Return one table of a recording as Arrow, with `time_s`, the time since the first record [s], as second column.
 
     Raises:
         RecordingError: The recording cannot be read, or has no such table.
@@ -472,11 +491,10 @@ def read_table(flight: Path, name: str) -> pa.Table:
     topic = name if is_known(name) else name.rpartition(".")[0]
     tables = Tables()
     found: list[tuple[int, Record]] = []
-    first_ns, zero_utc_ns = None, None
+    first_ns = None
     for message in good_messages(flight):
         first_ns = message.at_ns if first_ns is None else first_ns
-        if message.definition.topic == HEADER:
-            zero_utc_ns = _zero_utc_ns(decode(HEADER, message.data, message.at_ns))
+        tables.zero_utc_ns = message.zero_utc_ns
         if message.definition.topic == topic and is_known(topic):
             found.append((message.at_ns, decode(topic, message.data, message.at_ns)))
     if found:
@@ -492,20 +510,4 @@ def read_table(flight: Path, name: str) -> pa.Table:
     told = arrow_table(columns, rows)
     times_ns = [int(row[0] or 0) for row in rows]
     seconds = pa.array([(at_ns - (first_ns or 0)) / 1e9 for at_ns in times_ns], type=pa.float64())
-    told = told.add_column(1, "time_s", seconds)
-    if zero_utc_ns is None:
-        return told
-    utc = pa.array([at_ns + zero_utc_ns for at_ns in times_ns], type=pa.timestamp("ns", tz="UTC"))
-    return told.add_column(2, "utc", utc)
-
-
-def _zero_utc_ns(first: Record) -> int | None:
-    """Return UTC of time 0 of a recording's clock [ns since 1970]; None of a flight in virtual time."""
-    if not isinstance(first, Header) or not first.started_ns:
-        return None
-    try:
-        began = datetime.fromisoformat(first.started_utc)
-    except ValueError:
-        return None
-    began = began if began.tzinfo else began.replace(tzinfo=UTC)
-    return (began - _EPOCH) // timedelta(microseconds=1) * 1000 - first.started_ns
+    return told.add_column(1, "time_s", seconds)

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 class Recording:
     """A recording whose topics can be had as tables; they are read from the disk when they are asked for.
 
-    Every table has `log_time_ns`, `time_s` (since the first record) and, of a flight in real time, `utc`; then the
-    record's own fields, with their units in their names.
+    Every table has `log_time_ns`, `time_s` (since the first record) and, since version 0.2, `utc`; then the record's
+    own fields, with their units in their names.
     """
 
     path: Path  # its first file

@@ -42,7 +42,7 @@ from uavctl.cli.flying import (
 )
 from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
-from uavctl.clock import Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
 from uavctl.daemon.realtime import collected_between_ticks
@@ -90,7 +90,7 @@ def loopback(
         out=out,
         view_port=view_port,
     )
-    common.show(summary, lambda: render(summary))
+    common.show("loopback", summary, lambda: render(summary))
     return summary.ending.exit_code
 
 
@@ -165,7 +165,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         loop.course.in_flight = not takes_off
         wall_s = 0.0
         try:
-            put_header(recorder, prepared, monotonic_ns())
+            put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))

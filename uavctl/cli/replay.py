@@ -353,7 +353,7 @@ def replay(
         "changed": replayed.changed,
         "other_versions": replayed.other_versions,
     }
-    common.show(document, lambda: replay_table(replayed))
+    common.show("log/replay", document, lambda: replay_table(replayed))
     return 0 if result.identical else 1
 
 
@@ -371,7 +371,7 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
     )
     if not result.positions:
         raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
-    common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
+    common.show("log/replay-foreign", result, lambda: _foreign_table(result, config.smpc.horizon))
     return 0
 
 

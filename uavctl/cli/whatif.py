@@ -277,7 +277,7 @@ def whatif(
             page=str(path.with_name("what-if.html")),
         )
         write_whole(Path(result.page), write_page(result, sides[0], sides[2]))
-    Common(json=json).show(result, lambda: _picture(result))
+    Common(json=json).show("log/whatif", result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
 
@@ -353,7 +353,7 @@ def _recorded(
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
     recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(Views()))
     try:
-        put_header(recorder, now, recorded.started_ns)
+        put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
         course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
     except BaseException:
         recorder.close()
