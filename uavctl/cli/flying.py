@@ -324,7 +324,7 @@ def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None
         config_toml=dump_config(config),
         design_id=design.design_id,
         design=record_of(design),
-        versions=versions(),
+        versions=versions(config.smpc.controller),
         cpu=cpu(),
         library_id=None if library is None else library.library_id,
     )

@@ -16,6 +16,7 @@ from rich.progress import TimeElapsedColumn
 from uavctl import __version__
 from uavctl.build.code_id import decider_id
 from uavctl.build.controller import build_controller
+from uavctl.build.outside import controller_id
 from uavctl.cli.common import bars, messages
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
@@ -82,12 +83,15 @@ def _bar(title: str) -> Iterator[Callable[[str], None]]:
 # What decides a flight's last bits beside its configuration: code, libraries, CPU type.
 
 
+CONTROLLER = "controller"  # under which the one of another package stands among the versions
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of code and libraries that decisions depend on."""
+def versions(controller: str) -> dict[str, str]:
+    """Return the versions of code and libraries that decisions depend on; `controller`: one of another package."""
     found = {name: metadata.version(name) for name in _LIBRARIES}
+    if controller:
+        found[CONTROLLER] = controller_id(controller)
     return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
 
 
