@@ -238,6 +238,9 @@ class StepInput(Record, frozen=True, kw_only=True):
     missed_ticks: int = 0
     stop: bool = False  # the operator asks for the hand-over
     commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came
+    # Time that a controller of another package took for its plan in the tick before [ns], as the flying process has
+    # measured it; 0 where none was asked for, or time is virtual
+    answered_ns: int = 0
 
 
 class Timing(Record, frozen=True, kw_only=True):

@@ -65,7 +65,7 @@ def put_header(
         config_toml=dump_config(config),
         design_id=design.design_id,
         design=record_of(design),
-        versions=versions(),
+        versions=versions(config.smpc.controller),
         cpu=cpu(),
         library_id=None if library is None else library.library_id,
         zero_utc_ns=zero_utc_ns,

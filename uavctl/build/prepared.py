@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from uavctl import __version__
 from uavctl.build.code_id import decider_id
 from uavctl.build.controller import build_controller
+from uavctl.build.outside import controller_id
 from uavctl.config.types import Config
 from uavctl.flight.controller import Controller
 from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign
@@ -58,12 +59,15 @@ def ready_library(
 # What decides a flight's last bits beside its configuration: code, libraries, CPU type.
 
 
+CONTROLLER = "controller"  # under which the one of another package stands among the versions
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of code and libraries that decisions depend on."""
+def versions(controller: str) -> dict[str, str]:
+    """Return the versions of code and libraries that decisions depend on; `controller`: one of another package."""
     found = {name: metadata.version(name) for name in _LIBRARIES}
+    if controller:
+        found[CONTROLLER] = controller_id(controller)
     return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
 
 

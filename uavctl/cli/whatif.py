@@ -232,8 +232,13 @@ def whatif(
     response = response_of(history, plant)
     _warn(flight, recorded, history)
     was = recorded_flyer(flight, before)
-    if controller == "smpc":
-        now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
+    outside = controller not in KINDS
+    if outside:
+        smpc = replace(loaded.config.smpc, controller=controller)
+        loaded = dataclasses.replace(loaded, config=replace(loaded.config, smpc=smpc))
+    if controller == "smpc" or outside:
+        same = config is None and not overrides and not outside
+        now = was if same else changed_flyer(flight, before, loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
     other = None
@@ -283,7 +288,7 @@ def whatif(
 
 def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
     """Warn why the reproduction may not be exact."""
-    texts = [f"{text}: decisions may differ" for text in other_versions(recorded)]
+    texts = [f"{text}: decisions may differ" for text in other_versions(recorded, history.config.smpc.controller)]
     lost = max((one.dropped + one.refused for _, _, one in history.entries if isinstance(one, RecorderNote)), default=0)
     if lost:
         texts.append(f"{count(lost, 'record')} missing in the recording")
