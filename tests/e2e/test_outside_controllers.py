@@ -15,8 +15,9 @@ from soak_rig import Watch, fly
 
 from sim.simulation import World
 from uavctl.build.controller import design_of
+from uavctl.build.prepared import Prepared
 from uavctl.cli.app import run
-from uavctl.cli.prepare import Prepared, prepare
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
 from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Ending
