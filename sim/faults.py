@@ -14,7 +14,7 @@ from sim.channel import within
 from sim.vehicle.linear import LinearVehicle
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config.document import ConfigProblem
-from uavctl.config.load import find_nearest
+from uavctl.config.load import LoadedConfig, find_nearest
 from uavctl.config.sim import FaultConfig
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError
@@ -37,6 +37,17 @@ def with_spans(config: Config) -> Config:
         elif fault.kind in OF_CAMERA:
             camera = replace(camera, **{fault.kind: (*getattr(camera, fault.kind), span)})
     return replace(config, link=link, sim=replace(config.sim, camera=camera))
+
+
+def check_faults(loaded: LoadedConfig) -> None:
+    """Refuse a configuration with faults that its autopilot cannot have.
+
+    Raises:
+        ConfigError: With all problems found.
+    """
+    wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
+    if wrong:
+        raise ConfigError(tuple(loaded.source.tell(problem) for problem in wrong))
 
 
 def problems(

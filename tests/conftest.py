@@ -22,7 +22,7 @@ LONGEST = (
     "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
     "test_tune_real", "test_closed_loop", "test_soak", "test_properties", "test_whatif_inertial", "test_conditioned",
     "test_recorded_flights", "test_extending", "test_relay_outlives", "test_tune", "test_inertial_lies",
-    "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias",
+    "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias", "test_python_docs",
     "test_inertial_errors", "test_late", "test_whatif", "test_fly", "test_report", "test_loopback", "test_cuts",
     "test_foreign_stream", "test_engagement", "test_check_cmd", "test_conic", "test_campaign_docs",
     "test_sim_quadrotor_peers", "test_library_solver", "test_policies", "test_hand_over_restart", "test_whatif_cmd",

@@ -97,9 +97,10 @@ def topics_page() -> str:
     lines = [
         "# Topics of a recording",
         "",
-        "MCAP, log times in nanoseconds of the recorder's monotonic clock. Numbers are written with the digits",
-        'that give the same float back; NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`;',
-        "`null` is only ever a missing value.",
+        "MCAP, log times in UTC; times in the records (`at_ns` ...) are nanoseconds of the recorder's monotonic clock,",
+        "and the metadata `zero_utc_ns` of each channel is the UTC of that clock's zero",
+        "([recordings.md](recordings.md#times)). Numbers are written with the digits that give the same float back;",
+        'NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`; `null` is only ever a missing value.',
         "",
         "| topic | record | encoding | what it is |",
         "|---|---|---|---|",

@@ -9,6 +9,15 @@ from dataclasses import dataclass
 monotonic_ns: Callable[[], int] = time.monotonic_ns
 """Nanoseconds of the clock that no adjustment of the wall clock moves; shared by all processes of a machine."""
 
+VIRTUAL_ZERO_UTC_NS = 946_684_800 * 1_000_000_000
+"""UTC of time 0 in virtual time [ns since 1970]: 2000-01-01, so that the same flight has the same times."""
+
+
+def zero_utc_ns() -> int:
+    """UTC of time 0 of our clock by the wall clock as it is now [ns since 1970]; asked once a flight."""
+    before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()
+    return wall_ns - (before_ns + after_ns) // 2
+
 
 @dataclass(frozen=True, slots=True)
 class Due:

@@ -15,6 +15,15 @@ class UsageError(UavctlError):
     exit_code = 2
 
 
+class ExtraMissingError(UsageError):
+    """What is asked for needs a package that is not installed."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        self.package = package
+        self.extra = extra
+        super().__init__(f"{package} is not installed; pip install 'uavctl[{extra}]'")
+
+
 class ConfigError(UavctlError):
     """The configuration is wrong; holds every problem found, not only the first."""
 

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from uavctl.config import Config
 from uavctl.flight.controller import Controller
+from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
 from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
@@ -58,7 +59,9 @@ MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
-FOR_A_PERSON = frozenset({"vehicle-text", BIAS_AT_BOUND, BIAS_FREE})  # codes of the events that the console tells
+FOR_A_PERSON = frozenset(
+    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT}
+)  # codes of the events that the console tells
 MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
@@ -112,6 +115,7 @@ class ControlLoop:
         self._motion: VehicleMotion | None = None
         self._decision: Decision | None = None
         self._orders: deque[Command] = deque()
+        self._answered_ns = 0  # time that a controller of another package took in the last tick
         # The last time at which positions could not be those of the vehicle on its way up or down; None before.
         self._misled_ns: int | None = None
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
@@ -330,6 +334,15 @@ class ControlLoop:
         self.course.takes_off = self.course.takes_off or command.order is Order.TAKE_OFF
         return True
 
+    @property
+    def outside(self) -> str:
+        """Name of the controller of another package that plans; empty where one of ours does."""
+        return self._controller.outside
+
+    def answered(self, took_ns: int) -> None:
+        """Take note of how long that one took for the plan of the last tick; the next one judges it."""
+        self._answered_ns = took_ns
+
     def against(self, order: Order) -> str:
         """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
@@ -364,8 +377,10 @@ class ControlLoop:
             missed_ticks=missed_ticks,
             stop=stop,
             commands=tuple(self._orders),
+            answered_ns=self._answered_ns,
         )
         self._orders.clear()
+        self._answered_ns = 0
         self._put("/uavctl/step_input", at_ns, inp)
         for status in heard:
             self._put("/uavctl/vehicle", status.at_ns, status)

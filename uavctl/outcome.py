@@ -10,7 +10,7 @@ from enum import StrEnum
 
 from msgspec.structs import replace
 
-from uavctl.flight.decision import MISSION_OVER
+from uavctl.flight.decision import CONTROLLER_FAULT, MISSION_OVER
 from uavctl.mavlink.handover import Passage
 from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
@@ -162,6 +162,7 @@ class FlightCourse:
         self.flown = self.flown or (decision.boundary and decision.mode in _FLOWN and self._stop is None)
         if decision.mode in _FALLING and before not in _FALLING:
             self._fell = decision.reason
+        self._fell = next((one.text for one in events if one.code == CONTROLLER_FAULT), self._fell)
         ends = decision.mode in (ControlMode.LAND, ControlMode.STOPPED) and before in _FLOWN
         if ends and self._stop is None and not (self.let_go or self.died):
             lost = silent(decision.at_ns, self._vehicle)

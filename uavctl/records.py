@@ -238,6 +238,9 @@ class StepInput(Record, frozen=True, kw_only=True):
     missed_ticks: int = 0
     stop: bool = False  # the operator asks for the hand-over
     commands: tuple[Command, ...] = ()  # of the operator, in the order in which they came
+    # Time that a controller of another package took for its plan in the tick before [ns], as the flying process has
+    # measured it; 0 where none was asked for, or time is virtual
+    answered_ns: int = 0
 
 
 class Timing(Record, frozen=True, kw_only=True):
@@ -283,6 +286,17 @@ class Checked(Record, frozen=True, kw_only=True):
     value: str
     want: str
     hint: str
+
+
+class ToldParameter(Record, frozen=True, kw_only=True):
+    """A parameter that the vehicle told in the check before arming; a replay passes it over."""
+
+    at_ns: int
+    name: str
+    value: float
+    type: str  # of MAV_PARAM_TYPE: REAL32, INT32 ...
+    system: int
+    component: int
 
 
 class Ending(Record, frozen=True, kw_only=True):
@@ -349,6 +363,10 @@ class Header(Record, frozen=True, kw_only=True):
     versions: dict[str, str]
     cpu: str
     library_id: str | None = None  # hash of the policy library; None if none was flown with
+    # UTC of time 0 of our clock [ns since 1970]; log times are this much later than the records' own. None in
+    # recordings of before: their log times are those of our clock
+    zero_utc_ns: int | None = None
+    platform: str = ""  # operating system and processor
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):

@@ -17,12 +17,13 @@ import struct
 import types
 import typing
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import msgspec
@@ -31,12 +32,21 @@ from mcap.reader import make_reader
 
 from logs.recording.outputs import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
-from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view
+from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
+from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import Record, Vec3
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 Cell = int | float | bool | str | bytes | None
 _AXES = ("x", "y", "z")
+_UTC = "utc"
+
+
+class Instant(int):
+    """Time in UTC [ns since 1970], which a table shows as a date."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class TableColumn:
     """One column of a table."""
 
     name: str
-    kind: type  # of its cells, one of `_LEAVES`
+    kind: type  # of its cells, one of `_LEAVES` or `Instant`
 
 
 class _Leaf:
@@ -162,7 +172,8 @@ class _Table:
         self._form.learn(record)
 
     def columns(self) -> tuple[TableColumn, ...]:
-        return (*(TableColumn(name, int) for name in self._lead), *self._form.columns(""))
+        lead = (TableColumn(name, Instant if name == _UTC else int) for name in self._lead)
+        return (*lead, *self._form.columns(""))
 
     def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
         self.rows += 1
@@ -182,20 +193,29 @@ def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struc
 class Tables:
     """Tables of a recording, by topic; a list of records within has the table `<topic>.<field>`.
 
-    Each table begins with `log_time_ns`. That of a list goes on with `row`, the row (from 0) of the topic's table that
-    the list belongs to, and `place`, the place in the list (from 0).
+    Each table begins with `log_time_ns`, the time by our clock, and `utc`, if the recording knows it. That of a list
+    goes on with `row`, the row (from 0) of the topic's table that the list belongs to, and `place`, the place in the
+    list (from 0).
     """
 
     def __init__(self) -> None:
         self._tables: dict[str, _Table] = {}
+        self.zero_utc_ns = 0  # UTC of time 0 [ns since 1970]; 0: not known
+
+    def declare(self, topic: str) -> None:
+        """Make the tables of a topic, whether there are rows for them or not."""
+        times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
+        for field, kind in self._table(topic, times, record_type(topic)).lists:
+            self._table(f"{topic}.{field}", (*times, "row", "place"), kind)
 
     def learn(self, topic: str, record: Record) -> None:
         """Look at a record to find the columns that it needs; all records come before the first row is asked for."""
-        table = self._table(topic, ("log_time_ns",), type(record))
+        times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
+        table = self._table(topic, times, type(record))
         table.learn(record)
         for field, kind in table.lists:
             for one in getattr(record, field):
-                self._table(f"{topic}.{field}", ("log_time_ns", "row", "place"), kind).learn(one)
+                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(one)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
         """Return the columns of each table, by its name."""
@@ -205,11 +225,12 @@ class Tables:
         """Return the rows of a record, each with its table's name; records come in the order of the recording."""
         table = self._tables[topic]
         number = table.rows
-        yield topic, table.row((at_ns,), record)
+        times = (at_ns, at_ns + self.zero_utc_ns) if self.zero_utc_ns else (at_ns,)
+        yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
             for place, one in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((at_ns, number, place), one)
+                yield name, self._tables[name].row((*times, number, place), one)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -333,6 +354,7 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
         nonlocal total
         for message in good_messages(flight):
             total += 1
+            tables.zero_utc_ns = message.zero_utc_ns
             if not is_known(message.definition.topic):
                 unknown[message.definition.topic] += 1
             yield message
@@ -370,10 +392,17 @@ def _writer(kind: TableFormat) -> _Writer:
     return _parquet_file
 
 
+def _date(utc_ns: Cell) -> str:
+    """Return a time in UTC [ns since 1970] as ISO 8601 has it, with all its digits."""
+    seconds, ns = divmod(int(utc_ns or 0), 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{ns:09d}Z"
+
+
 @contextmanager
 def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
     in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
+    instants = tuple(place for place, column in enumerate(columns) if column.kind is Instant)
     with path.open("w", newline="", encoding=CSV_ENCODING) as file:
         rows = csv.writer(file)
         rows.writerow([column.name for column in columns])
@@ -382,9 +411,36 @@ def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
             for place in in_bytes:
                 held = row[place]
                 row[place] = held.hex() if isinstance(held, bytes) else None
+            for place in instants:
+                row[place] = _date(row[place])
             rows.writerow(row)
 
         yield write
+
+
+def arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) -> pa.Table:
+    """Return rows as an Arrow table: NaN stays NaN, a missing value is null, bytes are bytes.
+
+    Raises:
+        RecordingError: A value has no place in it.
+    """
+    import pyarrow as pa
+
+    fields, arrays = _arrow_fields(columns), []
+    for place, (name, kind) in enumerate(fields):
+        try:
+            arrays.append(pa.array([row[place] for row in rows], type=kind))
+        except (OverflowError, pa.ArrowInvalid) as error:
+            raise RecordingError(f"column {name}: Arrow has no place for one of its values ({error})") from error
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType]]:
+    import pyarrow as pa
+
+    types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
+    types[Instant] = pa.timestamp("ns", tz="UTC")
+    return [(column.name, types[column.kind]) for column in columns]
 
 
 @contextmanager
@@ -393,19 +449,11 @@ def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wri
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
-    fields = [(column.name, types[column.kind]) for column in columns]
-    schema = pa.schema(fields)
+    schema = pa.schema(_arrow_fields(columns))
     rows: list[list[Cell]] = []
 
     def flush() -> None:
-        arrays = []
-        for place, (name, kind) in enumerate(fields):
-            try:
-                arrays.append(pa.array([row[place] for row in rows], type=kind))
-            except (OverflowError, pa.ArrowInvalid) as error:
-                raise RecordingError(f"column {name}: Parquet has no place for one of its values ({error})") from error
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        writer.write_table(arrow_table(columns, rows))
         rows.clear()
 
     def write(row: list[Cell]) -> None:
@@ -416,3 +464,50 @@ def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wri
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         yield write
         flush()
+
+
+# One table of a recording, in memory.
+
+
+def table_names(flight: Path) -> tuple[str, ...]:
+    """Return the tables that a recording can be had as: its topics of records, and the lists of records within.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    topics = {message.definition.topic for message in good_messages(flight)}
+    known = sorted(filter(is_known, topics))
+    return tuple(name for one in known for name in (one, *(f"{one}.{field}" for field, _ in _lists(record_type(one)))))
+
+
+def read_table(flight: Path, name: str) -> pa.Table:
+    """Return one table of a recording as Arrow, with `time_s`, the time since the first record [s], as second column.
+
+    Raises:
+        RecordingError: The recording cannot be read, or has no such table.
+    """
+    import pyarrow as pa
+
+    topic = name if is_known(name) else name.rpartition(".")[0]
+    tables = Tables()
+    found: list[tuple[int, Record]] = []
+    first_ns = None
+    for message in good_messages(flight):
+        first_ns = message.at_ns if first_ns is None else first_ns
+        tables.zero_utc_ns = message.zero_utc_ns
+        if message.definition.topic == topic and is_known(topic):
+            found.append((message.at_ns, decode(topic, message.data, message.at_ns)))
+    if found:
+        tables.declare(topic)
+    if name not in tables.columns():
+        names, why = table_names(flight), "was made for viewers" if is_view(name) else "is not in it"
+        raise RecordingError(f"{flight}: topic {name} {why}{find_nearest(name, names)}; there are {', '.join(names)}")
+    for _, record in found:
+        tables.learn(topic, record)
+    columns = tables.columns()[name]
+    every = (row for at_ns, record in found for row in tables.rows(topic, at_ns, record))
+    rows = [row for table, row in every if table == name]
+    told = arrow_table(columns, rows)
+    times_ns = [int(row[0] or 0) for row in rows]
+    seconds = pa.array([(at_ns - (first_ns or 0)) / 1e9 for at_ns in times_ns], type=pa.float64())
+    return told.add_column(1, "time_s", seconds)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import tomllib
 from collections import Counter
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
 
 import msgspec
 
-from logs.recording.reader import Damage, EndOfFile, RecordedMessage, segment_files, walk
-from logs.recording.topics import END, HEADER, LIBRARY, RECORDER, RecorderNote, decode
+from logs.recording.parameters import ParameterReader, VehicleParameter
+from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
+from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, raw_link
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 
@@ -44,12 +46,22 @@ class RecordingOrigin(msgspec.Struct, frozen=True, kw_only=True):
     library_id: str | None  # None if no policy library was flown with
     versions: dict[str, str]
     cpu: str
+    platform: str = ""
+    zero_utc_ns: int | None = None  # UTC of time 0 of the recording's clock [ns since 1970]; None: not known
 
 
 class LibraryInfo(msgspec.Struct, frozen=True, kw_only=True):
     """The policy library that the recording carries."""
 
     library_id: str
+    bytes: int
+
+
+class AttachmentInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """A file that the recording carries for other programs."""
+
+    name: str
+    media_type: str
     bytes: int
 
 
@@ -112,6 +124,9 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
     topics: tuple[TopicInfo, ...]
     origin: RecordingOrigin | None  # None without a readable header
     library: LibraryInfo | None  # None without a readable policy library
+    begin_utc: str | None = None  # of the first message; None if the recording does not tell
+    attachments: tuple[AttachmentInfo, ...] = ()
+    parameters: dict[str, VehicleParameter] = {}  # of the vehicle, as it told them
 
 
 class _Course:
@@ -220,8 +235,11 @@ def info(path: Path) -> RecordingInfo:
     damage: list[str] = []
     missing = 0
     following: int | None = None
+    zero_utc_ns = 0
     account = _Account()
     newest: dict[str, RecordedMessage] = {}
+    attachments: dict[str, AttachmentInfo] = {}  # each file of the recording has them, the last one all
+    parameters = ParameterReader()
     segments = [_Segment(file) for file in segment_files(path)]
     ended = 0
     for item in walk(path):
@@ -231,6 +249,9 @@ def info(path: Path) -> RecordingInfo:
         if isinstance(item, EndOfFile):
             segments[ended].finished = item.finished
             ended += 1
+            continue
+        if isinstance(item, AttachedFile):
+            attachments[item.name] = AttachmentInfo(name=item.name, media_type=item.media_type, bytes=item.bytes)
             continue
         missing += max(0, item.sequence - (following or 1))
         following = item.sequence + 1
@@ -243,6 +264,9 @@ def info(path: Path) -> RecordingInfo:
             account.add(decode(topic, item.data, item.at_ns))
         elif topic in _NEWEST_TELLS:
             newest[topic] = item
+        elif topic == PARAMETER or raw_link(topic) is not None:
+            parameters.take(decode(topic, item.data, item.at_ns))
+        zero_utc_ns = item.zero_utc_ns
     for topic, item in newest.items():
         account.add(decode(topic, item.data, item.at_ns))
     if not courses and not damage:
@@ -275,7 +299,14 @@ def info(path: Path) -> RecordingInfo:
         topics=tuple(courses[topic].info(topic, start_ns, end_ns) for topic in sorted(courses)),
         origin=account.origin,
         library=account.library,
+        begin_utc=_utc(start_ns + zero_utc_ns) if zero_utc_ns else None,
+        attachments=tuple(attachments.values()),
+        parameters=parameters.parameters(),
     )
+
+
+def _utc(utc_ns: int) -> str:
+    return datetime.fromtimestamp(utc_ns // 1_000_000 / 1000, UTC).isoformat(timespec="milliseconds")
 
 
 def _origin(header: Header) -> RecordingOrigin:

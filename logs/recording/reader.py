@@ -17,10 +17,10 @@ from typing import NamedTuple, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Attachment, Channel, Schema
 
 from logs.recording.disk import later_segments
-from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MAGIC, MESSAGE
+from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MAGIC, MESSAGE, ZERO_UTC
 from logs.recording.topics import (
     END,
     GOES_ON,
@@ -55,6 +55,7 @@ class RecordedMessage(NamedTuple):
     data: bytes
     offset: int  # offset of its chunk in the file
     repeated: bool = False  # header or library, once more, at the start of a later segment
+    zero_utc_ns: int = 0  # its log time in the file is so much later than `at_ns`, which is by our clock
 
 
 @dataclass
@@ -77,7 +78,7 @@ class Contents:
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
-        self._known: dict[bytes, tuple[int, Definition]] = {}
+        self._known: dict[bytes, tuple[int, Definition, int]] = {}
 
     def messages(self, content: bytes, offset: int, order: ReadingOrder | None = None) -> Iterator[RecordedMessage]:
         """Read the messages of one chunk whose checksum is right.
@@ -88,7 +89,7 @@ class Contents:
         Raises:
             RecordingError: a message is missing that the order wants.
         """
-        channels: dict[int, Definition] = {}
+        channels: dict[int, tuple[Definition, int]] = {}
         at = 0
         size = len(content)
         while at < size:
@@ -97,32 +98,42 @@ class Contents:
                 continue
             _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
             begin, at = at + MESSAGE.size, at + _RECORD.size + length
-            definition = channels[channel]
+            definition, zero_utc_ns = channels[channel]
             if order is not None:
                 if sequence != order.following and order.following is not None:
                     raise order.broken(sequence)
                 order.following = sequence + 1
                 if definition.for_viewers:
                     continue
-            yield RecordedMessage(definition, sequence, at_ns, content[begin:at], offset)
+            data = content[begin:at]
+            yield RecordedMessage(definition, sequence, at_ns - zero_utc_ns, data, offset, zero_utc_ns=zero_utc_ns)
 
-    def _define(self, content: bytes, at: int, channels: dict[int, Definition]) -> int:
+    def _define(self, content: bytes, at: int, channels: dict[int, tuple[Definition, int]]) -> int:
         """Take a channel or schema; return the offset after it."""
         opcode, length = _RECORD.unpack_from(content, at)
         at += _RECORD.size
         if opcode == Opcode.CHANNEL:
-            channel, channels[channel] = self._channel(content[at : at + length])
+            channel, definition, zero_utc_ns = self._channel(content[at : at + length])
+            channels[channel] = definition, zero_utc_ns
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
             self._schemas[schema.id] = schema
         return int(at + length)
 
-    def _channel(self, record: bytes) -> tuple[int, Definition]:
+    def _channel(self, record: bytes) -> tuple[int, Definition, int]:
         if record not in self._known:
             channel = Channel.read(ReadDataStream(BytesIO(record)))
             schema = self._schemas.get(channel.schema_id)
-            self._known[record] = (channel.id, _definition(channel, schema))
+            self._known[record] = channel.id, _definition(channel, schema), _zero_utc_ns(channel)
         return self._known[record]
+
+
+def _zero_utc_ns(channel: Channel) -> int:
+    """Return how much later log times are than those of our clock [ns]; 0 in recordings of before."""
+    told = channel.metadata.get(ZERO_UTC, "0")
+    if not (told.isascii() and told.isdigit()):
+        raise RecordingError(f"topic {channel.topic}: {ZERO_UTC} of its channel is {told!r}, which is no time")
+    return int(told)
 
 
 def _definition(channel: Channel, schema: Schema | None) -> Definition:
@@ -134,11 +145,12 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
         return Definition(channel.topic, channel.message_encoding)
 
 
-__all__ = ["Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
+__all__ = ["AttachedFile", "Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
+_ATTACHMENT_FIELDS = 36  # bytes besides name, type and data
 _IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
 
 
@@ -154,6 +166,15 @@ class Damage:
 
     def __str__(self) -> str:
         return f"{self.path}, offset {self.offset}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class AttachedFile:
+    """An attachment whose checksum is right."""
+
+    name: str
+    media_type: str
+    bytes: int
 
 
 @dataclass(frozen=True)
@@ -173,10 +194,11 @@ class _TornRecordError(_BadRecordError):
 
 
 Buffer = bytes | mmap.mmap
+Scanned = RecordedMessage | AttachedFile | Damage | EndOfFile
 
 
-def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
-    """Yield messages and damage of one file in file order, then its `EndOfFile`.
+def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
+    """Yield messages, attachments and damage of one file in file order, then its `EndOfFile`.
 
     Args:
         order: where the reader is, moved on; what was made for viewers is then looked at for its number only.
@@ -228,7 +250,7 @@ def _last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
         return []
 
 
-def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
+def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scanned]:
     size = len(data)
     at = len(MAGIC)
     damaged = False
@@ -249,6 +271,8 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Reco
             length = _whole(data, at)
             if opcode == Opcode.CHUNK:
                 yield from contents.messages(_chunk(data, at, length), at, order)
+            if opcode == Opcode.ATTACHMENT:
+                yield _attached(data, at, length)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
                 if not damaged and stored != _crc(data, at):
@@ -275,7 +299,11 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Reco
 
 
 def _hint(path: Path) -> str:
-    return "; `uavctl log replay` and `uavctl identify` read a .tlog" if path.suffix == ".tlog" else ""
+    if path.suffix.lower() == ".tlog":
+        return "; `uavctl log info`, `report` and `replay`, and `uavctl identify` read a .tlog"
+    if path.suffix.lower() in (".ulg", ".bin"):
+        return "; it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
+    return ""
 
 
 def _whole(data: Buffer, at: int) -> int:
@@ -292,6 +320,10 @@ def _whole(data: Buffer, at: int) -> int:
         good = length >= CHUNK_FIELDS
     elif opcode == Opcode.DATA_END:
         good = length == _DATA_END.size - _RECORD.size
+    elif opcode == Opcode.ATTACHMENT:
+        good = length >= _ATTACHMENT_FIELDS
+    elif opcode == Opcode.METADATA:
+        good = _metadata_length(data, inner, length) == length
     elif opcode == Opcode.HEADER:
         good = at == len(MAGIC) and _header_length(data, inner, length) == length
     else:
@@ -299,6 +331,25 @@ def _whole(data: Buffer, at: int) -> int:
     if not good:
         raise _BadRecordError("is damaged")
     return int(_RECORD.size + length)
+
+
+def _attached(data: Buffer, at: int, length: int) -> AttachedFile:
+    """Return the attachment at `at`, if its checksum is right."""
+    content = data[at + _RECORD.size : at + length]
+    if zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
+        raise _BadRecordError("has a wrong checksum")
+    found = Attachment.read(ReadDataStream(BytesIO(content)))
+    return AttachedFile(found.name, found.media_type, len(found.data))
+
+
+def _metadata_length(data: Buffer, inner: int, length: int) -> int:
+    """Return the length of a metadata record by its name and its mapping; -1 if they do not fit."""
+    if length < 8:
+        return -1
+    (name,) = struct.unpack_from("<I", data, inner)
+    if name > length - 8:
+        return -1
+    return int(8 + name + struct.unpack_from("<I", data, inner + 4 + name)[0])
 
 
 def _header_length(data: Buffer, inner: int, length: int) -> int:
@@ -396,8 +447,8 @@ def segment_files(path: Path) -> tuple[Path, ...]:
     return files
 
 
-def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[RecordedMessage | Damage | EndOfFile]:
-    """Yield messages and damage of all segments; header and library that later segments repeat are marked.
+def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
+    """Yield messages, attachments and damage of all segments; header and library that later segments repeat are marked.
 
     Args:
         order: see `logs.recording.reader.scan`.

@@ -19,7 +19,9 @@ from typing import Protocol
 
 import msgspec
 
+from logs.recording import attachments
 from logs.recording.disk import DiskFile, OutputFile, RoomWatch, free_bytes, later_segments
+from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
 from logs.recording.topics import (
     END,
@@ -35,7 +37,7 @@ from logs.recording.topics import (
 )
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError
-from uavctl.records import Datagram, Record
+from uavctl.records import Datagram, Header, Record
 
 # What a recording carries for those who look on: messages for viewers beside each record, and a live view's share.
 
@@ -56,8 +58,8 @@ class DerivedTopics:
 
     Args:
         views: makes the messages for viewers; None: there are none.
-        watch: is given definition, log time [ns] and bytes of each message, soon after its record was taken;
-            returns at once and raises nothing.
+        watch: is given definition, log time [ns] (that of the file) and bytes of each message, soon after its record
+            was taken; returns at once and raises nothing.
         look: is given each record then, the same way.
 
     Attributes:
@@ -72,16 +74,19 @@ class DerivedTopics:
         look: Callable[[Record], None] = lambda _: None,
     ) -> None:
         self._views, self._watch, self._look = views, watch, look
+        self._zero_utc_ns = 0
         self.unseen = 0
         self.reason = ""
 
     def beside(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
         """Return topic, log time [ns] and message of all that is derived from a record, whose message is `data`."""
         self._look(record)
+        if isinstance(record, Header):
+            self._zero_utc_ns = record.zero_utc_ns or 0
         made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
         if self._watch is not None:
             for name, time_ns, message in ((topic, at_ns, data), *made):
-                self._watch(definition(name), time_ns, message)
+                self._watch(definition(name), time_ns + self._zero_utc_ns, message)
         return made
 
     def _made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
@@ -160,6 +165,7 @@ class WriteQueue:
         self._room = RoomWatch(path.parent, free, log.low_bytes, log.stop_bytes)
         self._room.look()
         self._files = Rotation(path, log, open_file, clock)
+        self._parameters = ParameterReader()
         self._clock = clock
         self._onlookers = onlookers
         self._written_s = clock()  # nothing that waited for the disk then does so now
@@ -270,6 +276,9 @@ class WriteQueue:
             return True
         if not waits or not files.may_begin or (self._room.resting and not self.closed):
             return False
+        head = self.queue[0][2] if self.queue else None
+        if isinstance(head, Header):  # it comes first, and tells the time of all that follows
+            files.zero_utc_ns = head.zero_utc_ns or 0
         files.begin(self._write_note)
         return True
 
@@ -286,7 +295,7 @@ class WriteQueue:
         if isinstance(record, Datagram):
             at_ns = record.at_ns  # the log time is the only place that keeps it
         try:
-            data = encode_message(topic, at_ns, record)
+            data = encode_message(topic, at_ns, record, self._files.zero_utc_ns)
         except RecordingError as error:
             self._refused += 1
             self._refusal = str(error)
@@ -297,6 +306,11 @@ class WriteQueue:
             self._write_note("begin")
         if topic in (HEADER, LIBRARY):
             self._files.commit()
+        if isinstance(record, Header):
+            utc_ns = at_ns + self._files.zero_utc_ns
+            self._files.attach(attachments.of_header(record, utc_ns), attachments.layout(utc_ns))
+        else:
+            self._parameters.take(record)
 
     def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
         """Write the messages for viewers that are derived from a record."""
@@ -333,7 +347,8 @@ class WriteQueue:
         blind = self._onlookers
         try:
             self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text)
-            self._files.finish()
+            utc_ns = self._files.at_ns + self._files.zero_utc_ns
+            self._files.finish(attachments.of_parameters(self._parameters.parameters(), utc_ns))
         except OSError as error:
             self._files.fail(error)
 

@@ -7,11 +7,26 @@ from pathlib import Path
 
 import msgspec
 
+from logs.recording import attachments
 from logs.recording.disk import DiskFile
-from logs.recording.reader import Damage, EndOfFile, RecordedMessage, is_end, note_of, walk
+from logs.recording.parameters import ParameterReader
+from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, is_end, note_of, walk
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import HOLES, NO_END, RECORDER, RECOVERED, RecorderNote, definition, encode
+from logs.recording.topics import (
+    HEADER,
+    HOLES,
+    NO_END,
+    PARAMETER,
+    RECORDER,
+    RECOVERED,
+    RecorderNote,
+    decode,
+    definition,
+    encode,
+    raw_link,
+)
 from uavctl.errors import RecordingError
+from uavctl.records import Header
 
 CHUNK_BYTES = 16384
 
@@ -89,7 +104,7 @@ def recover(src: Path, dst: Path) -> RecoverResult:
     except OSError as error:
         raise RecordingError(f"{dst}: {error.strerror}; choose another place") from error
     try:
-        result = _copy(src, Segment(file, CHUNK_BYTES))
+        result = _copy(src, file)
         if result.messages == 0:
             raise RecordingError(f"{src}: no whole chunk in it; nothing can be restored")
     except BaseException as error:
@@ -102,19 +117,33 @@ def recover(src: Path, dst: Path) -> RecoverResult:
     return result
 
 
-def _copy(src: Path, segment: Segment) -> RecoverResult:
-    tally = _Tally()
-    at_ns = 0
+def _copy(src: Path, file: DiskFile) -> RecoverResult:
+    tally, parameters = _Tally(), ParameterReader()
+    segment: Segment | None = None
+    at_ns = zero_utc_ns = 0
     for item in walk(src):
         if isinstance(item, Damage):
             tally.damaged(item)
         elif isinstance(item, EndOfFile):
             tally.file_ended(item)
+        elif isinstance(item, AttachedFile):
+            continue  # made anew from the messages
         else:
             tally.message(item)
             at_ns = item.at_ns
+            if segment is None:
+                zero_utc_ns = item.zero_utc_ns
+                segment = Segment(file, CHUNK_BYTES, zero_utc_ns)
             if not item.repeated:
                 segment.add(QueuedMessage(item.definition, tally.messages, item.at_ns, item.data))
+                topic = item.definition.topic
+                if topic in (HEADER, PARAMETER) or raw_link(topic) is not None:
+                    record = decode(topic, item.data, item.at_ns)
+                    parameters.take(record)
+                    if isinstance(record, Header):
+                        utc_ns = at_ns + zero_utc_ns
+                        segment.attach((*attachments.of_header(record, utc_ns), *attachments.layout(utc_ns)))
+    segment = segment or Segment(file, CHUNK_BYTES)
     tally.end()
     damage = [str(one) for one in tally.damage]
     if not tally.ended:
@@ -134,6 +163,7 @@ def _copy(src: Path, segment: Segment) -> RecoverResult:
             at_ns=at_ns, segment=1, written=result.messages, dropped=0, refused=0, failures=0, text=text
         )
         segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
+    segment.attach(attachments.of_parameters(parameters.parameters(), at_ns + zero_utc_ns))
     segment.finish()
     return result
 

@@ -478,6 +478,7 @@ def replay(
             found.begin(record)
             for command in record.commands:
                 loop.order(command)
+            loop.answered(record.answered_ns)
             loop.tick(record.tick, record.at_ns, to_nobody, record.missed_ticks, record.stop)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)

@@ -18,7 +18,7 @@ import os
 import struct
 import zlib
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,19 @@ from typing import NamedTuple
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Footer, Header, McapRecord, Schema, Statistics
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.records import SummaryOffset as Group
 
 from logs.recording.disk import OutputFile, is_there, segment_path
@@ -46,6 +58,9 @@ _OFFSET = struct.Struct("<HQ")  # channel, where its index is
 _CHUNK_INDEX_END = struct.Struct("<QIQQ")  # bytes of the indexes, compression, compressed size, size
 _CHUNK_INDEX_FIELDS = 64
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
+# Metadata of each channel: UTC of time 0 of our clock [ns since 1970], that log times are later than the records' own.
+# In each chunk, as all of a channel is, and so there whatever else of the file is damaged.
+ZERO_UTC = "zero_utc_ns"
 
 
 class QueuedMessage(NamedTuple):
@@ -69,16 +84,19 @@ class Segment:
 
     Args:
         chunk_bytes: largest chunk [bytes]; only a single larger message makes a larger chunk.
+        zero_utc_ns: UTC of time 0 of our clock [ns since 1970]; 0 makes log times those of our clock.
     """
 
-    def __init__(self, file: OutputFile, chunk_bytes: int) -> None:
+    def __init__(self, file: OutputFile, chunk_bytes: int, zero_utc_ns: int = 0) -> None:
         self._file = file
         self._chunk_bytes = chunk_bytes
+        self._zero_utc_ns = zero_utc_ns
         self._channels: dict[str, _Channel] = {}
         self._schemas: dict[str, Schema] = {}
         # Of a long recording there are many chunks: what the footer says of them is kept as its bytes.
         self._chunk_indexes = bytearray()
         self._chunks = 0
+        self._attached: list[AttachmentIndex | MetadataIndex] = []
         self._times_ns: tuple[int, int] | None = None  # first and last
         self._counts: Counter[int] = Counter()
         self._crc = 0
@@ -86,6 +104,7 @@ class Segment:
         self.open_entries: list[QueuedMessage] = []  # not on the disk yet
         self.messages = 0  # on the disk
         self.bytes = 0  # on the disk
+        self.attached_bytes = 0  # of these, attachments and metadata
 
     @property
     def records(self) -> int:
@@ -122,6 +141,27 @@ class Segment:
         if self.open_entries:
             self._commit(self.open_entries)
             self.open_entries = []
+
+    def attach(self, records: Sequence[Attachment | Metadata]) -> None:
+        """Write the open chunk, and attachments and metadata after it.
+
+        Raises:
+            OSError: as `commit`; of what was to be attached nothing counts then.
+        """
+        self.commit()
+        if not records:
+            return
+        prefix, at = self._prefix(), self.bytes
+        block, indexes = prefix, []
+        for one in records:
+            data = _bytes(one)
+            indexes.append(_index(one, at + len(block), len(data)))
+            block += data
+        self._file.write(block)
+        self._crc = zlib.crc32(block, self._crc)
+        self.bytes += len(block)
+        self.attached_bytes += len(block)
+        self._attached += indexes
 
     def sync(self) -> None:
         """Write the open chunk and wait for the disk."""
@@ -163,6 +203,10 @@ class Segment:
         """
         self._file.close()
 
+    def _prefix(self) -> bytes:
+        """Return the bytes that the next write has to begin with: those that begin a file, or none."""
+        return b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+
     def _begin_chunk(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
@@ -186,13 +230,13 @@ class Segment:
             topic=definition.topic,
             message_encoding=definition.encoding,
             schema_id=0 if schema is None else schema.id,
-            metadata={},
+            metadata={ZERO_UTC: str(self._zero_utc_ns)} if self._zero_utc_ns else {},
         )
         channel = self._channels[definition.topic] = _Channel(record.id, _bytes(record))
         return channel, head + channel.record
 
     def _put(self, entry: QueuedMessage, channel: int, head: bytes) -> None:
-        data, at_ns, place = entry.data, entry.at_ns, self._size + len(head)
+        data, at_ns, place = entry.data, entry.at_ns + self._zero_utc_ns, self._size + len(head)
         index = self._indexes.get(channel)
         if index is None:
             self._indexes[channel] = [at_ns, place]
@@ -204,12 +248,12 @@ class Segment:
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
         content = b"".join(self._parts)
-        times_ns = [one.at_ns for one in entries]
+        times_ns = [one.at_ns + self._zero_utc_ns for one in entries]
         first, last = min(times_ns), max(times_ns)
         size = len(content)
         head = CHUNK.pack(Opcode.CHUNK, CHUNK_FIELDS + size, first, last, size, zlib.crc32(content), 0, size)
         length = len(head) + size
-        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        prefix = self._prefix()
         start = self.bytes + len(prefix)
         at, offsets = start + length, []
         indexes = []
@@ -238,7 +282,7 @@ class Segment:
 
     def _tail(self) -> bytes:
         """Return the bytes that end a file: end of data, summary, footer."""
-        prefix = b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        prefix = self._prefix()
         data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
         start = self.bytes + len(data_end)
         groups = (
@@ -246,6 +290,8 @@ class Segment:
             (Opcode.CHANNEL, b"".join(channel.record for channel in self._channels.values())),
             (Opcode.STATISTICS, _bytes(self._statistics())),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, _bytes(*self._of(AttachmentIndex))),
+            (Opcode.METADATA_INDEX, _bytes(*self._of(MetadataIndex))),
         )
         summary, offsets = b"", b""
         for opcode, data in groups:
@@ -257,17 +303,20 @@ class Segment:
         footer = _bytes(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
         return data_end + summary + offsets + footer + MAGIC
 
+    def _of(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
+        return [one for one in self._attached if isinstance(one, kind)]
+
     def _statistics(self) -> Statistics:
         first, last = self._times_ns or (0, 0)
         return Statistics(
-            attachment_count=0,
+            attachment_count=len(self._of(AttachmentIndex)),
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
             chunk_count=self._chunks,
             message_count=self.messages,
             message_start_time=first,
             message_end_time=last,
-            metadata_count=0,
+            metadata_count=len(self._of(MetadataIndex)),
             schema_count=len(self._schemas),
         )
 
@@ -278,6 +327,20 @@ def _bytes(*records: McapRecord) -> bytes:
         record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]  # not annotated in mcap
     return data
+
+
+def _index(record: Attachment | Metadata, offset: int, length: int) -> AttachmentIndex | MetadataIndex:
+    if isinstance(record, Metadata):
+        return MetadataIndex(offset=offset, length=length, name=record.name)
+    return AttachmentIndex(
+        offset=offset,
+        length=length,
+        log_time=record.log_time,
+        create_time=record.create_time,
+        data_size=len(record.data),
+        name=record.name,
+        media_type=record.media_type,
+    )
 
 
 @cache
@@ -319,6 +382,7 @@ class Rotation:
         reason: reason of the newest failed write, or why recording pauses.
         gone: names of files that were written and are no longer there.
         gone_records: number of records in those files.
+        zero_utc_ns: UTC of time 0 of our clock [ns since 1970], for the files that are begun from now on.
     """
 
     def __init__(
@@ -329,12 +393,14 @@ class Rotation:
         self._preface = 0  # records at the start of this segment that only repeat
         self._repeats: dict[str, bytes] = {}  # header and library, for each segment
         self._repeats_bytes = 0
+        self._attachments: tuple[Attachment | Metadata, ...] = ()  # for each segment
         self._retry_s = clock()
         self._opened: os.stat_result | None = None  # what the open file is
         self._done: list[_SegmentPart] = []
         self.gone: list[str] = []
         self.gone_records = 0
         self.unwritten: deque[tuple[str, int, bytes]] = deque()
+        self.zero_utc_ns = 0
         self.because = ""
         self.number = 1
         self.written = 0
@@ -361,7 +427,10 @@ class Rotation:
     @property
     def is_full(self) -> bool:
         """Whether the open file has reached its size, not counting what every file begins with."""
-        return self._segment is not None and self._segment.bytes >= self._log.segment_bytes + self._repeats_bytes
+        segment = self._segment
+        if segment is None:
+            return False
+        return segment.bytes - segment.attached_bytes >= self._log.segment_bytes + self._repeats_bytes
 
     @property
     def may_begin(self) -> bool:
@@ -406,7 +475,7 @@ class Rotation:
         """
         path = segment_path(self._path, self.number)
         path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
-        self._segment = Segment(self._open_file(path), self._log.chunk_bytes)
+        self._segment = Segment(self._open_file(path), self._log.chunk_bytes, self.zero_utc_ns)
         self._opened = path.stat()
         self._preface = 0
         if self.number > 1:
@@ -414,6 +483,7 @@ class Rotation:
             self._repeat(HEADER)
             tell(self.because)
             self._repeat(LIBRARY)
+            self._segment.attach(self._attachments)
 
     def write(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a message to the open file.
@@ -453,6 +523,19 @@ class Rotation:
         """
         self._open_segment().commit()
 
+    def attach(self, each: Sequence[Attachment | Metadata], once: Sequence[Attachment | Metadata]) -> None:
+        """Write attachments and metadata into this file, after its chunk.
+
+        Args:
+            each: what the files that follow get, too.
+            once: what only this one gets.
+
+        Raises:
+            OSError: they could not be written.
+        """
+        self._attachments = tuple(each)
+        self._open_segment().attach((*each, *once))
+
     def sync(self) -> None:
         """Write the open chunk and wait until the disk has it.
 
@@ -461,13 +544,14 @@ class Rotation:
         """
         self._open_segment().sync()
 
-    def finish(self) -> None:
-        """Close the open file with index and footer.
+    def finish(self, records: Sequence[Attachment | Metadata] = ()) -> None:
+        """Close the open file with attachments and metadata that belong to its end, index and footer.
 
         Raises:
             OSError: not all of it could be done.
         """
         segment = self._open_segment()
+        segment.attach(records)
         segment.finish()
         self._retire(segment, there=self._is_there(segment))
 

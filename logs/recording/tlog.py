@@ -253,14 +253,14 @@ def export_tlog(
         UsageError: There is no such connection, or the file exists and is not to be overwritten.
     """
     first = header(flight)
-    began_us = _began_us(flight, first)
+    zero_utc_ns = utc_of_zero(flight, first)
     check_free([file], force=force)
     packets: Counter[str] = Counter()
     raw = _Raw(_streams(first))
     with all_or_none([file]), unfinished([file]) as parts, parts[file].open("wb") as out:
         messages = watch(good_messages(flight), known_number(flight), "writing")
         for at_ns, topic, packet in _in_order(raw.packets(messages, link)):
-            out.write(_STAMP.pack(began_us + (at_ns - first.started_ns) // 1000) + packet)
+            out.write(_STAMP.pack((zero_utc_ns + at_ns) // 1000) + packet)
             packets[topic] += 1
         if link is not None and link not in raw.links:
             there = f"it has {', '.join(sorted(raw.links))}" if raw.links else "it has none"
@@ -343,13 +343,20 @@ def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, 
     yield from ((first[0], first[2], first[3]) for first in sorted(waiting))
 
 
-def _began_us(flight: Path, first: Header) -> int:
-    """Return when the recording began [µs since the epoch]."""
+def utc_of_zero(flight: Path, first: Header) -> int:
+    """Return UTC of time 0 of a recording's clock [ns since the epoch]; of an older one by when it began.
+
+    Raises:
+        RecordingError: It does not say when it began.
+    """
+    if first.zero_utc_ns is not None:
+        return first.zero_utc_ns
     try:
         began = datetime.fromisoformat(first.started_utc)
     except ValueError as error:
         raise RecordingError(f"{flight}: its header has no usable start time ({error})") from error
-    return ((began if began.tzinfo else began.replace(tzinfo=UTC)) - _EPOCH) // timedelta(microseconds=1)
+    began_us = ((began if began.tzinfo else began.replace(tzinfo=UTC)) - _EPOCH) // timedelta(microseconds=1)
+    return began_us * 1000 - first.started_ns
 
 
 def _streams(first: Header) -> frozenset[str]:

@@ -38,6 +38,7 @@ from uavctl.records import (
     Setpoint,
     StepInput,
     Timing,
+    ToldParameter,
     Truth,
     VehicleStatus,
     raw_topic,
@@ -45,6 +46,7 @@ from uavctl.records import (
 
 HEADER = "/uavctl/header"
 LIBRARY = "/uavctl/library"
+PARAMETER = "/uavctl/parameter"
 ENDED = "/uavctl/end"
 RECORDER = "/uavctl/recorder"
 # How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
@@ -116,6 +118,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/event", Event, "something worth telling a person"),
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
     Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
+    Topic(PARAMETER, ToldParameter, "a parameter that the vehicle told in the check before arming, one record each"),
     Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
     Topic("/uavctl/relay", RelayStats, "positions that were passed on to the vehicle, once a second, if any are"),
@@ -247,8 +250,11 @@ def says(record: Record, message: bytes) -> bool:
         return False
 
 
-def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
-    """Encode a record so that a reader gets the same back under this topic and log time [ns].
+def encode_message(topic: str, at_ns: int, record: Record, zero_utc_ns: int = 0) -> bytes:
+    """Encode a record so that a reader gets the same back under this topic and time [ns].
+
+    Args:
+        zero_utc_ns: what is added to its time in the file [ns].
 
     Raises:
         RecordingError: it would not, and why.
@@ -261,7 +267,7 @@ def encode_message(topic: str, at_ns: int, record: Record) -> bytes:
         raise RecordingError(f"topic {topic} takes {expected.__name__}, not {type(record).__name__}")
     if isinstance(record, Datagram) and topic != raw_topic(record.link, outgoing=record.outgoing):
         raise RecordingError(f"topic {topic} is not that of connection {record.link}")
-    if not 0 <= at_ns <= _MAX_TIME_NS:
+    if at_ns < 0 or not 0 <= at_ns + zero_utc_ns <= _MAX_TIME_NS:
         raise RecordingError(f"topic {topic}: time {at_ns} ns does not fit a recording")
     return encode(record)
 

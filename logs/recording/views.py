@@ -112,7 +112,7 @@ def _made(kind: Callable[..., M], **fields: Any) -> M:
 
 
 def stamp(at_ns: int) -> Fields:
-    """Return a time of our clock as a Protobuf timestamp."""
+    """Return a log time as a Protobuf timestamp."""
     return {"seconds": at_ns // 1_000_000_000, "nanos": at_ns % 1_000_000_000}
 
 
@@ -168,11 +168,11 @@ def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
     )
 
 
-def log_line(event: Event) -> Log:
+def log_line(event: Event, at_ns: int) -> Log:
     """Return an event as a log message."""
     times = "" if event.count == 1 else f" ({event.count} times)"
     return _made(
-        Log, timestamp=stamp(event.at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
+        Log, timestamp=stamp(at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
     )
 
 
@@ -215,7 +215,7 @@ def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) 
     )
 
 
-def link_scene(design: DesignView, decision: Decision) -> SceneUpdate:
+def link_scene(at_ns: int, design: DesignView, decision: Decision) -> SceneUpdate:
     """Draw the link's state at the vehicle, with words: green with news, amber in silence, red in the fallback."""
     colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
     age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
@@ -228,7 +228,7 @@ def link_scene(design: DesignView, decision: Decision) -> SceneUpdate:
         "text": f"{decision.mode.value}, {age}",
     }
     ball: Fields = {"pose": pose((0.0, 0.0, 0.0)), "size": vector((0.2, 0.2, 0.2)), "color": colour}
-    return _update(_entity(decision.at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
+    return _update(_entity(at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
 
 
 def _update(*entities: Fields) -> SceneUpdate:
@@ -332,12 +332,13 @@ class Views:
         self._measured = _Trail()
         self._true_path = False
         self._still_ns = self._trail_ns = 0
+        self._zero_utc_ns = 0  # stamps, like log times, are so much later than the records' times
 
     def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         """Yield topic and message of all that is derived from a record, in order; nothing before a header.
 
         Args:
-            at_ns: log time of the record, and of what is made of it [ns].
+            at_ns: time of the record by our clock [ns]; what is made of it has stamps in UTC, as the header says.
 
         Raises:
             RecordingError: a header whose design cannot be used: no views come of this recording.
@@ -346,6 +347,7 @@ class Views:
         """
         if isinstance(record, Header):
             self._design, self._still_ns = design_view(record), at_ns
+            self._zero_utc_ns = record.zero_utc_ns or 0
         if self._design is None or isinstance(record, Datagram):  # half of all records
             return []
         views = [*self._views(self._design, at_ns, record)]
@@ -389,46 +391,47 @@ class Views:
                 at_m = design.position_of(record.mean)
                 if not self._true_path:
                     self._flown.add(record.at_ns, at_m)
-                yield topics.ESTIMATE, pose_in_frame(record.at_ns, at_m)
-                yield topics.VEHICLE_FRAME, vehicle_frame(record.at_ns, at_m)
+                utc_ns = record.at_ns + self._zero_utc_ns
+                yield topics.ESTIMATE, pose_in_frame(utc_ns, at_m)
+                yield topics.VEHICLE_FRAME, vehicle_frame(utc_ns, at_m)
             case Truth():
                 self._true_path = True
                 self._flown.add(record.at_ns, record.position_m)
-                yield topics.TRUTH, pose_in_frame(record.at_ns, record.position_m)
+                yield topics.TRUTH, pose_in_frame(record.at_ns + self._zero_utc_ns, record.position_m)
             case StepInput():
                 for sample in record.samples:
                     self._measured.add(record.at_ns, sample.position_m)
-                    yield topics.MEASURED, pose_in_frame(sample.captured_ns, sample.position_m)
+                    captured_utc_ns = sample.captured_ns + self._zero_utc_ns
+                    yield topics.MEASURED, pose_in_frame(captured_utc_ns, sample.position_m)
             case Plan() if record.status is SolveStatus.OPTIMAL:
                 places = design.positions_of(record.states)
-                yield topics.PLAN, poses_in_frame(at_ns, places)
-                yield topics.PLAN_SCENE, plan_scene(at_ns, design, record, self._estimate, places)
+                utc_ns = at_ns + self._zero_utc_ns
+                yield topics.PLAN, poses_in_frame(utc_ns, places)
+                yield topics.PLAN_SCENE, plan_scene(utc_ns, design, record, self._estimate, places)
             case Event():
-                yield topics.LOG, log_line(record)
+                yield topics.LOG, log_line(record, record.at_ns + self._zero_utc_ns)
             case RecorderNote():
                 told = Event(at_ns=at_ns, severity=Severity.WARNING, code="recording", text=record.text)
-                yield topics.LOG, log_line(told)
+                yield topics.LOG, log_line(told, at_ns + self._zero_utc_ns)
 
     def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
         """Yield the scenes that do not move, when they are due."""
         if at_ns >= self._still_ns:
             self._still_ns = at_ns + STILL_NS
-            yield topics.FRAMES, frames(at_ns)
-            yield topics.ROOM_SCENE, room_scene(at_ns, design)
+            yield topics.FRAMES, frames(at_ns + self._zero_utc_ns)
+            yield topics.ROOM_SCENE, room_scene(at_ns + self._zero_utc_ns, design)
 
     def _decision(self, design: DesignView, decision: Decision) -> Iterator[_Item]:
+        utc_ns = decision.at_ns + self._zero_utc_ns
         if decision.boundary:
-            yield topics.LINK_SCENE, link_scene(design, decision)
+            yield topics.LINK_SCENE, link_scene(utc_ns, design, decision)
             if decision.target is not None:
                 target_m = design.position_of(decision.target)
-                yield topics.TARGET, pose_in_frame(decision.at_ns, target_m)
+                yield topics.TARGET, pose_in_frame(utc_ns, target_m)
         if decision.at_ns >= self._trail_ns:
             self._trail_ns = decision.at_ns + TRAIL_NS
             since_ns = decision.at_ns - round(TRAIL_S * 1e9)
-            yield (
-                topics.PATH_SCENE,
-                path_scene(decision.at_ns, self._flown.since(since_ns), self._measured.since(since_ns)),
-            )
+            yield (topics.PATH_SCENE, path_scene(utc_ns, self._flown.since(since_ns), self._measured.since(since_ns)))
 
 
 class _Trail:

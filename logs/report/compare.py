@@ -20,6 +20,7 @@ from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.flight import FlightData
 from logs.recording.info import info
 from logs.recording.outputs import spare_recording, write_whole
+from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, good_messages, read
 from logs.recording.replay import leaves
 from logs.recording.summary import FlightSummary, Percentiles, count, position_error_m, summarise
@@ -57,6 +58,7 @@ class LoadedFlight:
     side: ComparedFlight
     flight: FlightData
     summary: FlightSummary
+    parameters: Mapping[str, VehicleParameter]  # of the vehicle, as it told them
 
 
 def load_all(paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: None) -> tuple[LoadedFlight, ...]:
@@ -88,7 +90,7 @@ def _load(path: Path, name: str) -> LoadedFlight:
         finished=whole.finished,
         records_lost=whole.dropped + whole.refused + whole.missing,
     )
-    return LoadedFlight(side, flight, summary)
+    return LoadedFlight(side, flight, summary, whole.parameters)
 
 
 # Figures of flights beside each other.
@@ -215,7 +217,8 @@ class Match(msgspec.Struct, frozen=True, kw_only=True):
 class ParameterDifference(msgspec.Struct, frozen=True, kw_only=True):
     """Parameter in which the recordings differ; null where a recording does not have it."""
 
-    key: str  # dotted name in the configuration, or design_id, library_id, cpu, versions.<package>
+    # dotted name in the configuration, or design_id, library_id, cpu, platform, versions.<package>, vehicle.<PARAMETER>
+    key: str
     values: tuple[object, ...]  # one each recording
 
 
@@ -238,7 +241,7 @@ def compare(loaded: Sequence[LoadedFlight]) -> FlightComparison:
     return FlightComparison(
         recordings=tuple(one.side for one in loaded),
         likenesses=tuple(_likeness(loaded[0], other) for other in loaded[1:]),
-        parameters=tuple(_differences([_parameters(one) for one in loaded])),
+        parameters=(*_differences([_parameters(one) for one in loaded]), *_differences(_vehicles(loaded))),
         figures=tuple(figures(loaded)),
         notes=tuple(_notes(loaded)),
     )
@@ -307,8 +310,17 @@ def _parameters(one: LoadedFlight) -> dict[str, object]:
         "design_id": header.design_id,
         "library_id": header.library_id,
         "cpu": header.cpu,
+        "platform": header.platform or None,
         **{f"versions.{name}": version for name, version in sorted(header.versions.items())},
     }
+
+
+def _vehicles(loaded: Sequence[LoadedFlight]) -> list[dict[str, object]]:
+    """Return the vehicle's parameters that differ, of those told in all flights in which it told any."""
+    told = [one.parameters for one in loaded if one.parameters]
+    common = sorted(set.intersection(*map(set, told))) if told else []
+    differing = [name for name in common if len({one[name].value for one in told}) > 1]
+    return [{f"vehicle.{name}": one.parameters[name].value for name in differing if one.parameters} for one in loaded]
 
 
 def _differences(parameters: Sequence[Mapping[str, object]]) -> Iterator[ParameterDifference]:
@@ -319,6 +331,9 @@ def _differences(parameters: Sequence[Mapping[str, object]]) -> Iterator[Paramet
 
 
 def _notes(loaded: Sequence[LoadedFlight]) -> Iterator[str]:
+    if _differ(loaded, lambda one: one.parameters.keys()):
+        told = ", ".join(f"{one.side.name} {len(one.parameters)}" for one in loaded)
+        yield f"the vehicle did not tell the same parameters in all ({told}): those that only some have are left out"
     for one in loaded:
         if not one.side.finished:
             yield f"{one.side.name} is torn: compared up to its end"

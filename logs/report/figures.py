@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from logs.recording.design_view import Floats
 from logs.recording.flight import FlightData
-from logs.recording.summary import SLACK_TOLERANCE, decision_times_us, input_outside
-from logs.report.plots import DASHED, draw_path, shade_fallback, span, thin
+from logs.recording.summary import SLACK_TOLERANCE, decision_times_us
+from logs.report.plots import DASHED, draw_path, input_beyond, shade_fallback, span, thin
 from logs.report.statistics import normal_reach
 from logs.report.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, power_of_ten, ramp, standalone, strokes
 from logs.report.verdict_model import AxisVerdict, LeadVerdict
@@ -74,7 +74,6 @@ def draw_age(ax: Axes, flight: FlightData) -> None:
 def inputs(flight: FlightData) -> Iterator[Drawing]:
     """Draw each input against its limits, coloured by the plan index that was flown."""
     steps, design = flight.steps, flight.design
-    outside = input_outside(flight)
     index = np.array([-1 if d.plan_index is None else d.plan_index for d in steps.decisions], dtype=np.int64)
     yield _indices(flight, index)
     for number, (name, sign) in enumerate(INPUT[axis] for axis in design.axes):
@@ -91,6 +90,7 @@ def inputs(flight: FlightData) -> Iterator[Drawing]:
                 chosen = index == at
                 shade = ramp(int(at), design.horizon) if at >= 0 else colour("fallback")
                 _draw_held(ax, steps.t_s[chosen], values[chosen], design.dt_s, shade)
+            outside = input_beyond(flight, number)
             ax.plot(steps.t_s[outside], values[outside], "x", ms=6, mew=1.6, color=colour("limit"))
             span(ax, flight)
         yield Drawing(key, one.svg, f"Input {name} over time against its limits, coloured by the plan index flown")

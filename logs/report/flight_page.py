@@ -8,9 +8,12 @@ from pathlib import Path
 
 from logs.recording.flight import FlightData
 from logs.recording.outputs import write_whole
-from logs.recording.summary import FlightSummary, rows
+from logs.recording.summary import FlightSummary, input_outside, rows, state_outside
 from logs.report import figures, page, plots
+from logs.report.cursor import script
+from logs.report.excursion import excursions
 from logs.report.figures import picture
+from logs.report.headline import headline
 from logs.report.page import Mark, PageSection
 from logs.report.plots import path_3d
 from logs.report.statistics import LEVEL
@@ -279,6 +282,9 @@ __all__ = ["picture", "report_html", "write_report"]
 _LIMIT = Mark("dashed", "limit", "limit")
 _TARGET = Mark("dotted", "target", "target")
 _ESTIMATE = Mark("line", "estimate", "estimate")
+_OUTSIDE = Mark("cross", "limit", "outside")
+_OUTSIDE_FROM = Mark("ring", "limit", "where it left its limits")
+_FURTHEST = Mark("cross", "limit", "furthest outside")
 _FALLBACK = Mark("band", "fallback", "fallback")
 _NO_PLAN = "No plan was flown, so there is nothing to compare."
 _LATENESS = "lateness is from a tick's deadline to its start"
@@ -305,15 +311,23 @@ def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | Non
     title = f"Flight “{name}”" if name else "Flight"
     title += ", a part" if part_begins(flight) else ""
     subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
-    return page.page(title, subtitle, story(flight, summary), _sections(flight, summary, judged))
+    main = headline(flight, summary, judged)
+    return page.page(
+        title,
+        subtitle,
+        story(flight, summary),
+        _sections(flight, summary, judged),
+        top=page.banner(main.tone, main.word, main.text, main.why),
+        script=script(flight, main.at_s),
+    )
 
 
 def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Iterator[PageSection]:
     begins = part_begins(flight)
     part = [("Part of a flight", f"begins at {begins}")] if begins else []
     yield PageSection("Summary", "", page.facts([*part, *rows(summary), *verdict_rows(judged.verdicts)]))
-    wide, narrow, marks = timeline(flight)
-    yield PageSection("Timeline", "", page.wide_or_narrow(wide, narrow), marks)
+    wide, narrow, marks, meanings = timeline(flight)
+    yield PageSection("Timeline", "", page.wide_or_narrow(wide, narrow) + page.note(meanings), marks)
     yield _path_section(flight)
     yield _axes_section(flight)
     yield _age_section(flight)
@@ -343,6 +357,8 @@ def _path_section(flight: FlightData) -> PageSection:
             Mark("ring", "truth", "start"),
             _TARGET if flight.moving_target else Mark("star", "target", "target"),
             _LIMIT,
+            *((Mark("band", "limit", "space that a fence took"),) if plots.fences(flight) else ()),
+            *((_OUTSIDE_FROM, _FURTHEST) if excursions(flight) else ()),
         ),
     )
 
@@ -358,7 +374,7 @@ def _axes_section(flight: FlightData) -> PageSection:
             _TARGET,
             _LIMIT,
             Mark("band", "limit", "reserve kept"),
-            Mark("cross", "limit", "outside"),
+            *((_OUTSIDE,) if state_outside(flight).any() else ()),
             *_fallback_mark(flight),
         ),
     )
@@ -438,7 +454,7 @@ def _inputs_section(flight: FlightData) -> PageSection:
         "Inputs",
         "The colour tells how far into its plan the controller was when it gave the input, as in the first figure.",
         page.grid(list(figures.inputs(flight))),
-        (_LIMIT, Mark("cross", "limit", "outside"), *_fallback_mark(flight)),
+        (_LIMIT, *((_OUTSIDE,) if input_outside(flight).any() else ()), *_fallback_mark(flight)),
     )
 
 

@@ -1,7 +1,8 @@
-"""HTML of a report: one file without scripts, fonts or images from outside."""
+"""HTML of a report: one file with nothing from outside, whole without its script, too."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -9,6 +10,8 @@ from importlib import resources
 from string import Template
 
 from logs.report.svg import FONT, Drawing, css_variables
+
+_MANY = 9  # sections from which on a page has a list of them
 
 
 @dataclass(frozen=True)
@@ -31,28 +34,71 @@ class PageSection:
 
 
 def page(
-    title: str, subtitle: str, story: Iterable[str], sections: Iterable[PageSection], heading: str = "What happened"
+    title: str,
+    subtitle: str,
+    story: Iterable[str],
+    sections: Iterable[PageSection],
+    heading: str = "What happened",
+    top: str = "",
+    script: str = "",
 ) -> str:
-    """Return a complete HTML document; `title`, `subtitle`, `story` and its `heading` are plain text."""
+    """Return a complete HTML document.
+
+    Args:
+        title: Plain text, as are `subtitle`, `story` and its `heading`.
+        top: HTML that stands before all else but the title.
+        script: JavaScript of the page's end; the page is whole without it.
+    """
     css = Template(resources.files("logs.report").joinpath("page.css").read_text(encoding="utf-8"))
     style = css.substitute(light=css_variables(False), dark=css_variables(True), font=FONT)
     sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in story)
+    first = PageSection(heading, "", f'<ul class="story">{sentences}</ul>')
+    shown = [first, *sections]
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
-        f'<header><h1>{escape(title)}</h1>\n<p class="sub">{escape(subtitle)}</p></header>\n'
-        f'<section><h2>{escape(heading)}</h2>\n<ul class="story">{sentences}</ul></section>\n'
-        + "\n".join(_section(section) for section in sections)
-        + "\n</main>\n</body>\n</html>\n"
+        f'<header><h1>{escape(title)}</h1>\n{top}<p class="sub">{escape(subtitle)}</p></header>\n'
+        f"{_contents(shown)}"
+        + "\n".join(_section(section) for section in shown)
+        + "\n</main>\n"
+        + (f"<script>{script}</script>\n" if script else "")
+        + "</body>\n</html>\n"
     )
+
+
+def banner(tone: str, word: str, text: str, why: Iterable[str]) -> str:
+    """Return the line on what matters most as HTML, with the sentences below it.
+
+    Args:
+        tone: "good", "mind" or "bad", for its colour.
+        word: What it comes to, so that it is said without colour, too.
+    """
+    sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in why)
+    return (
+        f'<div class="banner {tone}"><p><strong>{escape(word)}:</strong> {escape(text)}</p>'
+        f"{f'<ul>{sentences}</ul>' if sentences else ''}</div>\n"
+    )
+
+
+def _contents(sections: Sequence[PageSection]) -> str:
+    """Return links to the sections as HTML; none on a page that is seen at a glance."""
+    if len(sections) < _MANY:
+        return ""
+    links = "".join(f'<li><a href="#{_anchor(one)}">{escape(one.title)}</a></li>' for one in sections)
+    return f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n'
+
+
+def _anchor(section: PageSection) -> str:
+    return "on-" + re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
 
 
 def _section(section: PageSection) -> str:
     note = f'<p class="note">{escape(section.note)}</p>' if section.note else ""
     marks = "".join(f"<li>{_swatch(mark)}{escape(mark.text)}</li>" for mark in section.legend)
     legend = f'<ul class="legend">{marks}</ul>' if marks else ""
-    return f"<section><h2>{escape(section.title)}</h2>\n{note}{legend}\n{section.body}</section>"
+    heading = f'<h2 id="{_anchor(section)}">{escape(section.title)}</h2>'
+    return f"<section>{heading}\n{note}{legend}\n{section.body}</section>"
 
 
 def grid(drawings: Sequence[Drawing]) -> str:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats
 from logs.recording.flight import FlightData
-from logs.recording.summary import box_at, position_error_m, state_outside
+from logs.recording.summary import RELATIVE_TOLERANCE, WIRE_TOLERANCE, box_at, limits_at, position_error_m
+from logs.report.excursion import Excursion, excursions, trusted
 from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, dots
 from uavctl.records import Plan
 
@@ -26,7 +30,47 @@ DASHED = (0, (5, 3))
 DOTTED = (0, (1, 1.6))
 # Axes as people see them: down is drawn as height, upwards.
 SEEN = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("height", -1.0)}
+# Views of the path that the page's cursor moves in: its name, the axes across and up, and what a place becomes there.
+# In three dimensions north runs into the picture, to the upper right.
+VIEWS: dict[str, tuple[tuple[str, ...], Floats]] = {
+    "above": (("east", "north"), np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])),
+    "side": (("east", "down"), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])),
+    "deep": ((), np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])),
+}
 RATE = {"north": "speed north", "east": "speed east", "down": "climb rate"}
+
+# Text beside a mark that is to be seen: of the limits' colour, on a ground that keeps it readable.
+_MARKED: dict[str, Any] = {
+    "color": colour("limit"),
+    "fontsize": 8.5,
+    "fontweight": "bold",
+    "bbox": {"facecolor": colour("card"), "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+}
+
+
+@dataclass(frozen=True)
+class MovedLimit:
+    """A limit of position that moves over a flight [m], and when it first was at its tightest [s]."""
+
+    axis: str
+    upper: bool
+    widest_m: float
+    tightest_m: float
+    at_s: float
+
+
+def fences(flight: FlightData) -> list[MovedLimit]:
+    """Return the limits of position that move over the flight."""
+    t_s, design = np.linspace(0.0, flight.duration_s, LIMIT_POINTS), flight.design
+    found = []
+    for upper, sides in enumerate(box_at(flight, t_s)):
+        for axis, state in zip(design.axes, design.position_index, strict=True):
+            side = sides[:, state]
+            if np.isfinite(side).all() and np.ptp(side) > 0.0:
+                tight = int(side.argmin() if upper else side.argmax())
+                wide = float(side.max() if upper else side.min())
+                found.append(MovedLimit(axis, bool(upper), wide, float(side[tight]), float(t_s[tight])))
+    return found
 
 
 def path(flight: FlightData) -> Iterator[Drawing]:
@@ -41,6 +85,7 @@ def path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, s
     (x_name, _), (y_name, _) = (SEEN[axis] for axis in axes_shown)
     with canvas(key, 3.7) as one:
         ax = one.axes(title, f"{x_name} [m]", f"{y_name} [m]")
+        one.seen = next(name for name, (axes, _) in VIEWS.items() if axes == axes_shown)
         draw_path(ax, flight, axes_shown)
     label = f"Path seen {title[0].lower()}{title[1:]}: {x_name} and {y_name} in metres, within the position limits"
     return Drawing(key, one.svg, label)
@@ -56,10 +101,11 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
 
     design = flight.design
     samples = seen(_thin(np.array([s.position_m for s in flight.samples]).reshape(-1, 3)))
-    estimate = seen(along(np.array([design.position_of(e.mean) for e in flight.estimates])))
+    estimate = seen(along(np.array([design.position_of(e.mean) for e in trusted(flight)])))
     truth = seen(along(np.array([t.position_m for t in flight.truths])))
     target = seen(along(np.array([design.position_of(state) for state in _places(flight)])))
     _draw_room(ax, design, axes_shown)
+    _draw_fences(ax, flight, axes_shown)
     ax.plot(*estimate.T, color=colour("estimate"), lw=2.8, alpha=0.5, zorder=2)
     ax.plot(*truth.T, color=colour("truth"), lw=1.0, zorder=3)
     dots(ax, samples[:, 0], samples[:, 1], "sample", 2.4, zorder=4)
@@ -69,8 +115,56 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
         ax.plot(*target.T, color=colour("target"), lw=1.1, ls=DOTTED, zorder=3)
     else:
         ax.plot(*target.T, "*", ms=12, color=colour("target"), mec=colour("card"), mew=0.6, zorder=6)
+    _draw_excursions(ax, flight, seen)
     ax.set_aspect("equal", adjustable="datalim")
     ax.margins(0.06)
+
+
+def _draw_fences(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None:
+    """Draw the limits that move: where each was at its tightest, and the space that it took away until then."""
+    for fence in fences(flight):
+        if fence.axis not in axes_shown:
+            continue
+        up = axes_shown[1] == fence.axis
+        sign, other = SEEN[fence.axis][1], axes_shown[0 if up else 1]
+        begin, end = position_limits(flight.design, other)
+        if not np.isfinite([begin, end]).all():
+            places = SEEN[other][1] * course(flight)[1][:, AXIS_NUMBER[other]]
+            begin, end = float(np.nanmin(places)), float(np.nanmax(places))
+        tight, wide = sign * fence.tightest_m, sign * fence.widest_m
+        along, over = np.array([begin, end]), np.array([tight, tight])
+        fill, line = (ax.fill_between, (along, over)) if up else (ax.fill_betweenx, (over, along))
+        fill(along, tight, wide, color=colour("limit"), alpha=0.1, lw=0, zorder=0)
+        ax.plot(*line, color=colour("limit"), lw=1.6, zorder=1)
+        told, inwards = f"fence at {fence.at_s:.1f} s", -1 if wide > tight else 1
+        at, off = ((begin, tight), (3, 8 * inwards)) if up else ((tight, begin), (8 * inwards, 3))
+        how: dict[str, Any] = {"va": "center"} if up else {"ha": "center", "rotation": 90}
+        ax.annotate(told, at, off, textcoords="offset points", **how, **_MARKED)
+
+
+def _draw_excursions(ax: Axes, flight: FlightData, seen: Callable[[Floats], Floats]) -> None:
+    """Mark where the vehicle left its limits, and where it was furthest outside, for the worst of its excursions."""
+    for worst in excursions(flight)[:1]:
+        left, furthest = seen(np.array([worst.left_m, worst.worst_m]))
+        mark_excursion(ax, worst, left, furthest)
+
+
+def mark_excursion(ax: Axes, worst: Excursion, left: Floats, furthest: Floats) -> None:
+    """Mark an excursion at two places on the page (2,), with the times and how far it went."""
+    paint = colour("limit")
+    ax.plot(*furthest, "X", ms=8, color=paint, mec=colour("card"), mew=0.8, zorder=8)
+    ax.plot(*left, "o", ms=9, mfc="none", mec=paint, mew=2.2, zorder=8)
+    # Each text above or below its mark, away from the other one, and towards the middle of the drawing.
+    up = 1 if furthest[1] >= left[1] else -1
+    across = 1 if 0.5 * (left[0] + furthest[0]) < np.mean(ax.get_xlim()) else -1
+    for (x, y), told, way in (
+        (left, f"left at {worst.left_s:.1f} s", -up),
+        (furthest, f"{worst.beyond_m:.2g} m out at {worst.worst_s:.1f} s", up),
+    ):
+        side = "left" if across > 0 else "right"
+        ax.annotate(
+            told, (x, y), (8 * across, 12 * way), textcoords="offset points", ha=side, va="center", zorder=9, **_MARKED
+        )
 
 
 def _places(flight: FlightData) -> Floats:
@@ -113,14 +207,14 @@ def axes_over_time(flight: FlightData) -> Iterator[Drawing]:
 
 def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, title: str) -> Drawing:
     key, sign = f"state-{index}", SEEN[axis][1]
-    outside = state_outside(flight)
+    outside = state_beyond(flight, index)
     with canvas(key, 2.3) as one:
         ax = one.axes(title, "time [s]", y_label)
         shade_fallback(ax, flight)
         draw_limits(ax, flight, index, sign)
+        estimates = trusted(flight)
         estimate_s, estimate = thin(
-            flight.seconds([e.at_ns for e in flight.estimates]),
-            np.array([sign * e.mean[index] for e in flight.estimates]),
+            flight.seconds([e.at_ns for e in estimates]), np.array([sign * e.mean[index] for e in estimates])
         )
         ax.plot(estimate_s, estimate, color=colour("estimate"), lw=2.6, alpha=0.5)
         truth_s, truth = thin(
@@ -132,6 +226,27 @@ def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, ti
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
         span(ax, flight)
     return Drawing(key, one.svg, f"{title} over time against its limits")
+
+
+def state_beyond(flight: FlightData, index: int) -> NDArray[np.bool_]:
+    """Return at which flown boundaries a limit that a state has a part in is violated (n,)."""
+    states, limits = flight.steps.state, limits_at(flight, flight.steps.t_s)
+    rows = np.flatnonzero([normal[index] != 0.0 for normal in flight.design.c_x])
+    return _beyond(states, np.array(flight.design.c_x)[rows], limits[:, rows], RELATIVE_TOLERANCE)
+
+
+def input_beyond(flight: FlightData, number: int) -> NDArray[np.bool_]:
+    """Return at which flown boundaries a limit that an input has a part in is violated, as decided or applied (n,)."""
+    design, steps = flight.design, flight.steps
+    rows = np.flatnonzero([normal[number] != 0.0 for normal in design.c_u])
+    c, b = np.array(design.c_u)[rows], np.array(design.b_u)[rows]
+    outside = ~np.isnan(steps.decided).any(axis=1) & _beyond(steps.decided, c, b, RELATIVE_TOLERANCE)
+    return outside | _beyond(steps.input, c, b, WIRE_TOLERANCE) if steps.from_truth else outside
+
+
+def _beyond(values: Floats, c: Floats, b: Floats, tolerance: float) -> NDArray[np.bool_]:
+    normals = c.reshape(-1, values.shape[1])
+    return np.asarray(~(values @ normals.T <= b + tolerance * np.maximum(1.0, np.abs(b))).all(axis=1))
 
 
 def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
@@ -205,6 +320,7 @@ def _plans_above(flight: FlightData, chosen: list[Plan], end_s: float) -> Drawin
     flown = along(position[t_s <= end_s])
     with canvas("plan-above", 2.5) as one:
         ax = one.axes("From above", "east [m]", "north [m]")
+        one.seen = "above"
         for plan in chosen:
             north, east, _ = np.array([design.position_of(state) for state in plan.states]).T
             ax.plot(east, north, "-", color=colour("plan"), lw=1.3, marker=".", ms=3, zorder=3)
@@ -316,8 +432,7 @@ OPEN_M = 1.0  # an open side of the room is drawn so far beyond what was flown
 _STAGES = (3, 6, 12)  # of a plan whose spread is shown
 _LINES = 20.0  # of the floor's grid, at most, in each direction
 _DROPS = 12  # lines from the path to the floor
-# Where a metre north, east and down goes on the page: north runs into the picture, to the upper right.
-_SHOWN = np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])
+_SHOWN = VIEWS["deep"][1]
 
 
 def path_3d(flight: FlightData) -> tuple[Drawing, Drawing] | None:
@@ -335,14 +450,18 @@ def _view(flight: FlightData, key: str, width_in: float, height_in: float) -> Dr
     lower, upper = _room(flight.design, path_m)
     with canvas(key, height_in, width_in) as one:
         ax = one.figure.add_axes((0.04, 0.05, 0.92, 0.93))
+        one.seen = "deep"
         one.figure.set_layout_engine(None)
         ax.set_axis_off()
         ax.set_aspect("equal", adjustable="datalim")
         _draw_room_3d(ax, lower, upper)
+        _draw_fences_3d(ax, flight, lower, upper)
         _draw_path(ax, path_m, upper[2], "truth" if flight.truths else "estimate")
         for plan in choose_plans(flight):
             _draw_plan_3d(ax, flight.design, plan)
         _draw_places(ax, flight, path_m, upper[2])
+        for worst in excursions(flight)[:1]:
+            mark_excursion(ax, worst, *shown(np.array([worst.left_m, worst.worst_m])))
         ax.margins(0.03)
     label = "Path in three dimensions, seen from the south-east and above, within the position limits"
     return Drawing(key, one.svg, label)
@@ -399,6 +518,16 @@ def _draw_room_3d(ax: Axes, lower: Floats, upper: Floats) -> None:
     _label(ax, 0.5 * (south_west + south_east), (0, -7), f"east {_ends(lower[1], upper[1])}", "center", "top")
     _label(ax, 0.65 * south_east + 0.35 * north_east, (7, -3), f"north {_ends(lower[0], upper[0])}", "left", "top")
     _label(ax, 0.5 * (corners[0] + corners[1]), (-4, 0), f"height {_ends(-upper[2], -lower[2])}", "right", "center", 90)
+
+
+def _draw_fences_3d(ax: Axes, flight: FlightData, lower: Floats, upper: Floats) -> None:
+    """Draw each limit that moves as a wall where it was at its tightest."""
+    for fence in fences(flight):
+        low, high = lower.copy(), upper.copy()
+        low[AXIS_NUMBER[fence.axis]] = high[AXIS_NUMBER[fence.axis]] = fence.tightest_m
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        wall = np.unique(corners, axis=0)[[0, 1, 3, 2]]
+        ax.fill(*shown(wall).T, fc=colour("limit"), ec=colour("limit"), alpha=0.16, lw=1.2, zorder=1)
 
 
 def grid_m(lower: float, upper: float) -> Floats:

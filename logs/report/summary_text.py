@@ -128,7 +128,7 @@ def _fallback(flight: FlightData, s: FlightSummary) -> str:
 def _state_limits(flight: FlightData, s: FlightSummary) -> str:
     whose = "true" if s.state_source == "truth" else "estimated"
     if not s.state_violations:
-        return f"The {whose} state stayed inside its limits at every step."
+        return f"The {whose} state stayed inside its limits at every step that was flown."
     share = 100 * s.state_violations / s.steps
     return (
         f"The {whose} state was outside its limits at {s.state_violations} of {count(s.steps, 'step')} ({share:.3g} %)"

@@ -36,6 +36,7 @@ PALETTE = {
 # Ages of a plan, fresh to old: middle lightness throughout, so that it reads on white and on black.
 RAMP = ((0x2A, 0x86, 0xD1), (0x8B, 0x74, 0xC9), (0xCF, 0x6A, 0x94), (0xE0, 0x7B, 0x1E))
 WIDTH_IN = 4.7
+_TIME = "time [s]"  # label of an axis that runs with the flight
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.68, 0.14, 0.44, 0.3
 FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 
@@ -112,6 +113,7 @@ class Canvas:
 
     figure: Figure
     svg: str = field(default="", init=False)
+    seen: str = field(default="", init=False)  # what its first axes show, for the page's cursor: "time", or a view
 
     def axes(self, title: str, x_label: str, y_label: str, left_in: float = _LEFT_IN) -> Axes:
         """Add one set of axes, titled and labelled, that fills the figure.
@@ -128,7 +130,20 @@ class Canvas:
         axes.set_title(title)
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
+        if x_label == _TIME:
+            self.seen = "time"
         return axes
+
+    def cursor(self) -> str:
+        """Return an attribute that says where on the drawing the first axes are, and from where to where they go."""
+        if not self.seen:
+            return ""
+        ax = self.figure.axes[0]
+        size = 72.0 * self.figure.get_size_inches()
+        box = ax.get_position()
+        x, y = (size[0] * box.x0, size[0] * box.x1), (size[1] * (1.0 - box.y0), size[1] * (1.0 - box.y1))
+        numbers = " ".join(f"{value:.5g}" for value in (*x, *ax.get_xlim(), *y, *ax.get_ylim()))
+        return f'data-{self.seen}="{numbers}" '
 
 
 @contextmanager
@@ -140,7 +155,7 @@ def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[C
         yield one
         out = io.StringIO()
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-        one.svg = _inline(out.getvalue(), key)
+        one.svg = _inline(out.getvalue(), key).replace("<svg ", f"<svg {one.cursor()}", 1)
 
 
 def power_of_ten(value: float, _place: object = None) -> str:

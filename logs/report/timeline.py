@@ -1,10 +1,11 @@
-"""Timeline of a flight in lanes: who flew, the vehicle's mode, lost positions, plans that gave way, events."""
+"""Timeline of a flight in lanes that mean one thing each: who flew, the vehicle's mode, steps without news, events."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby, pairwise
+from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,17 +31,12 @@ _MODES = {
     ControlMode.LAND: "limit",
     ControlMode.STOPPED: "grid",
 }
-_MEANINGS = {
-    ("positions", "lost"): Mark("tick", "lost", "step without news"),
-    ("positions", "fallback"): Mark("tick", "fallback", "position refused"),
-    ("plans", "sample"): Mark("tick", "sample", "a constraint gave way"),
-    ("plans", "limit"): Mark("tick", "limit", "no optimum"),
-    ("limits", "limit"): Mark("tick", "limit", "outside a limit"),
-    ("events", "muted"): Mark("tick", "muted", "event"),
-    ("events", "sample"): Mark("tick", "sample", "warning"),
-    ("events", "limit"): Mark("tick", "limit", "error"),
-    ("orders", "target"): Mark("tick", "target", "order of the operator"),
-}
+_NONE = np.zeros(0)
+_EVENTS = (
+    (Severity.ERROR, "errors", "limit", "an error"),
+    (Severity.WARNING, "warnings", "sample", "a warning"),
+    (Severity.INFO, "told", "muted", "what else was told"),
+)
 _HANDS = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
 
 
@@ -56,15 +52,21 @@ class Span:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane of the timeline: bars, and marks by colour."""
+    """A lane of the timeline: bars, or marks that all mean the same."""
 
     name: str
+    meaning: str
     spans: tuple[Span, ...] = ()
-    marks: tuple[tuple[str, Floats], ...] = ()  # role, times [s]
+    marks: tuple[str, Floats] = ("muted", _NONE)  # role of their colour, times [s]
 
 
-def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...]]:
-    """Draw the lanes for a wide page and for a narrow one; return both with the legend of their marks."""
+class _Timed(Protocol):
+    @property
+    def at_ns(self) -> int: ...
+
+
+def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], str]:
+    """Draw the lanes for a wide page and a narrow one; return both, a legend of bars, and what the lanes mean."""
     rows = list(lanes(flight))
     label = "Timeline of the flight: " + ", ".join(lane.name for lane in rows)
     drawings = []
@@ -79,9 +81,8 @@ def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...]]:
             ax.tick_params(axis="y", length=0)
             ax.grid(visible=False, axis="y")
         drawings.append(Drawing(key, one.svg, label))
-    marked = {(lane.name, role) for lane in rows for role, times in lane.marks if len(times)}
-    meanings = tuple(mark for key, mark in _MEANINGS.items() if key in marked)
-    return drawings[0], drawings[1], (*_untold(rows, flight), *meanings)
+    meanings = "; ".join(f"“{lane.name}”: {lane.meaning}" for lane in rows)
+    return drawings[0], drawings[1], tuple(_untold(rows, flight)), f"What a lane shows: {meanings}."
 
 
 def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
@@ -97,20 +98,54 @@ def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
 
 
 def lanes(flight: FlightData) -> Iterator[Lane]:
-    """Return the lanes that this flight has something for."""
-    yield Lane("controller", tuple(_modes(flight)))
+    """Return the lanes that this flight has something for; each means one thing."""
+    flown, decisions = flight.flown, flight.decisions
+    plans = flight.flown_plans.values()
+    yield Lane("controller", "what flew", tuple(_modes(flight)))
     found = (
-        Lane("hand-over", tuple(_hand_over(flight))),
-        Lane("vehicle", tuple(_vehicle(flight))),
-        Lane("positions", marks=tuple(_positions(flight))),
-        Lane("plans", marks=tuple(_plans(flight))),
-        Lane("limits", marks=(("limit", flight.steps.t_s[state_outside(flight) | input_outside(flight)]),)),
-        Lane("events", marks=tuple(_events(flight))),
-        Lane("orders", marks=(("target", _orders(flight)),)),
+        Lane("hand-over", "who is in charge", tuple(_hand_over(flight))),
+        Lane("vehicle", "its own mode", tuple(_vehicle(flight))),
+        _marks(
+            flight, "no news", "lost", "a step without a new position", (d for d in flown if d.boundary and d.age_steps)
+        ),
+        _marks(flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)),
+        _marks(
+            flight,
+            "limited",
+            "plan",
+            "a setpoint that the last gate changed",
+            (s for s in flight.setpoints if s.limited),
+        ),
+        Lane(
+            "gave way",
+            "a plan that could not keep a constraint",
+            marks=(
+                "sample",
+                flight.seconds([p.base_ns for p in plans if max(p.slack, p.terminal_miss) > SLACK_TOLERANCE]),
+            ),
+        ),
+        _marks(
+            flight,
+            "no optimum",
+            "limit",
+            "a plan that was not found",
+            (d for d in decisions if d.solve not in (None, SolveStatus.OPTIMAL)),
+        ),
+        Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[state_outside(flight)])),
+        Lane("input over", "an input beyond a limit", marks=("limit", flight.steps.t_s[input_outside(flight)])),
+        *(
+            _marks(flight, name, role, f"{text} among the events", (e for e in flight.events if e.severity is severity))
+            for severity, name, role, text in _EVENTS
+        ),
+        Lane("orders", "an order of the operator", marks=("target", _orders(flight))),
     )
     for lane in found:
-        if lane.spans or any(len(times) for _, times in lane.marks):
+        if lane.spans or len(lane.marks[1]):
             yield lane
+
+
+def _marks(flight: FlightData, name: str, role: str, meaning: str, records: Iterable[_Timed]) -> Lane:
+    return Lane(name, meaning, marks=(role, flight.seconds([one.at_ns for one in records])))
 
 
 def _modes(flight: FlightData) -> Iterator[Span]:
@@ -142,29 +177,6 @@ def _vehicle(flight: FlightData) -> Iterator[Span]:
         yield Span(max(0.0, begun_s), ended_s, role, text)
 
 
-def _positions(flight: FlightData) -> Iterator[tuple[str, Floats]]:
-    """Return the times of steps without a new position, and of refused positions [s]."""
-    silent = [d.at_ns for d in flight.flown if d.boundary and d.age_steps]
-    yield "lost", flight.seconds(silent)
-    yield "fallback", flight.seconds([d.at_ns for d in flight.decisions if d.rejected])
-
-
-def _plans(flight: FlightData) -> Iterator[tuple[str, Floats]]:
-    """Return the times of plans in which a constraint gave way, and of solves without an optimum [s]."""
-    gave = [
-        plan.base_ns for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE
-    ]
-    yield "sample", flight.seconds(gave)
-    failed = [d.at_ns for d in flight.decisions if d.solve not in (None, SolveStatus.OPTIMAL)]
-    yield "limit", flight.seconds(failed)
-
-
-def _events(flight: FlightData) -> Iterator[tuple[str, Floats]]:
-    roles = {Severity.INFO: "muted", Severity.WARNING: "sample", Severity.ERROR: "limit"}
-    for severity, role in roles.items():
-        yield role, flight.seconds([event.at_ns for event in flight.events if event.severity is severity])
-
-
 def _orders(flight: FlightData) -> Floats:
     given = [one.at_ns for one in flight.step_inputs if one.commands]
     return flight.seconds(given if flight.stopped_ns is None else [*given, flight.stopped_ns])
@@ -190,10 +202,10 @@ def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
         )
         if _fits(one, character_s):
             ax.text(0.5 * (one.begun_s + one.ended_s), row, one.text, ha="center", va="center", fontsize=8.5)
-    for role, times_s in lane.marks:
-        shown = _apart(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
-        low, high = np.full(len(shown), row - 0.28), np.full(len(shown), row + 0.28)
-        strokes(ax, (shown, low), (shown, high), colour(role), 1.2)
+    role, times_s = lane.marks
+    shown = _apart(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
+    low, high = np.full(len(shown), row - 0.28), np.full(len(shown), row + 0.28)
+    strokes(ax, (shown, low), (shown, high), colour(role), 1.2)
 
 
 def _apart(times_s: Floats, shown_s: float) -> Floats:

@@ -16,10 +16,13 @@ import pytest
 from loopback_rig import Memory
 from patience import LIMIT_S
 
+from logs.recording.info import info
+from logs.recording.parameters import ParameterReader
+from logs.recording.recorder import SyncRecorder
 from sim.simulation import Peers
 from uavctl.check.findings import ItemState, item
 from uavctl.cli.app import run
-from uavctl.cli.check import disk_items, record_items, run_preflight
+from uavctl.cli.check import disk_items, record_items, record_parameters, run_preflight
 from uavctl.config import load_config
 from uavctl.io.base import Connection
 from uavctl.records import Checked, Event
@@ -250,3 +253,17 @@ def test_what_was_found_goes_into_the_recording() -> None:
     record_items(memory, items, 7)
     assert [(one.at_ns, one.name, one.state) for one in memory.of(Checked)] == [(7, each, each) for each in ItemState]
     assert not memory.of(Event)  # a replay compares events, and knows nothing of a check
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_parameters_that_were_told_go_into_the_recording(autopilot: str, tmp_path: Path) -> None:
+    bench, told = Bench(f"sim.autopilot={autopilot}"), ParameterReader()
+    bench.run(4.0, told=told)
+    recorder = SyncRecorder(tmp_path / "flight.mcap")
+    record_parameters(recorder, told, 7)
+    recorder.close()
+    held = bench.peers.autopilot.parameters
+    found = info(tmp_path / "flight.mcap").parameters
+    assert len(found) > 5
+    assert {name: one.value for name, one in found.items()} == pytest.approx({name: held[name] for name in found})
+    assert found == told.parameters()

@@ -33,7 +33,39 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     assert code == 0
     assert out.count("\n") == 1  # one document, on a line of its own
     found: dict[str, Any] = json.loads(out)
+    name = re.fullmatch(r"uavctl/([a-z/-]+)/[1-9][0-9]*", found.pop("schema"))
+    assert name is not None and name[1] == arguments[0]
     return found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "code", "told"),
+    [
+        (("log", "info", "there/is/none.mcap"), "RecordingError", 1, "none.mcap"),
+        (("solve", "--config", "paper", "--state=1,2"), "UsageError", 2, "give 4 numbers"),
+        (("solve", "--config", "paper", "--sate=1,2"), "UsageError", 2, "--sate"),
+        (("fly", "--config", "there/is/none.toml"), "ConfigError", 2, "none.toml"),
+        (("flyy",), "UsageError", 2, "flyy"),
+    ],
+)
+def test_an_error_is_a_document_too(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], kind: str, code: int, told: str
+) -> None:
+    without, _, _ = typed(capsys, *arguments)
+    ended, out, err = typed(capsys, *arguments, "--json")
+    found = json.loads(out)
+    assert (ended, without) == (code, code) and out.count("\n") == 1
+    assert told in found.pop("message") and told in err
+    assert found == {"schema": "uavctl/error/1", "type": kind, "exit_code": code}
+
+
+def test_every_command_names_its_document() -> None:
+    # Whoever writes a document gives its name, and no two commands the same one.
+    given = re.compile(r"""(?:\.show|write_document)\(\s*"([a-z/-]+)\"""")
+    names = [
+        name for file in sorted((ROOT / "uavctl" / "cli").glob("*.py")) for name in given.findall(file.read_text())
+    ]
+    assert len(names) == len(set(names)) > 20
 
 
 def test_solve_gives_the_paper_s_cost(capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,7 +162,7 @@ def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tm
     file = tmp_path / "mine.toml"
     file.write_text(text.replace(old, new), encoding="utf-8")
     code, out, err = typed(capsys, "design", "--config", str(file), "--json")
-    assert (code, out) == (2, "")
+    assert (code, json.loads(out)["type"]) == (2, "ConfigError")
     name = key.partition(".")[2]
     lines = enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
     line = next(number for number, content in lines if content.startswith(f"{name} ="))

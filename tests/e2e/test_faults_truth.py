@@ -10,7 +10,8 @@ from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_t
 from soak_rig import prepared_for
 
 from uavctl.build.controller import design_of
-from uavctl.cli.prepare import Prepared, prepare
+from uavctl.build.prepared import Prepared
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 

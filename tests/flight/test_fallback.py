@@ -18,6 +18,7 @@ from uavctl.flight.fallback import (
     enter,
     learnt,
     request,
+    stop_m,
 )
 from uavctl.flight.limits import ZERO
 from uavctl.flight.step import remember
@@ -30,8 +31,9 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, BARRED, LET_GO, STOP, TO_LAND = (
+RECOVER, UNPLANNED, BARRED, LET_GO, STOP, TO_LAND = (
     FallbackEnd.RECOVER,
+    FallbackEnd.UNPLANNED,
     FallbackEnd.BARRED,
     FallbackEnd.LET_GO,
     FallbackEnd.STOP,
@@ -64,6 +66,9 @@ RECOVER, BARRED, LET_GO, STOP, TO_LAND = (
         (BRAKE, BARRED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
         (BRAKE, BARRED, 0, STILL, PARAMETERS, HOLD),
         (HOLD, BARRED, 0, FAST, PARAMETERS, LAND),
+        (BRAKE, UNPLANNED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
+        (HOLD, UNPLANNED, 0, FAST, PARAMETERS, LAND),
+        (HOLD, UNPLANNED, 99 * S, FAST, STAY, STOPPED),
         (HOLD, BARRED, 99 * S, FAST, STAY, STOPPED),  # nothing that we left in the air is left to drift
         (HOLD, LET_GO, 0, FAST, PARAMETERS, LAND),
         (HOLD, LET_GO, 0, FAST, STAY, STOPPED),
@@ -142,6 +147,9 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
         (Fallback(BRAKE, 4), STOP, Fallback(BRAKE, 4, STOP)),  # the time of braking is not prolonged
         (Fallback(BRAKE, 4, STOP), STOP, Fallback(BRAKE, 4, STOP)),
         (Fallback(HOLD, 4), BARRED, Fallback(BRAKE, 9, BARRED)),
+        (Fallback(HOLD, 4), UNPLANNED, Fallback(BRAKE, 9, UNPLANNED)),
+        (Fallback(BRAKE, 4, UNPLANNED), BARRED, Fallback(BRAKE, 4, BARRED)),
+        (Fallback(BRAKE, 4, BARRED), UNPLANNED, Fallback(BRAKE, 4, BARRED)),
         (Fallback(HOLD, 4, STOP), STOP, Fallback(HOLD, 4, STOP)),
         (Fallback(HOLD, 4, BARRED), STOP, Fallback(BRAKE, 9, STOP)),
         (Fallback(HOLD, 4, STOP), TO_LAND, Fallback(BRAKE, 9, TO_LAND)),
@@ -161,7 +169,7 @@ def test_an_end_that_is_asked_for(before: Fallback | None, end: FallbackEnd, aft
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, end).final for end in FallbackEnd] == [False, True, True, True, True]
+    assert [Fallback(HOLD, 0, end).final for end in FallbackEnd] == [False, True, True, True, True, True]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:
@@ -275,3 +283,12 @@ def test_what_does_not_fit_together_is_an_error_and_not_compared_in_part() -> No
         learnt(((0, (0.1,)), (1, (0.1, 0.2))))
     with pytest.raises(TypeError):  # whose word it is has to be said
         advance(enter(0), 0, STILL, ZERO, PARAMETERS, ZERO, True)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("speed_mps", [0.1, 1.0, 4.0])
+def test_the_distance_of_braking_is_that_of_its_law(speed_mps: float) -> None:
+    most, way, speed, step_s = 2.0, 0.0, speed_mps, 1e-4
+    for _ in range(200_000):
+        way += speed * step_s
+        speed -= min(PARAMETERS.brake_gain_1ps * speed, most) * step_s
+    assert stop_m(speed_mps, most, PARAMETERS) == pytest.approx(way, rel=1e-3)

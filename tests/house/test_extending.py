@@ -21,6 +21,7 @@ from logs.recording.reader import records
 from uavctl.records import Truth
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+EXAMPLE = ROOT / "docs" / "examples" / "own-parts"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PACKAGES = ("uavctl", "sim", "logs")
 
@@ -90,17 +91,41 @@ def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
 
 
 @pytest.mark.slow
-def test_a_controller_flies_in_a_campaign_and_a_what_if_without_an_edit(tmp_path: Path) -> None:
+def test_a_controller_flies_in_flight_campaign_and_what_if_without_an_edit(tmp_path: Path) -> None:
     recipe, commands, touched = walk("A controller", tmp_path)
-    campaign, flight, again = commands
+    own, replay, flight, again, campaign = commands
+    assert touched == 0
+    told = json.loads(recipe.run(f"{own} --json"))
+    assert set(told["methods"]) == {"mine:Careful"}
+    assert json.loads(recipe.run(f"{replay} --json"))["identical"]
+    recipe.run(flight)
+    assert json.loads(recipe.run(f"{again} --json"))["controller"] == "mine:Careful"
     told = json.loads(recipe.run(f"{campaign} --json"))
     cells = {cell["controller"]: cell for cell in told["cells"]}
-    assert touched == 0
     assert cells["careful"]["runs"] == 200
     assert cells["careful"]["failed"] == 0
     assert cells["careful"]["cost"] > cells["ours"]["cost"]  # half of the regulator arrives late
-    recipe.run(flight)
-    assert json.loads(recipe.run(f"{again} --json"))["controller"] == "mine:Careful"
+
+
+@pytest.mark.parametrize(("block", "module"), [("mine.py", "controller.py"), ("lines.py", "source.py")])
+def test_the_example_package_has_what_the_page_shows(block: str, module: str) -> None:
+    (shown,) = re.findall(rf"^```python\n# {block}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    assert shown == (EXAMPLE / "own_parts" / module).read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_example_package_is_installed_tested_and_known_by_its_names(tmp_path: Path) -> None:
+    recipe, _, _ = walk("A controller", tmp_path)
+    (recipe.work / "mine.py").unlink()
+    package, site = tmp_path / "own-parts", tmp_path / "site"
+    shutil.copytree(EXAMPLE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    build = "python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index"
+    recipe.run(f"{build} --target {site} {package}")
+    recipe.tree = Path(f"{recipe.tree}{os.pathsep}{site}")
+    recipe.run(f"python -m pytest -q -n 0 -p no:cacheprovider {package / 'tests'}")
+    flight = "uavctl loopback --config room --duration 6 --set smpc.controller=careful --out own --json"
+    assert set(json.loads(recipe.run(flight))["methods"]) == {"careful"}
+    assert heard(recipe, "lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
 
 
 @pytest.mark.slow
@@ -158,19 +183,26 @@ print(found[0].position_m)
 """
 
 
-def test_a_position_source_is_a_class_and_a_line(tmp_path: Path) -> None:
-    recipe, commands, touched = walk("A position source", tmp_path)
-    assert (touched, commands) == (2, [])
+def heard(recipe: Recipe, url: str) -> list[float]:
+    """The first position that comes of a server's."""
     (recipe.work / "hear.py").write_text(SCRIPT)
     server = Server()
     server.start()
     try:
-        place = recipe.run(f"python hear.py lines://127.0.0.1:{server.port}/drone")
+        place = recipe.run(f"python hear.py {url.format(port=server.port)}")
     finally:
         server.socket.close()
-    assert [float(value) for value in place.strip("()\n").split(",")] == [1.5, -2.0, -1.0]
+    return [float(value) for value in place.strip("()\n").split(",")]
+
+
+def test_a_position_source_is_a_class(tmp_path: Path) -> None:
+    recipe, commands, touched = walk("A position source", tmp_path)
+    assert (touched, commands) == (0, [])
+    assert heard(recipe, "lines:Lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
     with pytest.raises(AssertionError, match="does the server run there"):
-        recipe.run("python hear.py lines://127.0.0.1:9/drone")
+        recipe.run("python hear.py lines:Lines://127.0.0.1:9/drone")
+    with pytest.raises(AssertionError, match=r"cannot be made \(ModuleNotFoundError"):
+        recipe.run("python hear.py nowhere:Lines://127.0.0.1:9/drone")
 
 
 def test_an_autopilot_is_a_row(tmp_path: Path) -> None:

@@ -114,7 +114,8 @@ def test_the_command_makes_one_and_shows_nothing_of_it(tmp_path: Path, capsys: p
     assert read_key(path).name in output.out
     assert words not in output.out + output.err
     assert run(["key", "show", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"file": str(path), "name": read_key(path).name}
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"schema": "uavctl/key/1", "file": str(path), "name": read_key(path).name}
     assert run(["key", "new", str(path)]) == 2
     assert "is there already" in capsys.readouterr().err
     path.chmod(0o644)

@@ -119,7 +119,7 @@ def refused(folder: Path) -> str:
     """What is wrong with how a recording is refused that holds nothing, not even its header."""
     for words in (("replay",), ("recover", str(folder / "recovered.mcap"))):
         code, told, errors = _run("log", words[0], str(folder / NAME), *words[1:])
-        if code != 1 or told or not errors.startswith("error: ") or errors.count("\n") != 1:
+        if code != 1 or told.get("exit_code") != code or not errors.startswith("error: ") or errors.count("\n") != 1:
             return f"{words[0]} of nothing: {code}, {told}, {errors}"
     return f"{words[0]} left a file" if (folder / "recovered.mcap").exists() else ""
 

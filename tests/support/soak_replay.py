@@ -16,13 +16,13 @@ from draw_flight import Drawn, drawn
 from msgspec.structs import replace
 from signing_rig import KEY, OFFSET_NS
 
+from logs.recording.ends import put_header
 from logs.recording.info import info
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.replay import ReplayResult
 from logs.recording.views import Views
 from sim.simulation import Peers, World
-from uavctl.cli.flying import put_header
-from uavctl.cli.prepare import Prepared
+from uavctl.build.prepared import Prepared
 from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop

@@ -7,11 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
 from uavctl.build.controller import design_of
-from uavctl.cli.flying import put_header, stop_limit_s
-from uavctl.cli.prepare import Prepared, prepare
+from uavctl.build.prepared import Prepared
+from uavctl.cli.flying import stop_limit_s
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
 from uavctl.loop import ControlLoop
 from uavctl.records import (

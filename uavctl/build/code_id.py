@@ -14,23 +14,23 @@ COMPUTES_WITH = ("numpy", "scipy", "clarabel", "daqp")
 def maker_id() -> str:
     """Hash of the code that makes libraries, and of the versions of what it computes with."""
     versions = tuple((name, metadata.version(name)) for name in COMPUTES_WITH)
-    return digest((_sources("uavctl.smpc"), versions))
+    return digest((sources_of("uavctl.smpc"), versions))
 
 
 @cache
 def decider_id() -> str:
     """Hash of the code that a flight's records come from: from bytes to estimate, plan, decision and bytes again."""
     return digest(
-        tuple(_sources(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
+        tuple(sources_of(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
     )
 
 
-def _sources(package: str) -> tuple[tuple[str, bytes], ...]:
+def sources_of(package: str) -> tuple[tuple[str, bytes], ...]:
     """Names and contents of a package's modules, and of those of the packages in it; of `uavctl` only its own."""
     found = []
     for entry in resources.files(package).iterdir():
         if entry.name.endswith(".py"):
             found.append((f"{package}.{entry.name}", entry.read_bytes()))
         elif package != "uavctl" and (entry / "__init__.py").is_file():
-            found.extend(_sources(f"{package}.{entry.name}"))
+            found.extend(sources_of(f"{package}.{entry.name}"))
     return tuple(sorted(found))

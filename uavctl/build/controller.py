@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
+from uavctl.build.outside import flown_outside
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
@@ -250,7 +251,7 @@ def build_design(config: Config) -> Design:
 
 
 def build_solver(design: AnyDesign, config: Config, library: Library | None = None) -> Solver:
-    """The solver of a design: that of scheme `age-conditioned`, or the one that `solver.method` asks for.
+    """The solver of a design: `smpc.controller`, that of scheme `age-conditioned`, or the one of `solver.method`.
 
     Args:
         config: The configuration that it is made from.
@@ -259,6 +260,8 @@ def build_solver(design: AnyDesign, config: Config, library: Library | None = No
     Raises:
         DesignError: The design does not fit the solver, or the library does not fit the design.
     """
+    if config.smpc.controller:
+        return flown_outside(config, build_problem(config))
     if isinstance(design, ConditionedDesign):
         return design.solver
     if config.solver.method == "library":
@@ -379,7 +382,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
     """
     design = design_of(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
-    plant = build_plant(config)
+    plant, outside = build_plant(config), config.smpc.controller
     return Controller(
         plant=plant,  # the design's own may be the one that the estimator makes of it
         design_id=design.design_id,
@@ -388,7 +391,8 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         mission=build_mission(config, design, resting(design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=_promised(config)),
-        late_steps=design.horizon if isinstance(design, ConditionedDesign) else len(design.late),
+        outside=outside,
+        late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
         fallback=FallbackParameters(

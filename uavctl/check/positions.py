@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uavctl.check.findings import Heard, Item, ItemState, Sample, item, judged
 from uavctl.config.checks import position_index
-from uavctl.config.connections import CAMERAS
+from uavctl.config.connections import camera_scheme
 from uavctl.config.types import Config
 from uavctl.flight.link_estimate import loss_std
 from uavctl.records import Vec3
@@ -58,7 +58,7 @@ def _nothing(seen: Heard, config: Config) -> Item:
 
 def from_cameras(config: Config) -> bool:
     """Whether a camera system is listened to directly."""
-    return config.daemon.mocap.startswith(CAMERAS)
+    return bool(camera_scheme(config.daemon.mocap))
 
 
 def _period_s(captured_s: list[float]) -> float | None:

@@ -9,13 +9,13 @@ from cyclopts import App, CycloptsError
 from rich.markup import escape
 
 from uavctl import __version__
-from uavctl.cli.common import messages
+from uavctl.cli.common import messages, write_document
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
 _EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
 4 `tune`: the pilot has taken over; 130 interrupted.
 
-With --json, standard output holds one JSON document and nothing else; messages go to standard error.
+With --json, standard output holds one JSON document and nothing else, also of an error; messages go to standard error.
 Every configuration key is described in docs/configuration.md."""
 
 app = App(
@@ -75,17 +75,18 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         if extra is None:
             raise
         text = f"{arguments[0]} needs a package that is not installed: pip install 'uavctl[{extra}]'"
-        return _refuse([text], UsageError.exit_code)
+        return _refuse(UsageError(text), [text], arguments)
     except CycloptsError as error:
-        return _refuse([str(error)], UsageError.exit_code)
+        return _refuse(UsageError(str(error)), [str(error)], arguments)
     except ConfigError as error:
-        return _refuse(error.problems, error.exit_code)
+        return _refuse(error, error.problems, arguments)
     except UavctlError as error:
-        return _refuse(str(error).split("\n"), error.exit_code)
+        return _refuse(error, str(error).split("\n"), arguments)
     except BrokenPipeError:
         raise
     except OSError as error:  # a file that no command foresaw: a full disk, a name that is too long
-        return _refuse([f"{error.filename or 'system'}: {error.strerror or error}"], UavctlError.exit_code)
+        text = f"{error.filename or 'system'}: {error.strerror or error}"
+        return _refuse(UavctlError(text), [text], arguments)
     return result if isinstance(result, int) else 0
 
 
@@ -103,12 +104,16 @@ def _know(arguments: Sequence[str]) -> None:
     raise UsageError(f'Unknown command "{name}".{did}')
 
 
-def _refuse(problems: Sequence[str], exit_code: int) -> int:
+def _refuse(error: UavctlError, problems: Sequence[str], arguments: Sequence[str]) -> int:
+    """Tell an error, with --json as a document too; return its exit code."""
     shown = [_shown(problem) for problem in problems[:_MOST_SHOWN]]
     if len(problems) > _MOST_SHOWN:
         shown.append(f"{len(problems) - _MOST_SHOWN} more")
     messages().print(f"[bold red]error:[/] {escape(chr(10).join(shown))}", soft_wrap=True)
-    return exit_code
+    if "--json" in arguments:  # what could not be parsed, too, is told to a program
+        told = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
+        write_document("error", told)
+    return error.exit_code
 
 
 def _shown(text: str) -> str:

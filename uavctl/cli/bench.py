@@ -38,7 +38,7 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
             progress.update(task, description=what, completed=done, total=total, refresh=True)
 
         result = run_loop_bench(common.load().config, options, seconds, runs, told)
-    common.show(result, lambda: loop_picture(result))
+    common.show("bench/loop", result, lambda: loop_picture(result))
     return 0
 
 
@@ -112,7 +112,7 @@ def bench(
             flight = time_flight(loaded.config, lambda done, total: advance("a flight's own decisions", done, total))
             decided = time_decisions(solver, states, seed, lambda done: advance("decisions", done, states))
         decided = msgspec.structs.replace(decided, flight=flight)
-        common.show(decided, lambda: _decisions(decided, loaded.config.name))
+        common.show("bench/decisions", decided, lambda: _decisions(decided, loaded.config.name))
         return 0
     with located(loaded):
         design = build_design(loaded.config)
@@ -120,7 +120,7 @@ def bench(
         with _progress() as advance:
             sizes = replace(DEFAULT_SIZES, states=states)
             result = run_bench(design, loss, seed, advance, sizes, _conditioned_solver(loaded.config))
-    common.show(result, lambda: bench_picture(result, loaded.config.name))
+    common.show("bench", result, lambda: bench_picture(result, loaded.config.name))
     return 0
 
 

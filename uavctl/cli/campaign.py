@@ -177,7 +177,7 @@ class _Given(Generic[S]):
             wall_s=wall_s,
             cells=self.summarise(store.folder),
         )
-        Common(json=json).show(result, lambda: self.picture(result))
+        Common(json=json).show("campaign", result, lambda: self.picture(result))
         return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
 
 

@@ -13,6 +13,8 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
+from logs.recording.parameters import ParameterReader, told_records
+from logs.recording.topics import PARAMETER
 from uavctl.check.findings import Item, ItemState, item, judged, refusals
 from uavctl.check.preflight import Preflight
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, columns, given_keys, messages
@@ -25,7 +27,7 @@ from uavctl.io.base import Connection
 from uavctl.io.signed_connection import connected
 from uavctl.io.transport import wait
 from uavctl.loop import make_links
-from uavctl.records import Checked, Sink
+from uavctl.records import Checked, Datagram, Sink
 
 # A check on real connections, bounded in time: what `uavctl check` runs, and `uavctl fly --arm` before it arms.
 
@@ -44,6 +46,7 @@ def run_preflight(
     stop: Callable[[], bool] = lambda: False,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
+    told: ParameterReader | None = None,
 ) -> tuple[Item, ...]:
     """Listen, ask, and report what was found. Arms nothing, changes no mode and no parameter.
 
@@ -55,6 +58,7 @@ def run_preflight(
         stop: asked once a tick; ends the listening.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
+        told: takes the vehicle's parameters, too.
     """
     ticker = Ticker(round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9), now)
     due = ticker.next()
@@ -63,7 +67,7 @@ def run_preflight(
     while True:
         while True:
             for name in wait_for(connections, due.at_ns):
-                _receive(flight, name, connections[name])
+                _receive(flight, name, connections[name], told)
             if now() >= due.at_ns:
                 break
         flight.tick(due.tick, due.at_ns, lambda message: connections[message.link].send(message.data))
@@ -79,8 +83,10 @@ def run_preflight(
         due = ticker.next()
 
 
-def _receive(flight: Preflight, name: str, connection: Connection) -> None:
+def _receive(flight: Preflight, name: str, connection: Connection, told: ParameterReader | None) -> None:
     for index, (data, received_ns) in enumerate(connection.receive()):
+        if told is not None:
+            told.take(Datagram(at_ns=received_ns, link=name, outgoing=False, data=data))
         received = flight.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
             connection.answer(index)
@@ -94,9 +100,16 @@ def _receive(flight: Preflight, name: str, connection: Connection) -> None:
 
 
 def checked_before_arming(
-    config: Config, connections: Mapping[str, Connection], stop: Callable[[], bool], take_off_m: float
+    config: Config,
+    connections: Mapping[str, Connection],
+    stop: Callable[[], bool],
+    take_off_m: float,
+    told: ParameterReader,
 ) -> tuple[Item, ...]:
     """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m` [m]; report what is not good.
+
+    Args:
+        told: takes the vehicle's parameters, for the recording that begins afterwards.
 
     Returns:
         All items; none of them forbids arming.
@@ -105,7 +118,7 @@ def checked_before_arming(
         NotReadyError: an item forbids arming.
     """
     messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
-    items = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop)
+    items = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
     against = refusals(items, config.check)
     if against:
         lines = (f"{one.name}: {one.value} (wanted: {one.want}); {one.hint}" for one in against)
@@ -121,6 +134,12 @@ def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
     for one in items:
         found = Checked(at_ns=at_ns, name=one.name, state=str(one.state), value=one.value, want=one.want, hint=one.hint)
         sink.put("/uavctl/check", at_ns, found)
+
+
+def record_parameters(sink: Sink, told: ParameterReader, at_ns: int) -> None:
+    """Record the vehicle's parameters that a check has heard."""
+    for one in told_records(told.parameters(), at_ns):
+        sink.put(PARAMETER, at_ns, one)
 
 
 # `uavctl check`: what can be known before take-off. It never arms, and changes neither mode nor parameter.
@@ -178,7 +197,7 @@ def check(
             raise  # a URL that is none: usage
         items.append(item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS))
     report = Report(ok=not refusals(items, config.check), items=tuple(items))
-    common.show(report, lambda: _table(report))
+    common.show("check", report, lambda: _table(report))
     return 0 if report.ok else 1
 
 

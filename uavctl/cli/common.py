@@ -61,25 +61,37 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
-        from sim.faults import problems  # a replay, which has a configuration of its own, needs no simulator
+        from sim.faults import check_faults  # a replay, which has a configuration of its own, needs no simulator
 
         loaded = load(self.config, self.overrides)
-        wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
-        if wrong:
-            raise ConfigError(tuple(loaded.source.tell(problem) for problem in wrong))
+        check_faults(loaded)
         return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:
         """Return the options with further overrides of a command's own, which win."""
         return replace(self, overrides=(*self.overrides, *more))
 
-    def show(self, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]) -> None:
-        """Write the result to standard output, as JSON or as a picture for people."""
+    def show(
+        self, name: str, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]
+    ) -> None:
+        """Write the result to standard output, as the JSON document `name` or as a picture for people."""
         if self.json:
-            sys.stdout.write(msgspec.json.encode(document).decode() + "\n")
+            write_document(name, document)
         else:
             # Files and pipes have no width of their own; the usual 80 columns would fold the tables.
             Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(picture())
+
+
+# Documents of which a key has gone, or means something else, since the first version; the others have version 1.
+_VERSIONS: dict[str, int] = {}
+
+
+def write_document(name: str, document: Mapping[str, object] | msgspec.Struct) -> None:
+    """Write a JSON document, on one line, to standard output; its first key says which one it is, of which version."""
+    fields = msgspec.to_builtins(document)
+    text = msgspec.json.encode({"schema": f"uavctl/{name}/{_VERSIONS.get(name, 1)}", **fields}).decode()
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def can_be_read(type_: object, path: object) -> None:

@@ -74,7 +74,7 @@ def status(*, which: Which = ANY) -> int:
     if reply.status is None:
         raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
     found = reply.status
-    Common(json=which.json).show(found, lambda: _table(found))
+    Common(json=which.json).show("ctl/status", found, lambda: _table(found))
     return 0
 
 
@@ -92,7 +92,7 @@ def _place(text: str) -> Vec3:
 def _order(request: ControlRequest, which: Which) -> int:
     reply = ask(request, control_folder(which.control), which.vehicle)
     if which.json:
-        Common(json=True).show({"ok": reply.ok, "text": reply.text}, str)
+        Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:
         verdict = "accepted" if reply.ok else "refused"
         messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, markup=False, highlight=False)

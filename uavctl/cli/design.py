@@ -38,7 +38,7 @@ def gains_report(common: Common, states: int) -> int:
         with _progress(2 + 4 * states) as advance:
             found = compare_gains(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
     document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
-    common.show(document, lambda: _gains_picture(found, loaded.config.name))
+    common.show("design/gains", document, lambda: _gains_picture(found, loaded.config.name))
     return 0 if found.after.refused is None else 1
 
 
@@ -124,13 +124,13 @@ def design(
         with located(loaded):
             conditioned = build_conditioned(loaded.config)
         figures = {**conditioned_record(conditioned), "wall_s": time.perf_counter() - start}
-        common.show(figures, lambda: conditioned_picture(conditioned, loaded.config.name))
+        common.show("design/conditioned", figures, lambda: conditioned_picture(conditioned, loaded.config.name))
         return 0
     with located(loaded):
         made = build_design(loaded.config)
         stored = ready_library(loaded.config, made)
     document = design_document(made, stored, time.perf_counter() - start)
-    common.show(document, lambda: design_picture(made, stored, loaded.config.name))
+    common.show("design", document, lambda: design_picture(made, stored, loaded.config.name))
     return 0
 
 

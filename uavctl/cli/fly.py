@@ -16,10 +16,13 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
+from logs.recording.ends import final, new_recording, put_header
+from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of
+from uavctl.check.findings import Item
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
@@ -29,20 +32,17 @@ from uavctl.cli.flying import (
     checked_take_off,
     conclude,
     ending_noted,
-    final,
     goto_overrides,
     live_line,
     live_view_port,
-    new_recording,
     onlookers,
-    put_header,
     stand_by,
     stop_limit_s,
     stop_on_signals,
     tell_ending,
 )
 from uavctl.cli.prepare import prepare
-from uavctl.clock import Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
@@ -190,7 +190,7 @@ def fly(
         as_realtime_process=realtime,
         view_port=view_port,
     )
-    common.show(summary, lambda: render(summary))
+    common.show("fly", summary, lambda: render(summary))
     return summary.ending.exit_code
 
 
@@ -234,7 +234,8 @@ def fly_daemon(
             design = design_of(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        from uavctl.cli.check import checked_before_arming, record_items  # an eighth of what loading `fly` would take
+        # an eighth of what loading `fly` would take
+        from uavctl.cli.check import checked_before_arming, record_items, record_parameters
 
         begun = time.perf_counter()
         with (
@@ -242,14 +243,18 @@ def fly_daemon(
             stop_on_signals() as stopped,
             connected(config) as connections,
         ):
-            checked = () if take_off_m is None else checked_before_arming(config, connections, stopped, take_off_m)
+            checked: tuple[Item, ...] = ()
+            told = ParameterReader()
+            if take_off_m is not None:
+                checked = checked_before_arming(config, connections, stopped, take_off_m, told)
             recorder = Recorder(path, config.log, onlookers=looking)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)
             asked_for = False
             try:
-                put_header(recorder, prepared, monotonic_ns())
+                put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
+                record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
                     messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
                 if tenure.left_ns is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import shlex
 import signal
 import subprocess
 import sys
@@ -12,7 +11,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Protocol
@@ -23,38 +21,21 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from logs.recording.disk import check_room
+from logs.recording.ends import final, lacks
 from logs.recording.flight import FlightData
-from logs.recording.outputs import no_empty_folders
 from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
-from logs.recording.topics import HEADER, LIBRARY
 from logs.recording.views import Views
-from uavctl.build.controller import record_of, resting
+from uavctl.build.controller import resting
 from uavctl.build.mission import build_mission
 from uavctl.cli.common import FREE_PORT, messages
-from uavctl.cli.prepare import Prepared, cpu, versions
 from uavctl.config import Config
-from uavctl.config.load import dump_config
 from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import MUST_LAND
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import lacking
-from uavctl.records import (
-    Command,
-    ControlMode,
-    Ending,
-    Event,
-    Header,
-    Order,
-    PolicyLibrary,
-    Record,
-    Severity,
-    Ticked,
-    Vec3,
-)
+from uavctl.records import Command, ControlMode, Ending, Event, Order, Record, Severity, Ticked, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import AXES
 
@@ -318,47 +299,6 @@ def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
         yield DerivedTopics(Views(), watch, flight.see)
 
 
-def recording_path(out: Path | None, name: str) -> Path:
-    """Return the path of a new recording: in `out`, or in a folder of its own below `flights/`."""
-    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
-    folder = out if out is not None else Path("flights") / f"{stamp}-{name}"
-    return folder / "flight.mcap"
-
-
-@contextmanager
-def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
-    """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
-
-    Raises:
-        RecordingError: as `check_room` does.
-    """
-    path = recording_path(out, name)
-    with no_empty_folders([path]):
-        check_room(path, free_bytes)
-        yield path
-
-
-def put_header(recorder: Recording, prepared: Prepared, started_ns: int) -> None:
-    """Begin a recording with its header and library: everything needed to decide alike in a replay."""
-    config, design, library = prepared.config, prepared.design, prepared.library
-    header = Header(
-        started_ns=started_ns,
-        started_utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        seed=config.sim.seed,
-        command=shlex.join(["uavctl", *sys.argv[1:]]),
-        config_toml=dump_config(config),
-        design_id=design.design_id,
-        design=record_of(design),
-        versions=versions(),
-        cpu=cpu(),
-        library_id=None if library is None else library.library_id,
-    )
-    recorder.put(HEADER, started_ns, header)
-    if library is not None:
-        record = PolicyLibrary(library_id=library.library_id, design_id=design.design_id, data=library.data)
-        recorder.put(LIBRARY, started_ns, record)
-
-
 def stop_limit_s(config: Config, *, takes_off: bool) -> float:
     """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
     landings = 1 + MUST_LAND if takes_off else int(config.relay.enabled)
@@ -386,7 +326,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
         wall_s=wall_s,
         recording=str(path),
         report=str(page),
-        recorder_dropped=0 if status.ok else _lacking(status),
+        recorder_dropped=0 if status.ok else lacks(status),
         ending=None if ending is None else final(ending, status),
     )
     try:
@@ -430,12 +370,6 @@ def ending_noted(loop: ControlLoop) -> Iterator[None]:
     except Exception as error:
         loop.course.died = f"{type(error).__name__}: {error}"
         raise
-
-
-def final(ending: Ending, status: RecorderStatus) -> Ending:
-    """Return how a flight ended, with the state of its recording."""
-    why = status.reason or status.refusal or "the disk was too slow"
-    return ending if status.ok else lacking(ending, max(_lacking(status), 1), why)
 
 
 @contextmanager
@@ -545,16 +479,11 @@ def _alarm(status: RecorderStatus) -> str:
     return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
 
 
-def _lacking(status: RecorderStatus) -> int:
-    """Return the number of records that are not in the recording."""
-    return status.dropped + status.refused + status.gone + status.waiting
-
-
 def tell_losses(status: RecorderStatus) -> None:
     """Print after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
         messages().print(
-            f"[bold red]warning:[/] the recording lacks {_lacking(status)} records "
+            f"[bold red]warning:[/] the recording lacks {lacks(status)} records "
             f"({escape(status.reason or status.refusal or 'the disk was too slow')}); what is in it is whole. "
             f"Files: {escape(', '.join(status.segments)) or 'none'}",
             soft_wrap=True,

@@ -53,7 +53,7 @@ def identify_command(
     write_whole(target, dump_config(found.config))
     write_whole(page, write_page(found, history.seen, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
-    common.show(document, lambda: _picture(found, target, page))
+    common.show("identify", document, lambda: _picture(found, target, page))
     return 0
 
 

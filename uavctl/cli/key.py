@@ -36,5 +36,5 @@ def _show(file: Path, name: str, *, json: bool) -> int:
     table.add_row("file", str(file))
     table.add_row("name of the key", name)
     table.add_row("to use it", f'key_file = "{file.absolute()}" in \\[security]')
-    Common(json=json).show({"file": str(file.absolute()), "name": name}, lambda: table)
+    Common(json=json).show("key", {"file": str(file.absolute()), "name": name}, lambda: table)
     return 0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,9 +13,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from logs.recording.attachments import layout_text
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import info as recording_info
+from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, is_tlog, read_flight
+from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
@@ -52,7 +54,7 @@ def export(
         folder = out if out is not None else flight.with_name(f"{flight.stem}-{to}")
         with _progress() as watch:
             exported = export_tables(flight, folder, TableFormat(to), force=force, watch=watch)
-        Common(json=json).show(exported, lambda: _tables_picture(exported, folder))
+        Common(json=json).show("log/export", exported, lambda: _tables_picture(exported, folder))
         for topic, number in exported.unknown.items():
             warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
     if cut := lacks_end(flight):
@@ -63,7 +65,7 @@ def export(
 def _export_tlog(flight: Path, file: Path, link: str | None, *, force: bool, common: Common) -> None:
     with _progress() as watch:
         exported = export_tlog(flight, file, link=link, force=force, watch=watch)
-    common.show(exported, lambda: _tlog_picture(exported))
+    common.show("log/export-tlog", exported, lambda: _tlog_picture(exported))
     if exported.left_out_bytes:
         warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
 
@@ -95,6 +97,15 @@ def _tlog_picture(exported: ExportedTlog) -> RenderableType:
 
 
 # `uavctl log info` as a table.
+
+
+_SOME_PARAMETERS = 4
+
+
+def _tlog_info(told: MavlinkFlightInfo) -> RenderableType:
+    rows = ((Text(name), str(number)) for name, number in told.messages.items())
+    lines = [f"{name}: {value}" for name, value in facts_of(told)]
+    return Group(columns("", ("message", "number"), rows, fold=True), *map(Text, (*lines, *told.notes)))
 
 
 def info_table(found: RecordingInfo) -> RenderableType:
@@ -140,6 +151,18 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
         yield f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})"
     if found.library is not None:
         yield f"policy library {found.library.library_id}, {found.library.bytes:,} bytes"
+    if found.begin_utc is not None:
+        yield f"begins at {found.begin_utc}"
+    for file in found.attachments:
+        yield f"attached: {file.name}, {file.bytes:,} bytes"
+    if found.parameters:
+        yield from _parameters(found.parameters)
+
+
+def _parameters(told: Mapping[str, VehicleParameter]) -> Iterator[str]:
+    some = ", ".join(f"{name} {one.value}" for name, one in [*told.items()][:_SOME_PARAMETERS])
+    more = "" if len(told) <= _SOME_PARAMETERS else " ...; --json has all"
+    yield f"vehicle parameters: {len(told)} ({some}{more})"
 
 
 def _loss(loss: PositionLoss) -> Iterator[str]:
@@ -168,7 +191,10 @@ _COMMANDS = {
         differs on.
         """,
     ),
-    "report": ("log_report:report", "Write the page of a recording: one HTML file that needs nothing else."),
+    "report": (
+        "log_report:report",
+        "Write the page of a recording, or of a .tlog: one HTML file that needs nothing else.",
+    ),
     "compare": (
         "log_report:compare_command",
         "Put flights beside each other: parameters that differ, figures, and where they part.",
@@ -196,9 +222,13 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command
 def info(flight: Flight, /, *, json: Json = False) -> int:
-    """Say what a recording holds: topics, rates, gaps, losses, and how it was made."""
+    """Say what a recording, or a .tlog, holds: topics, rates, gaps, losses, and how it was made."""
+    if is_tlog(flight):
+        told = read_flight(flight).info
+        Common(json=json).show("log/info-tlog", told, lambda: _tlog_info(told))
+        return 0
     found = recording_info(flight)
-    Common(json=json).show(found, lambda: info_table(found))
+    Common(json=json).show("log/info", found, lambda: info_table(found))
     return 0
 
 
@@ -206,14 +236,14 @@ def info(flight: Flight, /, *, json: Json = False) -> int:
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
     """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
     result = restore(flight, out)
-    Common(json=json).show(result, lambda: _recover_table(result, out))
+    Common(json=json).show("log/recover", result, lambda: _recover_table(result, out))
     return 0 if result.lossless else RECOVERED_WITH_LOSS
 
 
 @log_app.command
 def layout() -> int:
     """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
-    sys.stdout.write(resources.files("logs").joinpath("foxglove-layout.json").read_text(encoding="utf-8"))
+    sys.stdout.write(layout_text())
     return 0
 
 

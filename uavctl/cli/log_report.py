@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from logs.recording.flight import FlightData
+from logs.recording.mavlink_flight import facts_of, is_tlog, read_flight
 from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import names_and_values, render, summarise
@@ -30,8 +31,10 @@ from logs.report.compare import (
 )
 from logs.report.figures import picture
 from logs.report.flight_page import verdict_rows, write_report
+from logs.report.tlog_page import write_tlog_page
 from logs.report.verdicts import judge
-from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, warn
+from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, two_columns, warn
+from uavctl.errors import UsageError
 
 # `uavctl log compare`: recordings beside each other.
 
@@ -53,7 +56,7 @@ def compare_command(
         found = compare(loaded)
     if out is not None:
         write_page(found, loaded, out)
-    Common(json=json).show(found, lambda: comparison_picture(found))
+    Common(json=json).show("log/compare", found, lambda: comparison_picture(found))
     return 0
 
 
@@ -97,7 +100,7 @@ def _figures(found: FlightComparison) -> WideTable:
     return WideTable(Column("figure", list(map(label, rows)), "left"), groups, ends)
 
 
-# `uavctl log report`: the page of a recording.
+# `uavctl log report`: the page of a recording, ours or a `.tlog` of any ground station.
 
 
 def report(
@@ -108,10 +111,12 @@ def report(
     svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
     json: Json = False,
 ) -> int:
-    """Write the page of a recording: one HTML file that needs nothing else."""
+    """Write the page of a recording, or of a .tlog: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         spare_recording(target)
+    if is_tlog(flight):
+        return _report_tlog(flight, page, svg, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
@@ -122,5 +127,17 @@ def report(
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
-    Common(json=json).show(document, lambda: render(summary, verdict_rows(judged.verdicts)))
+    Common(json=json).show("log/report", document, lambda: render(summary, verdict_rows(judged.verdicts)))
+    return 0
+
+
+def _report_tlog(flight: Path, out: Path, svg: Path | None, common: Common) -> int:
+    if svg is not None:
+        raise UsageError(f"--svg draws a recording of ours; {flight} is a .tlog, of which there is the page")
+    found = read_flight(flight)
+    write_tlog_page(found, out)
+    for note in found.info.notes:
+        warn(note)
+    document = {**msgspec.to_builtins(found.info), "report": str(out)}
+    common.show("log/report-tlog", document, lambda: two_columns("", [*facts_of(found.info), ("page", str(out))]))
     return 0

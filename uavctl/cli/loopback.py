@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection as Pipe
 from pathlib import Path
 from typing import Annotated
@@ -16,13 +16,13 @@ import msgspec
 from cyclopts import Parameter
 from rich.progress import Progress
 
-from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
+from logs.recording.ends import final, new_recording, put_header
+from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
-from logs.recording.views import Views
 from sim.server import Ready, serve_in_child
-from sim.simulation import World
 from uavctl.build.controller import design_of
+from uavctl.build.prepared import Prepared
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
@@ -32,31 +32,27 @@ from uavctl.cli.flying import (
     checked_take_off,
     conclude,
     ending_noted,
-    final,
     goto_overrides,
     live_line,
     live_view_port,
-    new_recording,
     onlookers,
-    put_header,
     stop_limit_s,
     stop_on_signals,
     tell_ending,
 )
-from uavctl.cli.prepare import Prepared, prepare
+from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
-from uavctl.clock import Ticker, monotonic_ns
+from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
 from uavctl.daemon.realtime import collected_between_ticks
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
+from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
-from uavctl.outcome import Cause
-from uavctl.records import Received, Send, Sink, Truth
+from uavctl.records import Sink, Truth
 
 START_LIMIT_S = 60.0
-TRUTH = "/sim/truth"
 
 
 def loopback(
@@ -94,7 +90,7 @@ def loopback(
         out=out,
         view_port=view_port,
     )
-    common.show(summary, lambda: render(summary))
+    common.show("loopback", summary, lambda: render(summary))
     return summary.ending.exit_code
 
 
@@ -121,8 +117,7 @@ def fly_simulated(
         UavctlError: nothing was flown, and why.
     """
     config = _on_loopback(loaded.config) if udp else loaded.config
-    if config.duration_s < config.daemon.tick_s:
-        raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
+    check_length(config)
     with located(loaded):
         design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
@@ -133,70 +128,29 @@ def fly_simulated(
         return _real_time(prepared, path, engagement, looking) if udp else lockstep(prepared, path, engagement)
 
 
-class _Timed:
-    """Loop in virtual time: no tick is ever late, and the computing time in the core is recorded."""
-
-    def __init__(self, loop: ControlLoop, engagement: Engagement) -> None:
-        self._loop = loop
-        self._engagement = engagement
-        self.stop = False
-        self.at_ns = 0  # of the last tick
-
-    def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        return self._loop.receive(link, data, at_ns)
-
-    def tick(self, tick: int, at_ns: int, send: Send) -> None:
-        self.at_ns = at_ns
-        ticked = self._loop.tick(tick, at_ns, send, stop=self.stop)
-        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
-        self._engagement.follow(self._loop, ticked)
-
-
-class _InterruptedError(Exception):
-    """The operator has asked for the end of a flight in virtual time."""
-
-
 def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
     """Fly in virtual time, with a progress bar."""
-    config, takes_off = prepared.config, engagement.takes_off
-    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(Views()))
-    begun = time.perf_counter()
-    loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
-    engagement.begin(loop)
-    loop.course.in_flight = not takes_off
-    timed = _Timed(loop, engagement)
+    config = prepared.config
+    flight = LockstepFlight(prepared, path)
+    engagement.begin(flight.loop)
     try:
-        put_header(recorder, prepared, started_ns=0)
         with (
-            ending_noted(loop),
-            suppress(_InterruptedError),  # inside: an end that the operator asked for is no failure
+            ending_noted(flight.loop),
             stop_on_signals() as stopped,
             Progress(console=messages(), transient=True) as progress,
         ):
             task = progress.add_task("flying in virtual time", total=config.duration_s)
 
-            def show(flown_s: float) -> None:
+            def show(flown_s: float) -> bool:
                 progress.update(task, completed=flown_s)
-                if stopped():
-                    loop.course.stop(Cause.OPERATOR)
-                    raise _InterruptedError
+                return not stopped()
 
-            def record(truth: Truth) -> None:
-                recorder.put(TRUTH, truth.at_ns, truth)
-
-            world = World(config, timed, on_truth=record, on_progress=show, airborne=not takes_off)
-            begun = time.perf_counter()
-            world.run(config.duration_s, lambda: takes_off and loop.finished)
-            if takes_off:
-                timed.stop = True
-                loop.course.stop(Cause.TIME)
-                world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: loop.finished)
+            landing_s = stop_limit_s(config, takes_off=True) if engagement.takes_off else None
+            flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
-        wall_s = time.perf_counter() - begun
-        recorder.put(ENDED, timed.at_ns, loop.ending)
-        status = recorder.close()
-        tell_ending(final(loop.ending, status))
-    return conclude(path, wall_s, status, loop.ending)
+        status = flight.close()
+        tell_ending(final(flight.loop.ending, status))
+    return conclude(path, flight.wall_s, status, flight.loop.ending)
 
 
 def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: DerivedTopics) -> FlightSummary:
@@ -211,7 +165,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         loop.course.in_flight = not takes_off
         wall_s = 0.0
         try:
-            put_header(recorder, prepared, monotonic_ns())
+            put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))

@@ -94,7 +94,7 @@ def paper(
         "figures": [str(path) for path in figures],
         "wall_s": time.perf_counter() - begun,
     }
-    Common(json=json).show(document, lambda: paper_picture(results, claims, depth, figures))
+    Common(json=json).show("paper", document, lambda: paper_picture(results, claims, depth, figures))
     return 0 if all(result.decisions and not result.infeasible and not result.failed for result in results) else 1
 
 

@@ -31,11 +31,13 @@ from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlo
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.build.controller import build_controller, design_of
 from uavctl.build.library import check_fits, decode
+from uavctl.build.outside import KEY
+from uavctl.build.prepared import CONTROLLER, Prepared, cpu, versions
 from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
-from uavctl.cli.prepare import Prepared, cpu, prepare, versions
+from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse
-from uavctl.errors import LibraryError, RecordingError, UsageError
+from uavctl.errors import DesignError, LibraryError, RecordingError, UsageError
 from uavctl.loop import VEHICLE, ControlLoop, make_links
 from uavctl.records import Header, StepInput
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -47,11 +49,21 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
     """Return the controller that flew in a recording.
 
     Raises:
-        RecordingError: It carries no policy library though it flew with one, or one that does not fit.
+        RecordingError: It carries no policy library though it flew with one, or one that does not fit; or the
+            controller of another package that flew is not here.
     """
     design = design_of(config)
     if not isinstance(design, Design) or not config.uses_library:
-        return prepare(config, design)
+        try:
+            return prepare(config, design)
+        except DesignError as error:
+            if error.key != KEY:
+                raise
+            flown = header(flight).versions.get(CONTROLLER, config.smpc.controller)
+            raise RecordingError(
+                f"{flight}: was flown by a controller of another package, {flown}, which is not here: "
+                f"{error.reason}; {error.hint}"
+            ) from error
     try:
         return _with_library(flight, config, design)
     except LibraryError as error:
@@ -119,12 +131,12 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     """
     check_first(flight)
     recorded = header(flight)
+    name = f"{flight} (configuration)"
+    config = flown = parse(recorded.config_toml, name).config
     cut, note = lacks_end(flight), last_note(flight)
     if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
         nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
-        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded)))
-    name = f"{flight} (configuration)"
-    config = parse(recorded.config_toml, name).config
+        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded, flown.smpc.controller)))
     if overrides:
         loaded = parse(recorded.config_toml, name, overrides)
         if make_links(loaded.config).keys() != make_links(config).keys():
@@ -146,7 +158,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
         ignored=MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset(),
     )
-    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded)))
+    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded, flown.smpc.controller)))
 
 
 def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
@@ -199,9 +211,17 @@ def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
         yield Changed(key=key, recorded=str(before), replayed=str(now))
 
 
-def other_versions(recorded: Header) -> Iterator[str]:
-    """Return which code, libraries and CPU type, on which the last bits depend, differ from the recording's."""
-    here = {**versions(), "cpu": cpu()}
+def other_versions(recorded: Header, controller: str) -> Iterator[str]:
+    """Return which code, libraries and CPU type, on which the last bits depend, differ from the recording's.
+
+    Args:
+        controller: The one of another package that flew, if one did.
+    """
+    try:
+        found = versions(controller)
+    except DesignError:  # the controller of another package is not here
+        found = versions("")
+    here = {**found, "cpu": cpu()}
     there = {**recorded.versions, "cpu": recorded.cpu}
     for name in sorted(here.keys() | there.keys()):
         if here.get(name) != there.get(name):
@@ -352,7 +372,7 @@ def replay(
         "changed": replayed.changed,
         "other_versions": replayed.other_versions,
     }
-    common.show(document, lambda: replay_table(replayed))
+    common.show("log/replay", document, lambda: replay_table(replayed))
     return 0 if result.identical else 1
 
 
@@ -370,7 +390,7 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
     )
     if not result.positions:
         raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
-    common.show(result, lambda: _foreign_table(result, config.smpc.horizon))
+    common.show("log/replay-foreign", result, lambda: _foreign_table(result, config.smpc.horizon))
     return 0
 
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -21,7 +20,7 @@ from rich.markup import escape
 from sim.faults import problems
 from sim.server import Door, Port, Ready, Seat, fleet, serve_all
 from sim.simulation import VehicleSnapshot
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages
+from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages, write_document
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
@@ -335,7 +334,9 @@ def _announce(seats: Sequence[Seat], opened: Sequence[Ready], *, as_json: bool) 
         {"system_id": seat.config.sim.system_id, "vehicle": ports.vehicle, "mocap": ports.mocap}
         for seat, ports in zip(seats, opened, strict=True)
     ]
-    lines = [" ".join(f"{key} {value}" for key, value in one.items()) for one in listed]
-    text = msgspec.json.encode({"vehicles": listed}).decode() if as_json else "\n".join(lines)
-    sys.stdout.write(text + "\n")
+    if as_json:
+        write_document("sim", {"vehicles": listed})
+        return
+    for one in listed:
+        sys.stdout.write(" ".join(f"{key} {value}" for key, value in one.items()) + "\n")
     sys.stdout.flush()

@@ -48,7 +48,9 @@ def solve(
     start = time.perf_counter()
     answer = solver.solve(0, x, design.target)
     solve_us = (time.perf_counter() - start) * 1e6
-    common.show(solve_document(answer, solve_us), lambda: solve_picture(answer, design, loaded.config, solve_us))
+    common.show(
+        "solve", solve_document(answer, solve_us), lambda: solve_picture(answer, design, loaded.config, solve_us)
+    )
     return 0 if answer.status is SolveStatus.OPTIMAL else 1
 
 

@@ -349,7 +349,7 @@ def tune(
         "config": str(folder / TUNED) if progress.tuned is not None else None,
         "report": str(folder / PAGE) if progress.comparison is not None else None,
     }
-    common.show(document, lambda: comparison_picture(progress, folder))
+    common.show("tune", document, lambda: comparison_picture(progress, folder))
     return code
 
 

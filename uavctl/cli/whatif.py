@@ -16,6 +16,7 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
+from logs.recording.ends import new_recording, put_header
 from logs.recording.export import known_number
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
@@ -26,9 +27,10 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
 from uavctl.build.controller import build_problem, design_of
+from uavctl.build.prepared import Prepared
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
-from uavctl.cli.flying import conclude, new_recording, put_header
-from uavctl.cli.prepare import Prepared, prepare, ready_library
+from uavctl.cli.flying import conclude
+from uavctl.cli.prepare import prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
@@ -230,8 +232,13 @@ def whatif(
     response = response_of(history, plant)
     _warn(flight, recorded, history)
     was = recorded_flyer(flight, before)
-    if controller == "smpc":
-        now = was if config is None and not overrides else changed_flyer(flight, before, loaded)
+    outside = controller not in KINDS
+    if outside:
+        smpc = replace(loaded.config.smpc, controller=controller)
+        loaded = dataclasses.replace(loaded, config=replace(loaded.config, smpc=smpc))
+    if controller == "smpc" or outside:
+        same = config is None and not overrides and not outside
+        now = was if same else changed_flyer(flight, before, loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
     other = None
@@ -275,13 +282,13 @@ def whatif(
             page=str(path.with_name("what-if.html")),
         )
         write_whole(Path(result.page), write_page(result, sides[0], sides[2]))
-    Common(json=json).show(result, lambda: _picture(result))
+    Common(json=json).show("log/whatif", result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
 
 def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
     """Warn why the reproduction may not be exact."""
-    texts = [f"{text}: decisions may differ" for text in other_versions(recorded)]
+    texts = [f"{text}: decisions may differ" for text in other_versions(recorded, history.config.smpc.controller)]
     lost = max((one.dropped + one.refused for _, _, one in history.entries if isinstance(one, RecorderNote)), default=0)
     if lost:
         texts.append(f"{count(lost, 'record')} missing in the recording")
@@ -351,7 +358,7 @@ def _recorded(
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
     recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(Views()))
     try:
-        put_header(recorder, now, recorded.started_ns)
+        put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
         course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
     except BaseException:
         recorder.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from ipaddress import ip_network
 from pathlib import PurePath
 from typing import Annotated, Literal
@@ -74,11 +75,11 @@ class CameraSystem:
     camera: str  # `module:Class` of its `uavctl.io.camera.Camera`, made with the body's name and the axis that is up
     package: str  # package that it imports beyond ours; empty for none
     extra: str  # our optional dependency group that installs the package
-    port: int  # of its server, if a URL names none
+    port: int  # of its server, if a URL names none; 0: a URL has to
     advice: str  # what to check if no answer comes
 
 
-# By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY. Another one is a line here and its class.
+# By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY.
 CAMERA_SYSTEMS = {
     "natnet": CameraSystem(
         camera="uavctl.io.natnet:NatNet",
@@ -88,8 +89,28 @@ CAMERA_SYSTEMS = {
         advice="does Motive run there, is NatNet enabled in its streaming settings, and does no firewall block it?",
     )
 }
-CAMERAS = tuple(f"{scheme}:" for scheme in CAMERA_SYSTEMS)
+SOURCES = "uavctl.sources"  # entry points of those of other packages
+_TRANSPORTS = ("udpin", "udpout", "tcp", "serial")  # MAVLink as it is
 CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
+
+
+def camera_scheme(url: str) -> str:
+    """Return the scheme of a camera system's URL; empty if it is no camera system's.
+
+    That of another package is the name of its entry point `uavctl.sources`, or its `module:Class`.
+    """
+    scheme, separator, _ = url.partition("://")
+    if not separator or scheme in _TRANSPORTS:
+        return ""
+    return scheme if scheme in CAMERA_SYSTEMS or ":" in scheme or entry_points(group=SOURCES, name=scheme) else ""
+
+
+def camera_system(scheme: str) -> CameraSystem:
+    """Return what is known of a camera system, by the scheme of its URLs."""
+    if scheme in CAMERA_SYSTEMS:
+        return CAMERA_SYSTEMS[scheme]
+    camera = next((point.value for point in entry_points(group=SOURCES, name=scheme)), scheme)
+    return CameraSystem(camera=camera, package="", extra="", port=0, advice="does the server run there?")
 
 
 class FrameConfig(Section, frozen=True, kw_only=True):
@@ -163,7 +184,8 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
         Meta(
             max_length=LONGEST_URL,
             description="URL of the source of positions; the same URL as the vehicle's is one connection. "
-            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system (docs/sources.md)",
+            "`natnet://SERVER/BODY` is a body of an OptiTrack system (docs/sources.md), `NAME://SERVER:PORT/BODY` one "
+            "of another package, by its entry point `uavctl.sources` or as `module:Class` (docs/extending.md)",
         ),
     ] = "udpin://0.0.0.0:14560"
     vehicle_system_id: Annotated[
@@ -268,7 +290,7 @@ def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
             found.append(f"{name}: {url} listens to any address; list the peers in security.allow")
         if url.startswith("udp") and not signed:
             found.append(f"{name}: {url} is not signed, so a sender's address can be forged; see security.key_file")
-        if url.startswith(CAMERAS):
+        if camera_scheme(url):
             found.append(f"{name}: {url} has no signatures, so a sender's address can be forged; see docs/sources.md")
     return tuple(found)
 
@@ -278,13 +300,13 @@ def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
 
 def roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
     """Check that a camera system is not given as the vehicle."""
-    if daemon.vehicle.startswith(CAMERAS):
+    if camera_scheme(daemon.vehicle):
         yield ConfigProblem("daemon.vehicle", f'"{daemon.vehicle}" is a camera system', "give it as daemon.mocap")
 
 
 def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
     """Check that a camera system's positions are among those that count."""
-    if not daemon.mocap.startswith(CAMERAS):
+    if not camera_scheme(daemon.mocap):
         return
     if CAMERA_MESSAGE not in source.messages:
         yield ConfigProblem(
@@ -300,7 +322,7 @@ def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem
 
 def signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
     """Check that no signatures are asked of a camera system, which cannot sign."""
-    if daemon.mocap.startswith(CAMERAS) and security.key_file and "mocap" in security.require:
+    if camera_scheme(daemon.mocap) and security.key_file and "mocap" in security.require:
         yield ConfigProblem(
             "security.require",
             f'"mocap" cannot be: {daemon.mocap} has no signatures',

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
+import numpy as np
 from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
@@ -83,6 +84,34 @@ def _text(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_text, value))}]"
     return repr(value)
+
+
+def override_texts(values: Mapping[str, object], path: str = "") -> Iterator[str]:
+    """The values of a mapping as overrides `key.path=value`; a key may be dotted, or hold a mapping of those below it.
+
+    Raises:
+        ConfigError: A value is one that TOML cannot hold.
+    """
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from override_texts(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}={_inline(value, f'{path}{key}')}"
+
+
+def _inline(value: object, key: str) -> str:
+    """A value as TOML text in one line, that of a numpy array or number included."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{name} = {_inline(one, key)}' for name, one in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_inline(one, key) for one in value)}]"
+    if isinstance(value, Path):
+        value = str(value)
+    if not isinstance(value, str | bool | int | float):
+        raise ConfigError((f"{key}: {value!r} is no value of a configuration; give numbers, text, lists or tables",))
+    return _text(value)
 
 
 def dotted(value: object, path: str = "") -> Iterator[tuple[str, object]]:

@@ -223,6 +223,15 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
             "`age-conditioned`: plans without feedback, back-offs by the age of information, the regulator's tail"
         ),
     ] = "hahn-stursberg"
+    controller: Annotated[
+        str,
+        Meta(
+            max_length=200,
+            description="a controller of another package that plans in the place of the scheme: the name of its entry "
+            "point `uavctl.controllers`, or `module:Class` (docs/extending.md); the scheme's design says where the "
+            "vehicle may rest all the same; empty: the scheme plans",
+        ),
+    ] = ""
     horizon: Annotated[
         int,
         Meta(
@@ -561,4 +570,4 @@ class Config(Section, frozen=True, kw_only=True):
     @property
     def uses_library(self) -> bool:
         """Whether plans come from a policy library."""
-        return self.solver.method == "library" and not self.conditioned
+        return self.solver.method == "library" and not (self.conditioned or self.smpc.controller)

@@ -103,6 +103,8 @@ def fly(
             if withheld:
                 loop.refused(VEHICLE, {WITHHELD: withheld}, now())
             loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
+            if loop.outside and ticked.decision.solve is not None:
+                loop.answered(ticked.step_ns)
             refusals.tell(due.at_ns)
             for follow in after_tick:
                 follow(ticked, started_ns - due.at_ns)

@@ -44,6 +44,7 @@ class Controller:
     link: LinkEstimateParameters  # parameters of the link estimate
     dead_ns: int = 0  # from sending an input until it begins to act [ns]
     late_steps: int = 0  # age up to which the solver counts what it has not seen since [steps]
+    outside: str = ""  # name of the controller of another package that is the solver; empty: it is one of ours
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: nothing is checked against them
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
@@ -88,4 +89,6 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     biases: Biases = ()  # estimated biases of late
     taken_back: int | None = None  # the step in which positions were last taken back; None for none
     coming: Coming = ()  # inputs that were sent and do not act yet, oldest first
+    fault: str = ""  # why a controller of another package is not asked any more; empty as long as it is
+    late: int = 0  # its answers in a row that came too late
     held_m: Vec3 | None = None  # estimated position at which HOLD began [m]; None in other modes

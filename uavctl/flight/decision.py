@@ -146,6 +146,7 @@ class SolveOutcome(msgspec.Struct, frozen=True):
     status: SolveStatus
     plan: Plan | None
     text: str
+    fault: str = ""  # why the solver is not to be asked again
 
 
 def ask(
@@ -164,7 +165,8 @@ def ask(
     if answer.seq != seq:
         return SolveOutcome(SolveStatus.LATE, None, f"the answer is to step {answer.seq}, asked was step {seq}")
     if answer.status is not SolveStatus.OPTIMAL:
-        return SolveOutcome(answer.status, None, f"the solve ended as {answer.status.value}")
+        text = "" if answer.fault else f"the solve ended as {answer.status.value}"
+        return SolveOutcome(answer.status, None, text, answer.fault)
     if not _complete(answer, shape, len(base.mean)):
         return SolveOutcome(SolveStatus.FAILED, None, "the answer is not finite, or has the wrong shape")
     # The solver plans what acts on the plant in all: the part of it that is there without us is not asked for again.
@@ -215,6 +217,68 @@ def _rows(values: Array) -> Matrix:
     return tuple(map(tuple, values.tolist()))
 
 
+# How long a controller of another package may take; who flies measures it, and a replay is told.
+
+
+CONTROLLER_FAULT = "controller-fault"  # code of the event that tells why one is given up
+LATE_IN_A_ROW = 3  # plans that took longer than a tick: one may be the computer's fault
+LONGEST_ANSWER_NS = 500_000_000  # half of the time after which a PX4 takes setpoints for gone
+
+
+def judge_answer(state: ControlState, inp: StepInput, controller: Controller) -> ControlState:
+    """Return the state once the time of the last plan is judged: too late too often is a fault."""
+    took_ns, name = inp.answered_ns, controller.outside
+    late = state.late + 1 if took_ns > controller.tick_ns else 0
+    if state.fault or (late < LATE_IN_A_ROW and took_ns <= LONGEST_ANSWER_NS):
+        return replace(state, late=late)
+    times = f", too late {late} times in a row" if late > 1 else ""
+    fault = (
+        f"the controller {name} is too late: its plan took {took_ns * 1e-9:.3f} s, "
+        f"a tick has {controller.tick_ns * 1e-9:g} s{times}"
+    )
+    fallback = fb.request(state.fallback, FallbackEnd.UNPLANNED, inp.at_ns)
+    return replace(state, late=late, fault=fault, fallback=fallback)
+
+
+def _no_stop(estimate: Estimate, sent_mps2: Vec3, controller: Controller) -> str:
+    """Return why a controller of another package is given up: braking now would end beyond the limits; empty if not.
+
+    Nothing promises that it keeps them. It may come to a stop half as far beyond them as the envelope allows, which
+    would not brake but let go.
+
+    Args:
+        sent_mps2: The setpoint of the tick before [m/s²].
+    """
+    bounds, slew = controller.envelope, controller.limits.slew_mps3
+    if bounds is None:
+        return ""
+    rows = zip(
+        AXES,
+        _vec3(controller.plant, estimate.mean, controller.plant.position_index, math.nan),
+        _vec3(controller.plant, estimate.mean, controller.plant.velocity_index, math.nan),
+        bounds.lower_m,
+        bounds.upper_m,
+        bounds.outside_m,
+        bounds.lag_s,
+        sent_mps2,
+        controller.limits.accel_mps2,
+        strict=True,
+    )
+    for axis, position, velocity, lower, upper, margin, lag_s, sent, most in rows:
+        for out_m, outward, gains in ((lower - position, -velocity, -sent), (position - upper, velocity, sent)):
+            # The last gate takes its time until it asks for the opposite.
+            gains = max(gains, 0.0)
+            fastest = outward + gains * gains / (2.0 * slew)
+            turn_s = lag_s + (gains + 0.5 * most) / slew
+            beyond_m = out_m + fastest * turn_s + fb.stop_m(fastest, most, controller.fallback)
+            if outward > 0.0 and beyond_m > 0.5 * margin:
+                return (
+                    f"the controller {controller.outside} flies at the limit of {axis}: braking from {outward:.1f} m/s "
+                    f"would end {beyond_m:.1f} m beyond it"
+                )
+    return ""
+
+
 # Choice of what flies in a tick: nothing yet, a plan (fresh, or played out), or the fallback.
 
 
@@ -245,6 +309,7 @@ class Choice(msgspec.Struct, frozen=True, eq=False):
 PLAYED_OUT_STEPS = 2  # without a position: from there on a plan is held against the vehicle's own velocity
 MISSION_OVER = "the mission is over: landing"
 _FINAL = {
+    FallbackEnd.UNPLANNED: "the controller has failed",
     FallbackEnd.BARRED: "positions jumped and are not believed any more",
     FallbackEnd.LET_GO: "what is seen cannot be",
     FallbackEnd.STOP: "the operator asked for the hand-over",
@@ -291,6 +356,8 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
         why = _FINAL[state.fallback.end]
         if state.fallback.end is FallbackEnd.LET_GO and state.breach is not None:
             why = state.breach.text
+        elif state.fallback.end is FallbackEnd.UNPLANNED:
+            why = state.fault
         return _fall(state, state.fallback, tick, inp, controller, why)
     if state.plan is not None and state.trust.suspect is not None and state.trust.suspect.likely:
         why = "positions jumped: braking until they are believed again, or not any more"
@@ -330,8 +397,15 @@ def _decide(state: ControlState, tick: Tick, inp: StepInput, controller: Control
     if controller.mission.land and state.order is None and over(controller.mission, mission, tick.boundary_ns):
         landing = fb.request(state.fallback, FallbackEnd.LAND, at_ns)
         return _fall(state, landing, tick, inp, controller, MISSION_OVER)
+    if controller.outside and state.plan is not None and not state.fault:
+        state = replace(state, fault=_no_stop(base, state.accel_mps2, controller))
+    if state.fault:  # found just now, or it is flown again after the pilot had it
+        return _unplanned(state, tick, inp, controller)
     choice = _replan(state, mission, base, uncertain(controller.kalman, begins), tick, inp, controller)
     plan = choice.state.plan
+    if choice.state.fault:
+        unplanned = _unplanned(choice.state, tick, inp, controller)
+        return replace(choice, state=unplanned.state, reason=unplanned.reason)
     if plan is not None and tick.number - plan.seq < controller.horizon:
         return choice
     fallen = _fall(choice.state, state.fallback or fb.enter(at_ns), tick, inp, controller, "no plan is left to fly")
@@ -378,8 +452,15 @@ def _replan(
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
     if asked.plan is None:
+        state = replace(state, fault=asked.fault)
         return Choice(state, "no new plan: the old one plays out", news, asked.status, None, asked.text)
     return Choice(replace(state, plan=asked.plan, fallback=None), reason, news, asked.status, asked.plan)
+
+
+def _unplanned(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
+    """Let the fallback fly for good: the controller of another package has failed."""
+    fallback = fb.request(state.fallback, FallbackEnd.UNPLANNED, inp.at_ns)
+    return _fall(state, fallback, tick, inp, controller, state.fault)
 
 
 def _felt_since(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:

@@ -6,7 +6,8 @@ A state machine of four modes, each with a time limit:
 
     end       from HOLD
     RECOVER   LAND after hold_s, or blind_hold_s, if configured; else it holds on
-    BARRED    LAND once its zero has been sent, if configured; else STOPPED
+    UNPLANNED LAND once its zero has been sent, if configured; else STOPPED
+    BARRED    the same
     LET_GO    the same; and nothing is braked on before, as no position is believed: level at once
     STOP      LAND once its zero has been sent, if configured; else STOPPED
     LAND      LAND once its zero has been sent
@@ -55,6 +56,7 @@ class FallbackEnd(IntEnum):
     """End of the fallback; a greater one overrides a smaller one, and there is no way back to a smaller one."""
 
     RECOVER = auto()  # plans, once positions are back; until then as configured
+    UNPLANNED = auto()  # a controller of another package has failed: as configured, and plans never again
     BARRED = auto()  # positions are not believed any more: as configured, and plans never again
     LET_GO = auto()  # what is seen cannot be: the same, and nothing is braked on
     STOP = auto()  # the operator's stop: as configured, and then nothing is sent
@@ -152,6 +154,14 @@ def acceleration(fallback: Fallback, at_ns: int, velocity_mps: Vec3, parameters:
         return ZERO
     north, east, down = (-parameters.brake_gain_1ps * v for v in velocity_mps)
     return north, east, down
+
+
+def stop_m(speed_mps: float, most_mps2: float, parameters: FallbackParameters) -> float:
+    """Distance that braking takes [m], with so much acceleration at most, and no lag."""
+    gentle_mps = most_mps2 / parameters.brake_gain_1ps  # below this speed it brakes by less
+    if speed_mps <= gentle_mps:
+        return speed_mps / parameters.brake_gain_1ps
+    return (speed_mps**2 - gentle_mps**2) / (2.0 * most_mps2) + gentle_mps / parameters.brake_gain_1ps
 
 
 def back(off_m: Vec3, velocity_mps: Vec3) -> Vec3:

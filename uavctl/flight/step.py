@@ -17,11 +17,13 @@ from msgspec.structs import replace
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.decision import (
+    CONTROLLER_FAULT,
     Choice,
     Tick,
     back_mps2,
     choose,
     held_mps2,
+    judge_answer,
     mode_of,
     moving_mps,
     place,
@@ -198,6 +200,8 @@ def step(
         tick = place(state, inp, intake.history, controller)
     stale = tick.boundary and tick.age_steps is not None and tick.age_steps >= controller.horizon
     ordered, answers = take_orders(state, inp, controller)
+    if inp.answered_ns:
+        ordered = judge_answer(ordered, inp, controller)
     if moved:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.BARRED, inp.at_ns))
     if breach is not None:
@@ -292,6 +296,7 @@ def step(
             *answers,
             *((_restarted(inp.at_ns),) if lost else ()),
             *(() if breach is None else (_breached(inp.at_ns, breach),)),
+            *((_failed(inp.at_ns, after.fault),) if after.fault and not state.fault else ()),
             *_events(before, mode, choice, inp, tuple(why for _, why in intake.refused), controller.names),
             *_link_events(alarms, state.link_alarms, link),
             *_inertial_events(state.inertial, inertial, inp.at_ns),
@@ -542,6 +547,10 @@ def _breached(at_ns: int, breach: Breach) -> Event:
     return Event(at_ns=at_ns, severity=Severity.ERROR, code=breach.code, text=breach.text)
 
 
+def _failed(at_ns: int, fault: str) -> Event:
+    return Event(at_ns=at_ns, severity=Severity.ERROR, code=CONTROLLER_FAULT, text=fault)
+
+
 def _restarted(at_ns: int) -> Event:
     text = "positions jumped while nobody flew on them; the estimate begins anew"
     return Event(at_ns=at_ns, severity=Severity.WARNING, code="position-restart", text=text)
@@ -575,7 +584,7 @@ def _events(
         events.append(
             Event(at_ns=inp.at_ns, severity=Severity.WARNING, code="missed-ticks", text=text, count=inp.missed_ticks)
         )
-    if choice.solve is not None and choice.plan is None:
+    if choice.solve is not None and choice.trouble:
         code = f"solve-{choice.solve.value}"
         events.append(Event(at_ns=inp.at_ns, severity=Severity.WARNING, code=code, text=choice.trouble))
     if choice.plan is not None and choice.plan.gave_way:

@@ -8,7 +8,7 @@ from ipaddress import IPv4Address
 from typing import Protocol, get_args
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from uavctl.config.connections import CAMERA_SYSTEMS
+from uavctl.config.connections import camera_scheme, camera_system
 from uavctl.errors import ConnectionSpecError, UavctlError
 from uavctl.frames import Quaternion, Up
 from uavctl.records import Vec3
@@ -87,7 +87,7 @@ FORM = "SERVER[:PORT]/BODY, and after it ?up=z where the cameras' up is Z, inter
 class CameraUrl:
     """A body that a server of cameras tells of."""
 
-    system: str  # its scheme, a key of `CAMERA_SYSTEMS`
+    system: str  # its scheme, see `uavctl.config.connections.camera_scheme`
     host: str  # name or address of the server
     port: int  # where it takes questions
     body: str  # name of the body, as the cameras have it
@@ -101,23 +101,25 @@ def parse(url: str) -> CameraUrl:
     Raises:
         ConnectionSpecError: it is not of this form.
     """
-    scheme = url.partition(":")[0]
+    scheme, _, rest = url.partition("://")
     form = f"write {scheme}://{FORM}"
     try:
-        parts = urlsplit(url)
+        parts = urlsplit(f"//{rest}")
         host, port = parts.hostname, parts.port
         options = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query)))
     except ValueError as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; {form}") from error
     body = unquote(parts.path.removeprefix("/"))
-    if scheme not in CAMERA_SYSTEMS or not host or not body or parts.fragment or port == 0:
+    if not camera_scheme(url) or not host or not body or parts.fragment or port == 0:
         raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; {form}")
     up, interface = options.pop("up", "y"), options.pop("interface", "0.0.0.0")
     if options:
         raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; {form}")
     for axis in get_args(Up):
         if up == axis:
-            port = CAMERA_SYSTEMS[scheme].port if port is None else port
+            port = camera_system(scheme).port if port is None else port
+            if not port:
+                raise ConnectionSpecError(f"connection {url!r} needs the server's port too; {form}")
             return CameraUrl(scheme, host, port, body, axis, _address(url, interface))
     raise ConnectionSpecError(f"connection {url!r}: up={up!r} is neither y nor z; see the cameras' streaming settings")
 

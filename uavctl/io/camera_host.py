@@ -227,18 +227,35 @@ def _joined(group: tuple[str, int], interface: str) -> socket.socket:
     return joined
 
 
+def _made(camera: str, body: str, up: Up) -> Camera:
+    """Make the class of a camera system, `module:Class`; modules of the working directory count last.
+
+    Raises:
+        CameraError: it cannot be.
+    """
+    module, _, name = camera.partition(":")
+    sys.path.append(os.getcwd())  # noqa: PTH109 as text
+    try:
+        make: Callable[[str, Up], Camera] = getattr(import_module(module), name)
+        return make(body, up)
+    except CameraError:
+        raise
+    except Exception as error:
+        raise CameraError(
+            f"its class {camera} cannot be made ({type(error).__name__}: {error}); install its package, or start "
+            "uavctl in the folder of its module"
+        ) from error
+
+
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
     descriptor, camera, address, port, body, up, interface = arguments
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
-    module, _, name = camera.partition(":")
-    make: Callable[[str, Up], Camera] = getattr(import_module(module), name)
-
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
         try:
-            host = Host(make(body, cast(Up, up)), pipe, (address, int(port)), interface)
+            host = Host(_made(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
             try:
                 host.run()
             finally:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
 
-from uavctl.config.connections import CAMERA_SYSTEMS, CAMERAS
+from uavctl.config.connections import camera_scheme, camera_system
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.admission import AllowList, Budgets, Rules
 from uavctl.io.base import Base, Connection
@@ -129,7 +129,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
         ConnectionSpecError: the URL, the package, the server or the body is not as it has to be.
     """
     place = parse(url)
-    system = CAMERA_SYSTEMS[place.system]
+    system = camera_system(place.system)
     if system.package and find_spec(system.package) is None:
         raise ConnectionSpecError(
             f"connection {url!r} needs the package {system.package}, which is not installed; run: "
@@ -161,8 +161,8 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
 #
 # * Recording, replay, check, relay and the rules for stamps and clocks see one language. What reaches the controller is
 #   recorded as the bytes that it was, and a replay needs neither cameras nor their package.
-# * Another camera system is one class (`uavctl.io.camera.Camera`) and one line of
-#   `uavctl.config.connections.CAMERA_SYSTEMS`.
+# * Another camera system is one class (`uavctl.io.camera.Camera`): ours (`uavctl.config.connections.CAMERA_SYSTEMS`) or
+#   that of another package, by its entry point `uavctl.sources` or as `module:Class`.
 #
 # Why a process and not a thread: a decoder in Python would hold the interpreter's lock when a tick is due, and a
 # malformed frame can make it reserve gigabytes. The process has its own memory limit; when it ends, positions are
@@ -179,5 +179,5 @@ def open_source(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rul
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; says what to do.
     """
-    opener = _open_camera if url.startswith(CAMERAS) else open_connection
+    opener = _open_camera if camera_scheme(url) else open_connection
     return opener(url, now, rules)

@@ -91,13 +91,15 @@ class Answer:
     gap: float  # (cost - cost_lower) / |cost|, see `relative_gap`; inf if no lower bound is known
     iterations: int  # iterations of the solver, summed over all programs that were run
     gave_way: tuple[GaveWay, ...] = ()  # which constraints gave way, and by how much
+    fault: str = ""  # why the solver is not to be asked again; empty if it may be
 
     @classmethod
-    def failed(cls, seq: int, status: SolveStatus, method: str, iterations: int = 0) -> Answer:
+    def failed(cls, seq: int, status: SolveStatus, method: str, iterations: int = 0, fault: str = "") -> Answer:
         """An answer without a plan: empty arrays, infinite cost.
 
         Args:
             iterations: Interior-point iterations spent.
+            fault: Why the solver is not to be asked again.
         """
         empty = np.zeros((0, 0))
         return cls(
@@ -116,6 +118,7 @@ class Answer:
             cost_lower=-np.inf,
             gap=np.inf,
             iterations=iterations,
+            fault=fault,
         )
 
 

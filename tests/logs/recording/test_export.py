@@ -138,7 +138,7 @@ def test_columns_that_parquet_cannot_hold_are_named(tmp_path: Path) -> None:
     recorder = SyncRecorder(path)
     recorder.put("/uavctl/timing", 1, Timing(tick=1, at_ns=1, lateness_ns=0, step_ns=2**63, send_ns=0))
     assert recorder.close().ok
-    with pytest.raises(RecordingError, match="column step_ns: Parquet has no place"):
+    with pytest.raises(RecordingError, match="column step_ns: Arrow has no place"):
         export_tables(path, tmp_path / "out", TableFormat.PARQUET)
     assert not (tmp_path / "out").exists()
     export_tables(path, tmp_path / "out", TableFormat.CSV)

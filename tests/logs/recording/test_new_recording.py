@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from logs.recording.ends import new_recording
 from uavctl.cli.app import run
-from uavctl.cli.flying import new_recording
 from uavctl.errors import RecordingError
 
 EXACT = ("--config", "paper", "--set", "solver.method=exact")

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from loopback_rig import Memory, lockstep
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from report_rig import unwritten, walk
 from rich.console import Console
 
@@ -22,7 +23,7 @@ from logs.recording.summary import summarise
 from logs.report.compare import Figure, FlightComparison, compare, comparison_html, load_all
 from uavctl.cli.app import run
 from uavctl.cli.log_report import comparison_picture
-from uavctl.records import Decision, Header, Record, Timing
+from uavctl.records import Datagram, Decision, Header, Record, Timing
 
 SECONDS = 6.0
 EXACT = "solver.method=exact"
@@ -89,6 +90,25 @@ def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -
     assert {one.key: one.values for one in found.parameters} == {"cpu": ("", "another"), "versions.numpy": (None, "3")}
     assert found.likenesses[0].identical
     assert any("different processors" in note for note in found.notes)
+
+
+def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) -> None:
+    def with_parameters(**told: float) -> list[tuple[str, int, Record]]:
+        mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        messages = [
+            mavlink.MAVLink_param_value_message(name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32, 9, 0)
+            for name, value in told.items()
+        ]
+        data = b"".join(message.pack(mav) for message in messages)
+        at_ns = base.entries[-1][1]
+        raw = Datagram(at_ns=at_ns, link="vehicle", outgoing=False, data=data)
+        return [*base.entries, ("/raw/vehicle/in", at_ns, raw)]
+
+    flights = {"a": {"P": 0.1, "Q": 1.0}, "b": {"P": 0.25, "Q": 1.0, "R": 3.0}, "c": {}}
+    paths = [record(tmp_path / f"{name}.mcap", with_parameters(**told)) for name, told in flights.items()]
+    found = compare(load_all(paths))
+    assert [(one.key, one.values) for one in found.parameters] == [("vehicle.P", (0.1, 0.25, None))]
+    assert sum("A 2, B 3, C 0" in note for note in found.notes) == 1
 
 
 def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) -> None:

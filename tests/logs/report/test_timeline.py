@@ -62,19 +62,17 @@ def test_marks_are_where_things_happened(flight: FlightData) -> None:
     orders = (StepInput(tick=20, at_ns=flight.origin_ns + 1_000_000_000, commands=(Command(order=Order.HOLD),)),)
     found = dataclasses.replace(flight, step_inputs=(*flight.step_inputs, *orders))
     by_name = {one.name: one for one in lanes(found)}
-    ((_, times),) = by_name["orders"].marks
+    _, times = by_name["orders"].marks
     assert times.tolist() == [1.0]
     silent = sum(bool(d.age_steps) for d in flight.decisions if d.boundary)
-    assert len(by_name["positions"].marks[0][1]) == silent
-    assert "plans" not in by_name  # nothing gave way
-    assert "limits" not in by_name
+    assert len(by_name["no news"].marks[1]) == silent
+    assert not {"gave way", "no optimum", "outside", "input over", "refused"} & set(by_name)  # nothing of it happened
 
 
 def test_bars_too_short_for_their_text_are_explained(flight: FlightData) -> None:
     told = (hand_over(3.0, "engaging -> engaged", flight.origin_ns), hand_over(3.1, "engaged -> released", 0))
-    _, _, marks = timeline(dataclasses.replace(flight, events=told[:1]))
-    texts = {mark.text for mark in marks}
-    assert {"step without news", "event"} <= texts
+    *_, meanings = timeline(dataclasses.replace(flight, events=told[:1]))
+    assert "a step without a new position" in meanings and "an error" not in meanings
     short = timeline(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))[2]
     assert any(mark.kind == "band" and mark.text == "brake" for mark in short)
 

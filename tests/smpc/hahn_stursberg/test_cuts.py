@@ -11,8 +11,8 @@ import pytest
 from cut_rig import NAME, Cuts
 from report_rig import unpaged
 
+from uavctl.build.prepared import Prepared
 from uavctl.cli.app import run
-from uavctl.cli.prepare import Prepared
 from uavctl.cli.replay import recorded_flyer
 from uavctl.config import Config
 

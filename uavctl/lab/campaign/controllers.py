@@ -6,7 +6,6 @@ import hashlib
 import pickle
 import threading
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -45,10 +44,11 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, News, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, OneByOne
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
+from uavctl.smpc.outside import Rehearsal, make_answer
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
 
@@ -205,18 +205,19 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
     Raises:
         DesignError: There is no such controller.
     """
-    made = Recipe("", given.kind, config, margin=given.margin)
+    kind = config.smpc.controller or "smpc" if given.kind == "smpc" else given.kind
+    made = Recipe("", kind, config, margin=given.margin)
     if spec.measured == "position":
         sight = sight_of(config)
         made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
-    if given.kind == "smpc" and not config.conditioned:
+    if kind == "smpc" and not config.conditioned:
         design = build_design(config)
         stored = library_for(config, design)
         if stored is None:
             made = replace(made, design=design)
         else:
             made = replace(made, design=design, library=stored.data, library_id=stored.library_id)
-    elif given.kind == "pid":
+    elif kind == "pid":
         made = replace(made, gains=_tuned(config, spec))
     made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
     if made.design is None:
@@ -296,11 +297,7 @@ def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
     return tune(build_problem(config), np.asarray(start), meets.newest, meets.disturbances)
 
 
-# Controllers of others in place of the SMPC, within the flight core: its filter, fallback and last gate stay.
-#
-# The flight core asks for a plan when there is news, and plays it out in silence. So a baseline is asked now, and
-# again for each step of silence to come: what it would do then is its plan. It is told the filter's estimate as its
-# state.
+# Controllers of ours in place of the SMPC, within the flight core: its filter, fallback and last gate stay.
 
 
 class BaselineSolver:
@@ -312,66 +309,17 @@ class BaselineSolver:
     """
 
     def __init__(self, name: str, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
-        self._name, self._make = name, make
-        self._target: Array | None = None
-        self._begun = 0  # step in which it was asked first
-        self._asked: list[Array] = []  # its inputs (n_u,) step by step, as far as they are flown
+        self._name, self._rehearsal = name, Rehearsal(make)
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """See `Solver`; `outlook` is not used."""
         del outlook
-        if self._target is None or not np.array_equal(target, self._target):
-            self._problem, self._controller = self._make(target)
-            self._controller.begin(1)
-            self._target, self._begun, self._asked = target.copy(), seq, []
-        problem, step = self._problem, seq - self._begun
-        # What was flown since: its own plan, and nothing where that had run out.
-        flown = [*self._asked[:step], *([problem.u_target] * max(0, step - len(self._asked)))]
-        inputs: list[Array] = []
-        later = self._controller
+        problem, inputs = self._rehearsal.inputs(seq, x, target)
+        if not np.isfinite(inputs).all():
+            return Answer.failed(seq, SolveStatus.FAILED, self._name)
         low, high = problem.input_set.bounds
-        for silence in range(problem.horizon):
-            if silence == 1:
-                later = _twin(self._controller)
-            acted = np.clip(np.array([*flown, *inputs]).reshape(1, -1, problem.plant.n_u), low, high)
-            inputs.append(later.act(News(step + silence, np.array([step]), x[np.newaxis], acted))[0])
-        self._asked = [*flown, *inputs]
-        return _answer(seq, self._name, problem, x, np.array(inputs))
-
-
-def _twin(controller: BatchController) -> BatchController:
-    """Return a copy of a controller with a state of its own; the state of every baseline is in arrays."""
-    twin = copy(controller)
-    for name, value in vars(twin).items():
-        if isinstance(value, np.ndarray):
-            setattr(twin, name, value.copy())
-    return twin
-
-
-def _answer(seq: int, name: str, problem: ControlProblem, x: Array, inputs: Array) -> Answer:
-    """Return a plan without back-offs: states without disturbance, inputs cut to their limits."""
-    if not np.isfinite(inputs).all():
-        return Answer.failed(seq, SolveStatus.FAILED, name)
-    low, high = problem.input_set.bounds
-    states, cost = [x], 0.0
-    for u in np.clip(inputs, low, high):
-        off_x, off_u = states[-1] - problem.target, u - problem.u_target
-        cost += float(off_x @ problem.q_x @ off_x + off_u @ problem.q_u @ off_u)
-        states.append(problem.plant.a @ states[-1] + problem.plant.b @ u)
-    return Answer(
-        seq=seq,
-        status=SolveStatus.OPTIMAL,
-        method=name,
-        inputs=inputs,
-        states=np.array(states),
-        backoff_x=np.zeros((problem.horizon + 1, problem.state_set.b.size)),
-        backoff_u=np.zeros((problem.horizon, problem.input_set.b.size)),
-        reference=problem.target,
-        slack=0.0,
-        offset=0.0,
-        terminal_miss=0.0,
-        cost=cost,
-        cost_lower=-np.inf,
-        gap=np.inf,
-        iterations=0,
-    )
+        acts, states = np.clip(inputs, low, high), [x]
+        for u in acts:
+            states.append(problem.plant.a @ states[-1] + problem.plant.b @ u)
+        wanted, held = problem.target[np.newaxis], problem.u_target[np.newaxis]
+        return replace(make_answer(seq, self._name, problem, np.array(states), acts, wanted, held), inputs=inputs)

@@ -29,7 +29,7 @@ from uavctl.config.document import (
 from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.plugins import KINDS, controller_class
+from uavctl.lab.campaign.plugins import KINDS, check_kind
 
 # What a campaign is asked to fly, as its TOML file says it.
 #
@@ -474,7 +474,7 @@ def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
         kind = one.get("kind") if isinstance(one, dict) else None
         if isinstance(kind, str) and kind and kind not in KINDS:
             try:
-                controller_class(kind)
+                check_kind(kind)
             except DesignError as error:
                 yield ConfigProblem(f"controller[{i}].kind", error.reason, error.hint)
 

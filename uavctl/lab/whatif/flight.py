@@ -354,6 +354,8 @@ class _Flight:
                 self._loop.receive(self._positions_link, data, arrival_ns)
         for command in record.commands:
             self._loop.order(command)
+        if self._loop.outside == self._history.config.smpc.controller:
+            self._loop.answered(record.answered_ns)
         self._tap.setpoint = None
         ticked = self._loop.tick(record.tick, at_ns, to_nobody, record.missed_ticks, record.stop)
         self._loop.timing(ticked, lateness_ns=0, send_ns=0)

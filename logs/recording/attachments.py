@@ -1,0 +1,80 @@
+"""What a recording carries beside its messages, for other programs: attachments and metadata of MCAP.
+
+All of it follows from the messages, so that it is written anew for each file and by a recovery, and nothing is decided
+or replayed from it.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+
+import msgspec
+from mcap.records import Attachment, Metadata
+
+from logs.recording.parameters import VehicleParameter, parameter_file
+from uavctl.config.load import dotted
+from uavctl.records import Header
+
+CONFIG, LAYOUT, PARAMETERS = "config.toml", "foxglove-layout.json", "vehicle.params"
+_ORIGIN, _CONFIG, _VERSIONS = "uavctl", "configuration", "versions"
+_VALUES, _TYPES = "vehicle parameters", "vehicle parameter types"
+
+
+@cache
+def layout_text() -> str:
+    """Return the layout for Foxglove."""
+    return resources.files("logs").joinpath("foxglove-layout.json").read_text(encoding="utf-8")
+
+
+def of_header(header: Header, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
+    """Return what a header has for other programs: configuration, versions, origin.
+
+    Args:
+        utc_ns: log time of the header [ns].
+    """
+    origin = {
+        key: str(getattr(header, key))
+        for key in Header.__struct_fields__
+        if key not in ("config_toml", "design", "versions") and getattr(header, key) is not None
+    }
+    return (
+        _file(CONFIG, "application/toml", header.config_toml, utc_ns),
+        Metadata(_ORIGIN, origin),
+        Metadata(_VERSIONS, header.versions),
+        Metadata(_CONFIG, _flat(header.config_toml)),
+    )
+
+
+def layout(utc_ns: int) -> tuple[Attachment, ...]:
+    """Return the layout for Foxglove as an attachment."""
+    return (_file(LAYOUT, "application/json", layout_text(), utc_ns),)
+
+
+def of_parameters(parameters: Mapping[str, VehicleParameter], utc_ns: int) -> tuple[Attachment | Metadata, ...]:
+    """Return the vehicle's parameters for other programs; nothing if it told none."""
+    if not parameters:
+        return ()
+    return (
+        _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters), utc_ns),
+        Metadata(_VALUES, {name: str(one.value) for name, one in parameters.items()}),
+        Metadata(_TYPES, {name: one.type for name, one in parameters.items()}),
+    )
+
+
+def _file(name: str, media_type: str, text: str, utc_ns: int) -> Attachment:
+    return Attachment(create_time=utc_ns, log_time=utc_ns, name=name, media_type=media_type, data=text.encode())
+
+
+def _flat(text: str) -> dict[str, str]:
+    """Return a configuration by dotted names, its values as JSON; nothing if it is damaged."""
+    try:
+        return {key: _word(value) for key, value in dotted(tomllib.loads(text))}
+    except tomllib.TOMLDecodeError:
+        return {}
+
+
+def _word(value: object) -> str:
+    return str(value) if isinstance(value, str | float) else msgspec.json.encode(value).decode()

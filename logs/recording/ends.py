@@ -1,0 +1,88 @@
+"""Ends of a flight's recording: its path, header and policy library; how the flight ended, and what is missing."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from logs.recording.disk import check_room
+from logs.recording.outputs import no_empty_folders
+from logs.recording.recorder import RecorderStatus
+from logs.recording.topics import HEADER, LIBRARY
+from uavctl.build.controller import record_of
+from uavctl.build.prepared import Prepared, cpu, versions
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
+from uavctl.config.load import dump_config
+from uavctl.outcome import lacking
+from uavctl.records import Ending, Header, PolicyLibrary, Sink
+
+
+def recording_path(out: Path | None, name: str) -> Path:
+    """Return the path of a new recording: in `out`, or in a folder of its own below `flights/`."""
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
+    folder = out if out is not None else Path("flights") / f"{stamp}-{name}"
+    return folder / "flight.mcap"
+
+
+@contextmanager
+def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
+    """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
+
+    Raises:
+        RecordingError: as `check_room` does.
+    """
+    path = recording_path(out, name)
+    with no_empty_folders([path]):
+        check_room(path, free_bytes)
+        yield path
+
+
+def put_header(
+    recorder: Sink,
+    prepared: Prepared,
+    started_ns: int,
+    zero_utc_ns: int | None = VIRTUAL_ZERO_UTC_NS,
+    command: str | None = None,
+) -> None:
+    """Begin a recording with its header and library: everything needed to decide alike in a replay.
+
+    Args:
+        started_ns: when it begins, by the flight's clock.
+        zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
+        command: what it was made by; None: the command line of this process.
+    """
+    config, design, library = prepared.config, prepared.design, prepared.library
+    header = Header(
+        started_ns=started_ns,
+        started_utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        seed=config.sim.seed,
+        command=shlex.join(["uavctl", *sys.argv[1:]]) if command is None else command,
+        config_toml=dump_config(config),
+        design_id=design.design_id,
+        design=record_of(design),
+        versions=versions(config.smpc.controller),
+        cpu=cpu(),
+        library_id=None if library is None else library.library_id,
+        zero_utc_ns=zero_utc_ns,
+        platform=platform.platform(),
+    )
+    recorder.put(HEADER, started_ns, header)
+    if library is not None:
+        record = PolicyLibrary(library_id=library.library_id, design_id=design.design_id, data=library.data)
+        recorder.put(LIBRARY, started_ns, record)
+
+
+def final(ending: Ending, status: RecorderStatus) -> Ending:
+    """Return how a flight ended, with the state of its recording."""
+    why = status.reason or status.refusal or "the disk was too slow"
+    return ending if status.ok else lacking(ending, max(lacks(status), 1), why)
+
+
+def lacks(status: RecorderStatus) -> int:
+    """Return the number of records that are not in the recording."""
+    return status.dropped + status.refused + status.gone + status.waiting

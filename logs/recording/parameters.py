@@ -1,0 +1,161 @@
+"""The vehicle's parameters, as it tells them in PARAM_VALUE: out of raw MAVLink, and as a file of QGroundControl.
+
+https://mavlink.io/en/services/parameter.html: ArduPilot casts an integer to a float, PX4 puts its bytes into one. A
+heartbeat says which of the two it is.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Mapping
+
+import msgspec
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.mavlink.framing import MessageLayout, scan, text_of
+from uavctl.records import Datagram, Record, ToldParameter
+
+_HEARTBEAT, _PARAM_VALUE = mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_PARAM_VALUE
+_LAYOUTS = {
+    _HEARTBEAT: MessageLayout(mavlink.MAVLink_heartbeat_message),
+    _PARAM_VALUE: MessageLayout(mavlink.MAVLink_param_value_message),
+}
+_V1, _V2 = 0xFE, 0xFD  # first byte of a frame
+_HEAD_BYTES = 10  # enough of one to know its length and message
+_SIGNED, _SIGNATURE_BYTES = 0x01, 13
+_PREFIX = "MAV_PARAM_TYPE_"
+_TYPES = {
+    number: entry.name.removeprefix(_PREFIX)
+    for number, entry in mavlink.enums["MAV_PARAM_TYPE"].items()
+    if not entry.name.endswith("ENUM_END")
+}
+_NUMBERS = {name: number for number, name in _TYPES.items()}
+_INTEGERS = {"UINT8": "<B", "INT8": "<b", "UINT16": "<H", "INT16": "<h", "UINT32": "<I", "INT32": "<i"}
+_MOST = 20_000  # parameters kept: a vehicle has one or two thousand
+
+
+class VehicleParameter(msgspec.Struct, frozen=True, kw_only=True):
+    """A parameter of the vehicle, by its newest PARAM_VALUE."""
+
+    value: int | float
+    type: str  # of MAV_PARAM_TYPE: REAL32, INT32 ...
+    system: int
+    component: int
+
+
+class ParameterReader:
+    """Reader of the parameters in what comes from the vehicle, datagram by datagram."""
+
+    def __init__(self) -> None:
+        self._rest: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
+        self._lost: set[str] = set()  # links on which nobody knows where the next frame begins
+        self._before: dict[str, VehicleParameter] = {}  # told before the recording began
+        self._told: dict[tuple[int, int, str], tuple[float, int]] = {}
+        self._autopilots: dict[int, int] = {}  # MAV_AUTOPILOT by system, in the order in which they were heard
+
+    def take(self, record: Record) -> None:
+        """Take raw bytes, or what was told before; any other record, and what is sent, says nothing."""
+        if isinstance(record, ToldParameter):
+            value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
+            told = VehicleParameter(value=value, type=record.type, system=record.system, component=record.component)
+            self._before[record.name] = told
+        elif isinstance(record, Datagram) and not record.outgoing:
+            self._take_bytes(record)
+
+    def _take_bytes(self, datagram: Datagram) -> None:
+        data, at = self._rest.pop(datagram.link, b"") + datagram.data, 0
+        while at < len(data):
+            begin = _next_frame(data, at)
+            if begin > at:
+                self._lost.add(datagram.link)
+            length = _length(data, begin)
+            if length is None or begin + length > len(data):
+                self._rest[datagram.link] = data[begin:]
+                return
+            end = begin + length
+            message = data[begin + 5] if data[begin] == _V1 else int.from_bytes(data[begin + 7 : begin + 10], "little")
+            # Checksums take time: where frame follows frame, only those that are read need theirs.
+            looked_at = message in _LAYOUTS or datagram.link in self._lost
+            frames = scan(data[begin:end], final=True).frames if looked_at else []
+            if frames and len(frames[0].data) == length:
+                self._read(message, frames[0].data)
+                self._lost.discard(datagram.link)
+            elif looked_at or (end < len(data) and data[end] not in (_V1, _V2)):
+                self._lost.add(datagram.link)
+                end = begin + 1
+            at = end
+
+    def _read(self, message_id: int, frame: bytes) -> None:
+        if message_id not in _LAYOUTS:
+            return
+        fields = _LAYOUTS[message_id].read(frame)
+        if message_id == _HEARTBEAT:
+            if fields.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+                self._autopilots.setdefault(fields.src_system, fields.autopilot)
+            return
+        key = fields.src_system, fields.src_component, text_of(fields.param_id)
+        if len(self._told) < _MOST or key in self._told:
+            self._told[key] = fields.param_value, fields.param_type
+
+    def parameters(self) -> dict[str, VehicleParameter]:
+        """Return the parameters by name, in order: of the first vehicle that was heard, or else told any."""
+        systems = [*self._autopilots, *(system for system, _, _ in self._told)]
+        found = {
+            name: VehicleParameter(
+                value=_value(value, kind, bytewise=self._autopilots.get(system) == mavlink.MAV_AUTOPILOT_PX4),
+                type=_TYPES.get(kind, str(kind)),
+                system=system,
+                component=component,
+            )
+            # The autopilot comes last: what else has parameters aboard (a gimbal, a radio) does not hide its own.
+            for (system, component, name), (value, kind) in sorted(self._told.items(), key=_autopilot_last)
+            if system == systems[0]
+        }
+        return dict(sorted({**self._before, **found}.items()))
+
+
+def told_records(parameters: Mapping[str, VehicleParameter], at_ns: int) -> Iterator[ToldParameter]:
+    """Return records of parameters, for a recording that begins after they were told."""
+    for name, one in parameters.items():
+        where = {"system": one.system, "component": one.component}
+        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, **where)
+
+
+def parameter_file(parameters: Mapping[str, VehicleParameter]) -> str:
+    """Return parameters as a file of QGroundControl: system, component, name, value and type, parted by tabs."""
+    head = "# Vehicle parameters, as PARAM_VALUE told them\n# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
+    return head + "".join(
+        f"{one.system}\t{one.component}\t{name}\t{one.value}\t{_NUMBERS.get(one.type, one.type)}\n"
+        for name, one in parameters.items()
+    )
+
+
+def _autopilot_last(told: tuple[tuple[int, int, str], object]) -> bool:
+    return bool(told[0][1] == mavlink.MAV_COMP_ID_AUTOPILOT1)
+
+
+def _value(value: float, kind: int, *, bytewise: bool) -> int | float:
+    """Return the value of a parameter; of a single float the shortest digits that give it back."""
+    form = _INTEGERS.get(_TYPES.get(kind, ""))
+    if form is not None and bytewise:
+        return int(struct.unpack_from(form, struct.pack("<f", value))[0])
+    if form is not None and math.isfinite(value):
+        return round(value)
+    return float(str(np.float32(value)))
+
+
+def _next_frame(data: bytes, at: int) -> int:
+    """Return where the next frame may begin, from `at` on; the end if nowhere."""
+    found = [place for marker in (_V1, _V2) if (place := data.find(marker, at)) >= 0]
+    return min(found, default=len(data))
+
+
+def _length(data: bytes, at: int) -> int | None:
+    """Return the length of the frame that begins at `at` [bytes]; None while too little of it is there."""
+    if len(data) - at < _HEAD_BYTES:
+        return None
+    if data[at] == _V1:
+        return 8 + data[at + 1]
+    return 12 + data[at + 1] + (_SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0)

@@ -1,0 +1,180 @@
+"""Page of a flight as its MAVLink tells it: a `.tlog` of any ground station, whoever flew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from logs.recording.design_view import AXIS_NUMBER, Floats
+from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap
+from logs.recording.outputs import write_whole
+from logs.recording.summary import count
+from logs.report import page
+from logs.report.figures import largest
+from logs.report.page import Mark, PageSection
+from logs.report.plots import DOTTED, RATE, SEEN, along, thin
+from logs.report.svg import Drawing, canvas, colour, dots
+
+_OWN = Mark("line", "estimate", "position of the vehicle's own")
+_SENT = Mark("dot", "sample", "position sent to it")
+_WANTED = Mark("dotted", "target", "setpoint")
+_NONE = "There are none."
+
+
+def write_tlog_page(flight: MavlinkFlight, path: Path) -> None:
+    """Write the page.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    write_whole(path, tlog_html(flight))
+
+
+def tlog_html(flight: MavlinkFlight) -> str:
+    """Return the page of a flight as HTML."""
+    info = flight.info
+    who = info.autopilot or "no autopilot"
+    return page.page(
+        f"Flight in {Path(info.recording).name}",
+        f"{info.begin_utc} · {info.duration_s:.1f} s · {who}",
+        story(info),
+        _sections(flight),
+    )
+
+
+def story(info: MavlinkFlightInfo) -> Iterator[str]:
+    """Return what the recording tells, in sentences; what is odd about it comes last."""
+    if info.vehicle_system is None:
+        yield "No autopilot's heartbeat is in it, so nobody knows what the vehicle did."
+    else:
+        told = f"by {info.own_source}" if info.own_positions else "and it told no position"
+        positions = f", {count(info.own_positions, 'position')} of its own" if info.own_positions else ","
+        yield f"System {info.vehicle_system} ({info.autopilot}){positions} {told}."
+    for sent in info.sent:
+        yield f"{sent.source}: {count(sent.positions, 'position')}, {sent.rate_hz:.1f}/s, {longest_gap(sent)}."
+    yield f"{count(info.setpoints, 'setpoint')} in local NED; {count(len(info.texts), 'text')} of the vehicle."
+    yield from (f"{note}." for note in info.notes)
+
+
+def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
+    info = flight.info
+    yield PageSection("Summary", "", page.facts(facts_of(info)))
+    marks = (*((_OWN,) if len(flight.own.t_s) else ()), *((_SENT,) if flight.sent else ()))
+    if marks:
+        yield PageSection("Path", "", page.grid(list(_paths(flight))), marks)
+        asked = np.isfinite(flight.setpoint_m).any() or np.isfinite(flight.setpoint_mps).any()
+        wanted = (_WANTED,) if asked else ()
+        note = "Time counts from the first packet. All is in local NED, height upwards."
+        yield PageSection("Axes over time", note, page.grid(list(_axes(flight))), (*marks, *wanted))
+    aged = {source: ages for source, ages in flight.ages.items() if len(ages.age_s)}
+    if aged:
+        note = (
+            "The age of the newest position grows until another one arrives. Its source's clock is not known: ages are "
+            "those beyond the quickest position of the last ten seconds."
+        )
+        drawn = [_age(flight, f"age-{number}", *one) for number, one in enumerate(aged.items())]
+        yield PageSection("Age of positions", note, page.grid(drawn))
+    if info.setpoints:
+        drawn = list(_setpoints(flight))
+        body = page.grid(drawn) if drawn else page.paragraph("They hold places and speeds alone, drawn above.")
+        yield PageSection("Acceleration setpoints", "", body)
+    modes = [(f"{one.at_s:.2f}", one.mode, "armed" if one.armed else "") for one in info.modes]
+    yield PageSection("Modes", "", _table(("from [s]", "mode", "armed"), modes))
+    texts = [(f"{one.at_s:.2f}", one.severity, one.text) for one in info.texts]
+    yield PageSection("Texts of the vehicle", "", _table(("at [s]", "severity", "text"), texts))
+    messages = [(name, str(number)) for name, number in info.messages.items()]
+    parameters = [(name, str(one.value), one.type) for name, one in info.parameters.items()]
+    folded = page.table_folded("Messages", ("message", "number"), messages, frozenset({1}))
+    if parameters:
+        columns = ("parameter", "value", "type")
+        folded += page.table_folded("Parameters of the vehicle", columns, parameters, frozenset({1}))
+    yield PageSection("What is in it", "", folded)
+
+
+def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
+    return page.table(columns, rows, frozenset({0})) if rows else page.paragraph(_NONE)
+
+
+def _paths(flight: MavlinkFlight) -> Iterator[Drawing]:
+    for key, title, shown in (
+        ("path-above", "From above", ("east", "north")),
+        ("path-side", "From the south", ("east", "down")),
+    ):
+        pick = [AXIS_NUMBER[axis] for axis in shown]
+        signs = np.array([SEEN[axis][1] for axis in shown])
+        names = [SEEN[axis][0] for axis in shown]
+        with canvas(key, 3.7) as one:
+            ax = one.axes(title, f"{names[0]} [m]", f"{names[1]} [m]")
+            for track in flight.sent.values():
+                points = along(track.position_m)[:, pick] * signs
+                dots(ax, points[:, 0], points[:, 1], "sample", 2.4)
+            points = along(flight.own.position_m)[:, pick] * signs
+            ax.plot(*points.T, color=colour("estimate"), lw=1.4, zorder=3)
+            ax.plot(*points[:1].T, "o", ms=6, mfc=colour("card"), mec=colour("estimate"), mew=1.5, zorder=4)
+            ax.set_aspect("equal", adjustable="datalim")
+            ax.margins(0.06)
+        yield Drawing(key, one.svg, f"Path seen {title[0].lower()}{title[1:]}: {names[0]} and {names[1]} in metres")
+
+
+def _axes(flight: MavlinkFlight) -> Iterator[Drawing]:
+    for axis, number in AXIS_NUMBER.items():
+        name, sign = SEEN[axis]
+        sent = [(track.t_s, track.position_m) for track in flight.sent.values()]
+        yield _over_time(
+            flight, f"position-{axis}", name.capitalize(), f"{name} [m]",
+            [(t_s, sign * values[:, number]) for t_s, values in sent],
+            (flight.own.t_s, sign * flight.own.position_m[:, number]),
+            sign * flight.setpoint_m[:, number],
+        )  # fmt: skip
+        speed = sign * flight.own.velocity_mps[:, number]
+        if np.isfinite(speed).any():
+            yield _over_time(
+                flight, f"velocity-{axis}", RATE[axis].capitalize(), f"{RATE[axis]} [m/s]", [],
+                (flight.own.t_s, speed), sign * flight.setpoint_mps[:, number],
+            )  # fmt: skip
+
+
+def _over_time(
+    flight: MavlinkFlight,
+    key: str,
+    title: str,
+    y_label: str,
+    sent: Sequence[tuple[Floats, Floats]],
+    own: tuple[Floats, Floats],
+    wanted: Floats,
+) -> Drawing:
+    with canvas(key, 2.3) as one:
+        ax = one.axes(title, "time [s]", y_label)
+        for t_s, values in sent:
+            dots(ax, *thin(t_s, values), "sample", 2.0)
+        ax.plot(*thin(*own), color=colour("estimate"), lw=1.4, zorder=3)
+        ax.plot(*thin(flight.setpoint_t_s, wanted), color=colour("target"), lw=1.1, ls=DOTTED, zorder=4)
+        ax.set_xlim(0, max(flight.duration_s, 1e-3))
+    return Drawing(key, one.svg, f"{title} over time")
+
+
+def _age(flight: MavlinkFlight, key: str, source: str, ages: Ages) -> Drawing:
+    with canvas(key, 2.3) as one:
+        ax = one.axes(source, "time [s]", "age [s]")
+        t_s, age_s = largest(ages.age_t_s, ages.age_s)
+        ax.plot(t_s, age_s, color=colour("estimate"), lw=1.1)
+        dots(ax, *largest(ages.t_s[np.isfinite(ages.delay_s)], ages.delay_s[np.isfinite(ages.delay_s)]), "sample", 2.0)
+        ax.set_xlim(0, max(flight.duration_s, 1e-3))
+        ax.set_ylim(bottom=0)
+    return Drawing(key, one.svg, f"Age of the positions of {source} over time")
+
+
+def _setpoints(flight: MavlinkFlight) -> Iterator[Drawing]:
+    for axis, number in AXIS_NUMBER.items():
+        name, sign = SEEN[axis]
+        values = sign * flight.setpoint_mps2[:, number]
+        if not np.isfinite(values).any():
+            continue
+        key, upwards = f"setpoint-{axis}", "upwards" if axis == "down" else name
+        with canvas(key, 2.3) as one:
+            ax = one.axes(f"Acceleration {upwards}", "time [s]", f"acceleration {upwards} [m/s²]")
+            ax.step(*thin(flight.setpoint_t_s, values), where="post", color=colour("estimate"), lw=1.1)
+            ax.set_xlim(0, max(flight.duration_s, 1e-3))
+        yield Drawing(key, one.svg, f"Acceleration setpoint {upwards} over time")

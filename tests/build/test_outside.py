@@ -1,0 +1,132 @@
+"""Controllers of other packages: found by name, refused with the reason, and known again by their code."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+from baseline_rig import problem
+
+import uavctl.build.outside as outside
+from uavctl.build.controller import build_controller, build_problem, design_of
+from uavctl.config import load_config
+from uavctl.errors import DesignError
+from uavctl.lab.campaign import plugins
+from uavctl.records import SolveStatus
+
+MODULE = """
+import numpy as np
+
+class Still:
+    def __init__(self, problem):
+        self.problem = problem
+    def begin(self, runs):
+        pass
+    def act(self, news):
+        return np.zeros((1, 3))
+
+class Resting:
+    def __init__(self, problem):
+        pass
+    def plan(self, request):
+        return request.inputs
+
+class Broken(Still):
+    def __init__(self, problem):
+        raise ZeroDivisionError("no gain")
+
+class Half:
+    def begin(self, runs):
+        pass
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module in the working directory, under a name that no other test has imported."""
+    name = f"still_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return name
+
+
+def test_a_class_of_the_working_directory_is_found(module: str) -> None:
+    plugins.check_kind(f"{module}:Still")
+    assert type(plugins.make_controller(f"{module}:Still", problem("paper"))).__name__ == "Still"
+
+
+def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("still", f"{module}:Still", outside.GROUP)
+    monkeypatch.setattr(outside, "entry_points", lambda group: (point,) if group == outside.GROUP else ())
+    assert outside.installed() == ("still",)
+    plugins.check_kind("still")
+    with pytest.raises(DesignError, match='nearest valid name "still"'):
+        plugins.check_kind("stil")
+    assert build_controller(load_config("room", ["smpc.controller=still"])).outside == "still"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("Nothing", "AttributeError"), ("Half", "no act"), ("Resting", "no begin"), ("Broken", "no gain")],
+)
+def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
+    with pytest.raises(DesignError, match=told) as found:
+        plugins.make_controller(f"{module}:{name}", problem("paper"))
+    assert found.value.key == "kind"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
+)
+def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
+    config = load_config("room", [f"smpc.controller={module}:{name}"])
+    with pytest.raises(DesignError, match=told) as found:
+        outside.flown_outside(config, build_problem(config))
+    assert found.value.key == "smpc.controller"
+
+
+def test_a_module_that_is_not_there(module: str) -> None:
+    with pytest.raises(DesignError, match="ModuleNotFoundError"):
+        plugins.check_kind(f"{module}_not:Still")
+
+
+def test_only_what_plans_is_told_a_trajectory(module: str) -> None:
+    motion = "mission.trajectory={times_s=[0.0, 9.0], positions_m=[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]}"
+    with pytest.raises(DesignError, match="told no trajectory"):
+        build_controller(load_config("room", [motion, f"smpc.controller={module}:Still"]))
+    assert build_controller(load_config("room", [motion, f"smpc.controller={module}:Resting"])).mission.trajectory
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"), [("Still", "room"), ("Resting", "room"), ("Resting", "room-hahn-stursberg")]
+)
+def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module: str, name: str, preset: str) -> None:
+    config = load_config(preset, [f"smpc.controller={module}:{name}"])
+    design = design_of(config)
+    controller = build_controller(config, design)
+    target = design.target
+    answer = controller.solver.solve(0, target, target)
+    assert answer.status is SolveStatus.OPTIMAL and answer.method == f"{module}:{name}"
+    np.testing.assert_allclose(answer.states, np.tile(target, (design.horizon + 1, 1)), atol=1e-12)
+    assert controller.late_steps == design.horizon and controller.design_id == design.design_id
+    assert not config.uses_library
+
+
+def test_its_identity_changes_with_its_code_and_with_nothing_else(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = outside.controller_id(f"{module}:Resting")
+    assert first.startswith(f"{module}:Resting ") and first == outside.controller_id(f"{module}:Resting")
+    (tmp_path / f"{module}.py").write_text(MODULE + "\n")
+    assert outside.controller_id(f"{module}:Resting") != first
+    package = tmp_path / f"{module}_package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "inner.py").write_text(MODULE)
+    before = outside.controller_id(f"{package.name}.inner:Resting")
+    (package / "__init__.py").write_text("# another file of the package\n")
+    assert outside.controller_id(f"{package.name}.inner:Resting") != before

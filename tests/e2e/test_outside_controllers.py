@@ -1,0 +1,144 @@
+"""Flights by controllers of other packages, judged on the true vehicle: they reach the target, or stay in the room."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+from soak_pairs import SPEED_MPS, WORLDS, beyond_m
+from soak_rig import Watch, fly
+
+from sim.simulation import World
+from uavctl.build.controller import design_of
+from uavctl.build.prepared import Prepared
+from uavctl.cli.app import run
+from uavctl.cli.prepare import prepare
+from uavctl.config import Config, load_config
+from uavctl.outcome import Cause
+from uavctl.records import ControlMode, Ending
+
+MODULE = "outside_controllers"
+FAILING = ("Raises", "RaisesSoon", "NotFinite", "WrongShape")
+WAY_S = 14.0
+
+
+@pytest.fixture(scope="module")
+def ready() -> Callable[[str], Prepared]:
+    """Makes preset `room` with a controller of the module; the design is made once."""
+    design = design_of(load_config("room"))
+
+    def make(name: str) -> Prepared:
+        return prepare(load_config("room", [f"smpc.controller={MODULE}:{name}"]), design)
+
+    return make
+
+
+@dataclass
+class Seen:
+    """The true vehicle in a flight."""
+
+    outside_m: float = -math.inf
+    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    speed_mps: float = 0.0
+    ending: Ending | None = None
+    modes: set[ControlMode] = field(default_factory=set)
+    wrong: tuple[str, ...] = ()
+
+
+def flown(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path: Path | None = None) -> Seen:
+    """Fly from the air, until it has landed if it has to; `took_ns`: time of plans after two seconds."""
+    config = in_world(prepared.config, plant, autopilot)
+    seen = Seen()
+
+    def look(world: World, watch: Watch, at_ns: int) -> None:
+        seen.place_m = world.peers.vehicle.position_m
+        seen.outside_m = max(seen.outside_m, beyond_m(config, seen.place_m))
+        seen.speed_mps = max(seen.speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
+        assert watch.ticked is not None
+        seen.modes.add(watch.ticked.decision.mode)
+        seen.ending = watch.loop.ending
+        if took_ns and at_ns > 2_000_000_000 and watch.ticked.decision.solve is not None:
+            watch.loop.answered(took_ns)
+
+    seen.wrong = tuple(fly(prepared, config, look, path=path, lands=True).wrong)
+    return seen
+
+
+def in_world(config: Config, plant: str, autopilot: str) -> Config:
+    return replace(config, duration_s=WAY_S, sim=replace(config.sim, plant=plant, autopilot=autopilot, seed=3))
+
+
+def assert_let_go(seen: Seen, words: str) -> None:
+    """It never left the room, was never fast, and the end says why."""
+    assert seen.wrong == () and seen.outside_m <= 0.0 and seen.speed_mps <= SPEED_MPS
+    assert seen.ending is not None and seen.ending.exit_code == 1 and not seen.ending.as_ordered
+    assert seen.ending.cause == Cause.FALLBACK and words in seen.ending.sentence
+    assert ControlMode.BRAKE in seen.modes
+
+
+def replays(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
+    capsys.readouterr()
+    run(["log", "replay", str(path), "--json"])
+    return bool(json.loads(capsys.readouterr().out)["identical"])
+
+
+def test_one_that_fails_brakes_within_the_room_and_replays(
+    ready: Callable[[str], Prepared], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "flight.mcap"
+    assert_let_go(flown(ready("NotFinite"), "linear", "px4", path=path), "not finite")
+    assert replays(path, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant: str, autopilot: str) -> None:
+    prepared = ready("Regulates")
+    seen = flown(prepared, plant, autopilot)
+    assert seen.wrong == () and seen.outside_m <= 0.0 and seen.modes <= {ControlMode.WAIT, ControlMode.TRACK}
+    assert math.dist(seen.place_m, prepared.config.target.position_m) < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+@pytest.mark.parametrize("name", FAILING)
+def test_one_that_fails_never_leaves_the_room(
+    ready: Callable[[str], Prepared], name: str, plant: str, autopilot: str
+) -> None:
+    words = {"NotFinite": "not finite", "WrongShape": "shape"}.get(name, "raised ZeroDivisionError: no gain")
+    assert_let_go(flown(ready(name), plant, autopilot), words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+@pytest.mark.parametrize("took_ns", [60_000_000, 700_000_000])
+def test_one_that_is_late_never_leaves_the_room_and_replays(
+    ready: Callable[[str], Prepared],
+    took_ns: int,
+    plant: str,
+    autopilot: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "flight.mcap"
+    assert_let_go(flown(ready("Regulates"), plant, autopilot, took_ns, path), "too late")
+    assert replays(path, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
+    ready: Callable[[str], Prepared], plant: str, autopilot: str
+) -> None:
+    seen = flown(ready("Beyond"), plant, autopilot)
+    assert seen.wrong == () and seen.outside_m <= 0.3 and seen.speed_mps <= SPEED_MPS
+    # The envelope may have its say while it brakes.
+    assert (
+        seen.ending is not None and seen.ending.cause in (Cause.FALLBACK, Cause.LET_GO) and seen.ending.exit_code == 1
+    )
+    assert ControlMode.BRAKE in seen.modes and ControlMode.HOLD in seen.modes

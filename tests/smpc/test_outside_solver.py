@@ -1,0 +1,145 @@
+"""A controller of another package as a solver: what it is told, what of its answer flies, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from baseline_rig import problem
+from numpy.typing import NDArray
+
+from uavctl.records import SolveStatus
+from uavctl.smpc.answer import Path, Preview
+from uavctl.smpc.batch import News
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.outside import OutsideSolver, PlanRequest, Rehearsal, moved
+
+Array = NDArray[np.float64]
+
+
+class Saying:
+    """Answers as it is told to, and keeps what it was asked."""
+
+    def __init__(self, say: Callable[[PlanRequest], Any]) -> None:
+        self.say, self.asked = say, list[PlanRequest]()
+
+    def plan(self, request: PlanRequest) -> Any:
+        self.asked.append(request)
+        return self.say(request)
+
+
+@pytest.fixture(scope="module")
+def paper() -> ControlProblem:
+    return problem("paper")
+
+
+def here(paper: ControlProblem) -> Array:
+    return paper.target + np.linspace(0.5, 1.0, paper.plant.n_x)
+
+
+def test_it_is_told_all_that_a_scheme_is_and_can_change_nothing_of_it(paper: ControlProblem) -> None:
+    saying = Saying(lambda request: request.inputs)
+    solver, n_x, n_u, steps = OutsideSolver("ours", paper, saying), paper.plant.n_x, paper.plant.n_u, paper.horizon
+    rng = np.random.default_rng(1)
+    path = Path(states=rng.normal(size=(steps, n_x)), inputs=0.1 * rng.normal(size=(steps, n_u)))
+    limits = rng.normal(size=(steps + 1, paper.state_set.b.size))
+    cov, sent, x = np.eye(n_x), rng.normal(size=n_u), here(paper)
+    answer = solver.solve(7, x, paper.target, Preview(limits=limits, path=path, late=3, cov=cov, sent=sent))
+    (told,) = saying.asked
+    assert (told.step, told.age) == (7, 3)
+    np.testing.assert_array_equal(told.state, x)
+    np.testing.assert_array_equal(told.states, paper.target + path.states)
+    np.testing.assert_allclose(told.inputs, paper.u_target + path.inputs, atol=1e-12)
+    for given, want in ((told.limits, limits), (told.cov, cov), (told.sent, sent), (told.target, paper.target)):
+        assert given is not None
+        np.testing.assert_array_equal(given, want)
+        with pytest.raises(ValueError, match="read-only"):
+            given[0] = 1.0
+    np.testing.assert_allclose(answer.inputs, told.inputs, atol=1e-12)
+
+
+def test_its_plan_is_cut_to_the_limits_and_predicted_by_the_plant(paper: ControlProblem) -> None:
+    low, high = paper.input_set.bounds
+    wanted = np.linspace(3.0 * low, 2.0 * high, paper.horizon)
+    x = here(paper)
+    answer = OutsideSolver("ours", paper, Saying(lambda _: wanted)).solve(1, x, paper.target)
+    assert answer.status is SolveStatus.OPTIMAL and answer.seq == 1 and answer.method == "ours"
+    np.testing.assert_array_equal(answer.inputs, np.clip(wanted, low, high))
+    for now, u, after in zip(answer.states, answer.inputs, answer.states[1:], strict=False):
+        np.testing.assert_allclose(after, paper.plant.a @ now + paper.plant.b @ u, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(answer.states[0], x)
+
+
+def test_behind_one_input_the_regulator_of_the_costs_plays_on(paper: ControlProblem) -> None:
+    x, first = here(paper), 0.3 * paper.input_set.bounds[1]
+    answer = OutsideSolver("ours", paper, Saying(lambda _: first)).solve(1, x, paper.target)
+    np.testing.assert_array_equal(answer.inputs[0], first)
+    gain = lqr(paper.plant, paper.q_x, paper.q_u).k
+    wanted = paper.u_target + (answer.states[1:-1] - paper.target) @ gain.T
+    np.testing.assert_allclose(answer.inputs[1:], np.clip(wanted, *paper.input_set.bounds), atol=1e-9)
+
+
+def fail(_: PlanRequest) -> None:
+    raise KeyError("gain" * 200)
+
+
+class Worse:
+    def __array__(self, *_: object, **__: object) -> Array:
+        raise OSError("none")
+
+
+@pytest.mark.parametrize(
+    ("say", "told"),
+    [
+        (fail, "raised KeyError"),
+        (lambda r: r.inputs * np.nan, "not finite"),
+        (lambda r: np.full_like(r.inputs, np.inf), "not finite"),
+        (lambda r: r.inputs[:-1], "shape"),
+        (lambda r: r.inputs[0, :1], "shape"),
+        (lambda r: 0.0, "shape"),
+        (lambda r: None, "not finite|no array of numbers|shape"),
+        (lambda r: "left", "no array of numbers"),
+        (lambda r: [[1.0], [1.0, 2.0]], "no array of numbers"),
+        (lambda r: Worse(), "no array of numbers"),
+    ],
+)
+def test_what_cannot_be_flown_is_a_fault_that_names_it(
+    paper: ControlProblem, say: Callable[[PlanRequest], Any], told: str
+) -> None:
+    answer = OutsideSolver("ours", paper, Saying(say)).solve(1, here(paper), paper.target)
+    assert answer.status is SolveStatus.FAILED and answer.inputs.size == 0
+    assert answer.fault.startswith("the controller ours ") and len(answer.fault) < 300
+    assert any(words in answer.fault for words in told.split("|"))
+
+
+def test_where_it_raised_is_told(paper: ControlProblem) -> None:
+    answer = OutsideSolver("ours", paper, Saying(fail)).solve(1, here(paper), paper.target)
+    line = fail.__code__.co_firstlineno + 1
+    assert answer.fault.endswith(f"(test_outside_solver.py, line {line})")
+
+
+class Shrinking:
+    """A campaign's controller with a gain that falls from step to step."""
+
+    def __init__(self, problem: ControlProblem) -> None:
+        self.problem, self.k = problem, lqr(problem.plant, problem.q_x, problem.q_u).k
+
+    def begin(self, runs: int) -> None:
+        self.gain = np.ones(runs)
+
+    def act(self, news: News) -> Array:
+        self.gain *= 0.5
+        return self.gain[:, None] * np.ones((1, self.problem.plant.n_u))
+
+
+def test_a_campaign_s_controller_is_asked_for_each_step_of_silence_and_forgets_that(paper: ControlProblem) -> None:
+    solver = OutsideSolver("ours", paper, Rehearsal(lambda target: (moved(paper, target), Shrinking(paper))))
+    halves = 0.5 ** np.arange(1, paper.horizon + 2)
+    for seq in range(2):  # asked twice: the first input of each plan is what it has really done
+        answer = solver.solve(seq, here(paper), paper.target)
+        np.testing.assert_allclose(answer.inputs[:, 0], halves[seq : seq + paper.horizon])
+    other = solver.solve(2, here(paper), paper.plant.equilibrium((1.0, 1.0, 0.0)))  # another target: it begins anew
+    np.testing.assert_allclose(other.inputs[0, 0], 0.5)

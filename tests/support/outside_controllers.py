@@ -1,0 +1,80 @@
+"""Controllers as another package would have them: one that is good, and some that fail while they fly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.outside import PlanRequest
+
+Array = NDArray[np.float64]
+
+
+class Regulates:
+    """The regulator of `[cost]`, one input at a time."""
+
+    fails_at = 10**9  # step
+
+    def __init__(self, problem: ControlProblem) -> None:
+        self.k = lqr(problem.plant, problem.q_x, problem.q_u).k
+
+    def plan(self, request: PlanRequest) -> Any:
+        """See `FlightPlanner`."""
+        good: Array = request.inputs[0] + self.k @ (request.state - request.states[0])
+        return good if request.step < self.fails_at else self.fail(request)
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Answer otherwise."""
+        raise NotImplementedError
+
+
+class RaisesSoon(Regulates):
+    """Raises while it is on its way at full speed."""
+
+    fails_at = 35
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Raise."""
+        raise ZeroDivisionError("no gain")
+
+
+class Raises(RaisesSoon):
+    """Raises at step 100."""
+
+    fails_at = 100
+
+
+class NotFinite(Regulates):
+    """Answers with one NaN."""
+
+    fails_at = 40
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Answer so."""
+        inputs = np.array(request.inputs)
+        inputs[-1, -1] = np.nan
+        return inputs
+
+
+class WrongShape(Regulates):
+    """Answers with a step too few."""
+
+    fails_at = 30
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Answer so."""
+        return request.inputs[1:]
+
+
+class Beyond(Regulates):
+    """Asks for far more than can be."""
+
+    fails_at = 100
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Answer so."""
+        return np.tile([1e9, -1e9, 0.0], (len(request.inputs), 1))

@@ -1,0 +1,6 @@
+# nbclient 0.11: the part that is used here.
+from typing import Any
+
+class NotebookClient:
+    def __init__(self, nb: Any, *, timeout: int, resources: Any) -> None: ...
+    def execute(self) -> Any: ...

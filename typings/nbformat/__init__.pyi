@@ -1,0 +1,6 @@
+# nbformat 5: the part that is used here.
+from pathlib import Path
+from typing import Any
+
+def read(fp: Path, as_version: int) -> Any: ...
+def validate(nbdict: Any) -> None: ...

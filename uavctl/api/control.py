@@ -1,0 +1,233 @@
+"""Configurations, models, decisions, and a controller that is stepped by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.faults import check_faults
+from uavctl.build.controller import build_plant, build_problem, build_solver, design_of
+from uavctl.build.link import build_ages
+from uavctl.build.prepared import ready_library
+from uavctl.config import Config, dump_config, parse
+from uavctl.config import load as load_file
+from uavctl.config.load import override_texts
+from uavctl.config.mission import MissionConfig
+from uavctl.errors import ConfigError, ExtraMissingError, UavctlError, UsageError
+from uavctl.smpc.answer import Answer, Solver
+from uavctl.smpc.batch import BatchController, News
+from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.link import AgeModel
+from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.plant import Plant
+
+if TYPE_CHECKING:
+    from uavctl.lab.campaign.controllers import Recipe, Setting
+
+Array = NDArray[np.float64]
+Source = Config | str | Path
+
+
+def load(source: Source = "room", overrides: Mapping[str, object] | None = None, /, **keys: object) -> Config:
+    """Load a configuration: a preset's name, a TOML file, or one that is there, with some keys given anew.
+
+    Args:
+        source: What it is made from.
+        overrides: Values by dotted key, as in `{"link.loss": 0.3}`.
+        keys: Values of keys at the top, and tables of them, as in `duration_s=10, link={"loss": 0.3}`.
+
+    Raises:
+        ConfigError: With all problems found, one a line.
+    """
+    given = tuple(override_texts({**(overrides or {}), **keys}))
+    if isinstance(source, Config):
+        loaded = parse(dump_config(source), source.name, given)
+    else:
+        loaded = load_file(str(source), given)
+    check_faults(loaded)
+    return loaded.config
+
+
+def loaded(source: Source) -> Config:
+    """Return a configuration, loaded if a name or a file is given."""
+    return source if isinstance(source, Config) else load(source)
+
+
+def plant(config: Source) -> Plant:
+    """Return the plant x(k+1) = A x(k) + B u(k) + E w(k) of a configuration.
+
+    Raises:
+        ConfigError: The configuration is wrong.
+        DesignError: It is no plant.
+    """
+    return build_plant(loaded(config))
+
+
+def link(config: Source) -> AgeModel:
+    """Return the model of the link: `outage(j)` is the probability that the age is at least j steps.
+
+    Raises:
+        ConfigError: The configuration is wrong.
+        DesignError: No position can be counted on.
+    """
+    return build_ages(loaded(config))
+
+
+def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> Answer:
+    """Solve one decision problem: the plan from a state to the configured target.
+
+    The solver of a configuration is kept for the next call.
+
+    Args:
+        config: What is flown, and with which scheme.
+        state: State now (n_x,), axis by axis.
+        target: Equilibrium to go to (n_x,); None: the configured one.
+
+    Raises:
+        ConfigError: The configuration is wrong.
+        DesignError: There is no design.
+        UsageError: The state is none of this plant.
+    """
+    design, solver = _solver(loaded(config))
+    n_x = design.plant.n_x
+    wanted = design.target if target is None else state_of(target, n_x)
+    return solver.solve(0, state_of(state, n_x), wanted)
+
+
+@lru_cache(maxsize=8)
+def _solver(config: Config) -> tuple[AnyDesign, Solver]:
+    design = design_of(config)
+    stored = ready_library(config, design)
+    return design, build_solver(design, config, None if stored is None else stored.library)
+
+
+def state_of(given: ArrayLike, n_x: int) -> Array:
+    """Return a state (n_x,) that a person gave.
+
+    Raises:
+        UsageError: It is not n_x finite numbers.
+    """
+    try:
+        state = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        state = np.empty(0)
+    if state.shape != (n_x,) or not np.isfinite(state).all():
+        raise UsageError(f"{given!r} is not a state of this plant; give {n_x} finite numbers")
+    return state
+
+
+class SteppedController:
+    """A controller of one run that is asked step by step; implements nothing but what a loop of your own needs.
+
+    Args:
+        controller: The controller.
+        problem: What it is made for; its input limits are the actuators'.
+    """
+
+    def __init__(self, controller: BatchController, problem: ControlProblem) -> None:
+        self._controller, self.problem = controller, problem
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new run."""
+        self._controller.begin(1)
+        self._newest, self._state = -1, np.empty(0)
+        self._inputs: list[Array] = []
+
+    def step(self, state: ArrayLike | None, age_steps: int = 0) -> Array:
+        """Return the input (n_u,) that acts in the next step, within the actuators' limits.
+
+        Args:
+            state: State (n_x,) that a packet tells; None where none has come.
+            age_steps: How many steps ago it was captured; older ones than are known change nothing.
+
+        Raises:
+            UsageError: The first state is missing, it is none of this plant, or older than the run.
+            UavctlError: The controller asked for numbers that are not finite.
+        """
+        step, plant = len(self._inputs), self.problem.plant
+        if not 0 <= age_steps <= step:
+            raise UsageError(f"a packet of step {step} cannot be {age_steps} steps old; give 0 to {step}")
+        if state is not None:
+            told = state_of(state, plant.n_x)
+            if step - age_steps > self._newest:
+                self._newest, self._state = step - age_steps, told
+        elif not step:
+            raise UsageError("the first step needs a state: a controller has to know where it begins")
+        acted = np.array(self._inputs).reshape(1, step, plant.n_u)
+        news = News(step, np.array([self._newest]), self._state[np.newaxis], acted)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
+            asked = self._controller.act(news)[0]
+        if not np.isfinite(asked).all():
+            raise UavctlError(f"the controller asks for {asked} in step {step}; is the state far beyond the limits?")
+        self._inputs.append(np.clip(asked, *self.problem.input_set.bounds))
+        return self._inputs[-1].copy()
+
+
+def controller(config: Source, kind: str = "smpc") -> SteppedController:
+    """Return a controller to be stepped in a loop of your own, told states that may be lost.
+
+    Args:
+        config: What it is made for.
+        kind: `smpc`, a baseline of campaigns (`lqg`, `mean-qp` …), an entry point, or `module:Class`.
+
+    Raises:
+        ConfigError: The configuration is wrong, or not one of campaigns.
+        DesignError: There is no such controller.
+    """
+    from uavctl.lab.campaign.controllers import build
+
+    found = loaded(config)
+    recipe, _ = cell_of(found, kind)
+    return SteppedController(build(recipe), build_problem(found))
+
+
+def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, Setting]:
+    """Return the one cell of a campaign: the recipe of a controller, and what its runs meet.
+
+    Args:
+        config: What is flown, and believed.
+        kind: Kind of the controller.
+        spec: Further keys of the campaign, as docs/campaign-keys.md has them.
+
+    Raises:
+        ConfigError: The configuration is none that campaigns fly.
+        UsageError: A key of the campaign is wrong.
+        DesignError: There is no such controller.
+    """
+    from uavctl.lab.campaign.controllers import Setting, recipe_for
+    from uavctl.lab.campaign.spec import CampaignSpec, compose, flown
+
+    given = {"name": "python", "config": config.name, "controller": [{"name": kind, "kind": kind}], **spec}
+    try:
+        campaign = msgspec.convert(given, CampaignSpec)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{error}; docs/campaign-keys.md says what is possible") from error
+    wrong = tuple(f"{one.key}: {one.reason}; load it with {one.todo}" for one in flown(config, (), "config"))
+    if wrong:
+        raise ConfigError(wrong)
+    base = msgspec.structs.replace(config, mission=MissionConfig(), fence=())  # runs go to the target alone
+    made = compose(campaign, dump_config(base))
+    believed = made.believed_link(0, 0)
+    recipe = recipe_for(made.tuned(0, believed), made.believed[0, believed], campaign, ready_library)
+    setting = Setting(campaign, made.base, made.flown_plant[0].plant, made.flown_link[0].link, campaign.disturbance[0])
+    return recipe, setting
+
+
+def need(package: str, extra: str) -> None:
+    """See that an optional package is there.
+
+    Raises:
+        ExtraMissingError: It is not; names the extra to install.
+    """
+    try:
+        import_module(package)
+    except ImportError as missing:
+        raise ExtraMissingError(package, extra) from missing

@@ -1,0 +1,189 @@
+"""Simulated flights, and recordings as tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from logs.recording.ends import final, new_recording
+from logs.recording.export import read_table, table_names
+from logs.recording.flight import FlightData
+from logs.recording.outputs import spare_recording
+from logs.recording.reader import header, lacks_end, records
+from logs.recording.reader import read as read_records
+from logs.recording.summary import FlightSummary, summarise
+from uavctl.api.control import Array, Source, load, loaded, need
+from uavctl.build.controller import design_of
+from uavctl.build.prepared import prepare, ready_library
+from uavctl.config import Config, parse
+from uavctl.errors import RecordingError
+from uavctl.lab.lockstep import LockstepFlight, check_length
+from uavctl.records import Ending, Truth
+
+if TYPE_CHECKING:
+    import pandas
+    import polars
+    import pyarrow
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording whose topics can be had as tables; they are read from the disk when they are asked for.
+
+    Every table has `log_time_ns`, `time_s` (since the first record) and, since version 0.2, `utc`; then the record's
+    own fields, with their units in their names.
+    """
+
+    path: Path  # its first file
+    topics: tuple[str, ...]  # those it holds, and lists of records within them, as `/uavctl/step_input.samples`
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration that was flown.
+
+        Raises:
+            RecordingError: The recording has no header.
+        """
+        return parse(header(self.path).config_toml, f"{self.path} (configuration)").config
+
+    @cached_property
+    def data(self) -> FlightData:
+        """All records of the flight, by type."""
+        return FlightData.from_records(read_records(self.path), self.path)
+
+    @cached_property
+    def summary(self) -> FlightSummary:
+        """Figures of the flight, as `uavctl log report --json` has them."""
+        dropped = max((note.dropped for note in self.data.notes), default=0)
+        return summarise(self.data, wall_s=None, recording=str(self.path), report="", recorder_dropped=dropped)
+
+    def arrow(self, topic: str) -> pyarrow.Table:
+        """Return a topic as an Arrow table.
+
+        Raises:
+            RecordingError: There is no such topic in it.
+            ExtraMissingError: pyarrow is not there.
+        """
+        need("pyarrow", "parquet")
+        return read_table(self.path, topic)
+
+    def pandas(self, topic: str) -> pandas.DataFrame:
+        """Return a topic as a pandas frame; whole numbers stay whole where some are missing (`Int64`).
+
+        Raises:
+            RecordingError: There is no such topic in it.
+            ExtraMissingError: pandas or pyarrow is not there.
+        """
+        need("pandas", "pandas")
+        import pandas as pd
+
+        table = self.arrow(topic)
+        kinds = {"int64": pd.Int64Dtype(), "bool": pd.BooleanDtype()}
+        frame: pandas.DataFrame = table.to_pandas(types_mapper=lambda kind: kinds.get(str(kind)))
+        return frame
+
+    def polars(self, topic: str) -> polars.DataFrame:
+        """Return a topic as a polars frame.
+
+        Raises:
+            RecordingError: There is no such topic in it.
+            ExtraMissingError: polars or pyarrow is not there.
+        """
+        need("polars", "polars")
+        import polars as pl
+
+        return pl.from_arrow(self.arrow(topic))
+
+    def report(self, out: str | Path | None = None) -> Path:
+        """Write the page of the flight, and return its path.
+
+        Args:
+            out: The page; None: beside the recording.
+
+        Raises:
+            RecordingError: Nothing was flown, or the page cannot be written.
+        """
+        from logs.report.flight_page import write_report
+
+        page = self.path.with_suffix(".html") if out is None else Path(out)
+        spare_recording(page)
+        write_report(self.data, msgspec.structs.replace(self.summary, report=str(page)), page)
+        return page
+
+
+def read(path: str | Path, *, torn: bool = False) -> Recording:
+    """Open a recording.
+
+    Args:
+        path: Its first file.
+        torn: Whether one without an end may be read, as far as it goes.
+
+    Raises:
+        RecordingError: There is none, it is damaged, or it has no end and `torn` is not set.
+    """
+    path = Path(path)
+    cut = lacks_end(path)
+    if cut and not torn:
+        raise RecordingError(
+            f"{path}: {cut}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
+        )
+    return Recording(path, table_names(path))
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A simulated flight: how it ended, its recording, and where the vehicle truly was."""
+
+    config: Config  # what was flown
+    ending: Ending  # cause, sentence, whether as ordered, exit code
+    recording: Recording
+    time_s: Array  # (n,), of the true path: every Δt
+    position_m: Array  # true position (n, 3), local NED
+    velocity_mps: Array  # true velocity (n, 3), local NED
+
+
+def fly(
+    config: Source = "room", out: str | Path | None = None, *, seed: int | None = None, duration_s: float | None = None
+) -> Flight:
+    """Fly the simulated vehicle in virtual time, as `uavctl loopback` does; the same seed gives the same flight.
+
+    Args:
+        config: What is flown.
+        out: Folder of the recording; None: a new one below `flights/`.
+        seed: Seed of every random draw; None: `sim.seed`.
+        duration_s: Length [s]; None: that of the configuration.
+
+    Raises:
+        ConfigError: The configuration is wrong.
+        DesignError: There is no design.
+        RecordingError: The recording cannot be written, or is there already.
+        UsageError: The flight is shorter than a tick.
+    """
+    given = {"sim.seed": seed, "duration_s": duration_s}
+    found = load(loaded(config), {key: value for key, value in given.items() if value is not None})
+    check_length(found)
+    design = design_of(found)
+    prepared = prepare(found, design, ready_library(found, design))
+    with new_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
+        flight = LockstepFlight(prepared, path, command="uavctl.fly")
+        try:
+            flight.fly(lambda _: True)
+        except Exception as error:
+            flight.loop.course.died = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            status = flight.close()
+    truth = tuple(records(path, Truth))
+    return Flight(
+        config=found,
+        ending=final(flight.loop.ending, status),
+        recording=read(path, torn=True),
+        time_s=np.array([one.at_ns for one in truth]) * 1e-9,
+        position_m=np.array([one.position_m for one in truth]).reshape(-1, 3),
+        velocity_mps=np.array([one.velocity_mps for one in truth]).reshape(-1, 3),
+    )
