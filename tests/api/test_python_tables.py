@@ -67,7 +67,7 @@ def agree(rows: list[dict[str, Any]], told: list[tuple[float, bytes]]) -> int:
             else:  # an empty list, or null where others have a record
                 assert cell in (None, 0), name
         spare = {name for name, cell in row.items() if cell is not None} - {one.removeprefix(".") for one in want}
-        assert all(name in ("log_time_ns", "time_s") or row[name] == 0 for name in spare), spare
+        assert all(name in ("log_time_ns", "time_s", "utc") or row[name] == 0 for name in spare), spare
     return compared
 
 
@@ -79,7 +79,12 @@ def test_tables_hold_what_mcap_reads(flown: Recording, topic: str) -> None:
     told = messages(flown.path, topic)
     rows = flown.arrow(topic).to_pylist()
     assert agree(rows, told) > 4 * len(told)
-    assert flown.polars(topic).to_dicts() == rows
+    assert undated(flown.polars(topic).to_dicts()) == undated(rows)
+
+
+def undated(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows without the date, which Python holds to a microsecond only."""
+    return [{name: cell for name, cell in row.items() if name != "utc"} for row in rows]
 
 
 @pytest.mark.parametrize("topic", TOPICS)
