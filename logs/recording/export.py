@@ -189,9 +189,9 @@ def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struc
 class Tables:
     """Tables of a recording, by topic; a list of records within has the table `<topic>.<field>`.
 
-    Each table begins with `log_time_ns`, the time by our clock, and `utc`, if the recording knows it. That of a list goes
-    on with `row`, the row (from 0) of the topic's table that the list belongs to, and `place`, the place in the list
-    (from 0).
+    Each table begins with `log_time_ns`, the time by our clock, and `utc`, if the recording knows it. That of a list
+    goes on with `row`, the row (from 0) of the topic's table that the list belongs to, and `place`, the place in the
+    list (from 0).
     """
 
     def __init__(self) -> None:
