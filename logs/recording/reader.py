@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 
@@ -338,7 +339,10 @@ def _attached(data: Buffer, at: int, length: int) -> AttachedFile:
     content = data[at + _RECORD.size : at + length]
     if zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
         raise _BadRecordError("has a wrong checksum")
-    found = Attachment.read(ReadDataStream(BytesIO(content)))
+    try:
+        found = Attachment.read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct.error, ValueError) as error:  # it was written so
+        raise _BadRecordError("is no attachment") from error
     return AttachedFile(found.name, found.media_type, len(found.data))
 
 

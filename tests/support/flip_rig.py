@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from pathlib import Path
+from unittest import mock
 
 import msgspec
 from mcap.reader import make_reader
@@ -37,10 +38,12 @@ class Flips:
         self._path, self._out = folder / "flight.mcap", folder / "out.mcap"
         self._finished = finished
         self._items: list[Item] = [item for item in flight(15) if item[0] != "/uavctl/setpoint"]
-        recorder = SyncRecorder(self._path, LogConfig(chunk_bytes=1024), clock=Clock())
-        for item in self._items:
-            recorder.put(*item)
-        recorder.close()
+        # A layout of many bytes that all are of one attachment would make most of the file.
+        with mock.patch("logs.recording.attachments.layout_text", lambda: '{"layout": 0}'):
+            recorder = SyncRecorder(self._path, LogConfig(chunk_bytes=1024), clock=Clock())
+            for item in self._items:
+                recorder.put(*item)
+            recorder.close()
         self.data = self._path.read_bytes()
         if not finished:
             self.data = self.data[: self.data.rindex(DATA_END)]
@@ -83,6 +86,8 @@ class Flips:
         assert found.start_ns >= self._info.start_ns and found.end_ns <= self._info.end_ns
         if self._finished:
             assert found.damage
+        lost = set(self._info.attachments) - set(found.attachments)
+        assert set(found.attachments) <= set(self._info.attachments) and (found.damage or not lost)
         if found.messages == self._info.messages:
             assert _without_state(found) == _without_state(self._info)
         else:
@@ -103,7 +108,7 @@ class Flips:
 
 def _without_state(found: RecordingInfo) -> RecordingInfo:
     segments = tuple(msgspec.structs.replace(one, finished=False) for one in found.segments)
-    return msgspec.structs.replace(found, finished=False, damage=(), segments=segments)
+    return msgspec.structs.replace(found, finished=False, damage=(), segments=segments, attachments=())
 
 
 def _check_parts(path: Path, entries: list[Item]) -> None:
