@@ -219,3 +219,21 @@ def test_a_backlog_that_is_never_read_to_its_end_lets_nothing_out() -> None:
     assert {name for _, name in bench.connections["vehicle"].words} <= {"TIMESYNC"}  # answers alone
     assert sum(one.counts.get("withheld", 0) for one in bench.memory.of(Refused)) > 20
     assert len(bench.memory.of(Decision)) > 50  # it ticks on, and would end if it were asked to
+
+
+def test_how_long_a_controller_of_another_package_takes_is_judged_and_a_replay_is_told() -> None:
+    bench = Bench('smpc.controller="outside_controllers:Regulates"')
+    watch_ns = 0
+
+    def stopwatch() -> int:  # each tick's two looks at it are a tick and a millisecond apart from two seconds on
+        nonlocal watch_ns
+        watch_ns += TICK_NS + 1_000_000 if bench.now_ns > 2 * SECOND else 0
+        return watch_ns
+
+    bench.loop._stopwatch = stopwatch
+    bench.fly(duration_s=6.0)
+    told = [event.text for event in bench.memory.of(Event) if event.code == "controller-fault"]
+    assert len(told) == 1 and "too late 3 times in a row" in told[0]
+    assert bench.peers.autopilot.mode_name == "AUTO.LAND"
+    result = replay(iter(bench.memory.entries), lambda sink: make_loop(bench.config, sink))
+    assert result.identical, result.first_difference
