@@ -17,6 +17,7 @@ from logs.recording.flight import FLOWN, FlightData
 from logs.recording.summary import RELATIVE_TOLERANCE, box_at
 from uavctl.records import Estimate
 
+GRAVE_M = 0.05  # beyond a limit: further than what a plan promises to keep now and then
 _WALLS = {
     ("north", 1): "north wall",
     ("north", 0): "south wall",

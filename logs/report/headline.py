@@ -13,7 +13,7 @@ import numpy as np
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.summary import BLIND_S, FlightSummary, box_at, count, input_outside, position_error_m, state_outside
-from logs.report.excursion import Clearance, Excursion, excursions, trusted
+from logs.report.excursion import GRAVE_M, Clearance, Excursion, excursions, trusted
 from logs.report.verdicts import Judged, flown_config
 from uavctl.build.controller import build_estimator
 from uavctl.config import Config
@@ -22,7 +22,6 @@ from uavctl.records import ControlMode, Decision
 
 GOOD, MIND, BAD = "good", "mind", "bad"  # of a headline: its colour
 
-_GRAVE_M = 0.05  # beyond a limit: further than what a plan promises to keep now and then
 _PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth telling, if it lasts
 _LOOKED_AT_S, _AFTER_S = 0.3, 3.0  # least time to tell a push in, and the longest until a limit is left for it
 _WRONG_M = 0.3  # between a position that was used and the true place: no noise of a camera
@@ -90,9 +89,9 @@ class _Told:
         if s.final_error_m is None or s.settled_error_m is None:
             last = (self.flight.flown or self.flight.decisions)[-1]
             return Headline(MIND if s.ending.as_ordered else BAD, "Nothing was flown", f"{last.reason}.", ())
-        if self.excursions and (self.excursions[0].beyond_m >= _GRAVE_M or s.ending.as_ordered):
+        if self.excursions and (self.excursions[0].beyond_m >= GRAVE_M or s.ending.as_ordered):
             worst = self.excursions[0]
-            tone, word = (BAD, "Left its limits") if worst.beyond_m >= _GRAVE_M else (MIND, "Touched a limit")
+            tone, word = (BAD, "Left its limits") if worst.beyond_m >= GRAVE_M else (MIND, "Touched a limit")
             text = (
                 f"went {metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{self._how(worst)}"
                 f"{self._seen()}."
@@ -281,7 +280,7 @@ class _Told:
         others = [
             f"{metres(one.beyond_m)} {one.passage} at {seconds(one.worst_s)}"
             for one in self.excursions[1:3]
-            if one.beyond_m >= min(_GRAVE_M, worst.beyond_m)
+            if one.beyond_m >= min(GRAVE_M, worst.beyond_m)
         ]
         yield f"{whole}{'; also ' + ', '.join(others) if others else ''}."
         push = self._push(worst)
@@ -328,7 +327,7 @@ class _Told:
             f"position that was believed came, and plans reach {number(reach_s, 1)} s."
         )
         drift_m = self._drift_m(begun_s, ended_s)
-        if drift_m is not None and drift_m >= _GRAVE_M:
+        if drift_m is not None and drift_m >= GRAVE_M:
             text += f" Meanwhile it drifted {metres(drift_m)} away from its prediction."
         yield text
 

@@ -15,6 +15,9 @@ from typing import Any
 
 import pytest
 
+from logs.recording.flight import FlightData
+from logs.recording.reader import read
+
 LIMIT_S = 60.0
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS = (390, 500, 800, 1400)
@@ -196,6 +199,53 @@ def test_paper_is_white_and_cuts_nothing(window: Browser, page: Path, comparison
         assert found["background"] == "rgb(255, 255, 255)"
         assert faults(found) == NONE
         assert found["hidden"] == []
+
+
+MOVE = """
+((t_s) => {
+const input = document.querySelector('.cursor input');
+input.value = t_s;
+input.dispatchEvent(new Event('input'));
+const shown = s => s.querySelector('.moment').style.display === '';
+const lines = [...document.querySelectorAll('svg[data-time]')].filter(shown);
+const dot = document.querySelector('#path-above .moment.true');
+return {
+  times: lines.map(s => {
+    const [x0, x1, from, to] = s.dataset.time.split(' ').map(Number);
+    const x = Number(s.querySelector('.moment').getAttribute('transform').match(/[(]([-.\\d]+)/)[1]);
+    return from + (x - x0) / (x1 - x0) * (to - from);
+  }),
+  view: dot.ownerSVGElement.dataset.above.split(' ').map(Number),
+  at: [dot.getAttribute('cx'), dot.getAttribute('cy')].map(Number),
+  said: document.querySelector('.cursor output').textContent,
+};
+})
+"""
+
+
+def test_the_slider_moves_one_moment_through_all_drawings(window: Browser, page: Path) -> None:
+    window.open(page, 1000)
+    found = window.call("Runtime.evaluate", expression=f"({MOVE})(5)", returnByValue=True)["result"]["value"]
+    assert len(found["times"]) > 10 and found["times"] == pytest.approx([5.0] * len(found["times"]), abs=0.01)
+    flight = FlightData.from_records(read(page.with_name("flight.mcap")))
+    (true,) = [one.position_m for one in flight.truths if abs(one.at_ns - flight.origin_ns - 5_000_000_000) < 1000]
+    x0, x1, left, right, y0, y1, low, high = found["view"]
+    east = left + (found["at"][0] - x0) / (x1 - x0) * (right - left)
+    north = low + (found["at"][1] - y0) / (y1 - y0) * (high - low)
+    assert (north, east) == pytest.approx(true[:2], abs=0.03)
+    assert "5.0 s" in found["said"] and "track" in found["said"]
+
+
+def test_without_its_script_the_page_lacks_the_slider_only(window: Browser, page: Path) -> None:
+    window.call("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        found, console = window.open(page, 1000)
+    finally:
+        window.call("Emulation.setScriptExecutionDisabled", value=False)
+    assert console == "" and faults(found) == NONE
+    assert len(found["figures"]) == 32
+    sliders = "document.querySelectorAll('.cursor, .moment').length"
+    assert window.call("Runtime.evaluate", expression=sliders, returnByValue=True)["result"]["value"] == 0
 
 
 def test_it_prints(window: Browser, page: Path) -> None:

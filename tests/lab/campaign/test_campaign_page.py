@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_results import cell, runs, write
+from report_rig import unwritten
 from told_numbers import numbers_in
 
 from uavctl.errors import UavctlError
@@ -138,6 +139,11 @@ def test_the_promise_is_told_by_what_was_measured(
     assert (numbers_in(broke), "chance" in broke, broke.startswith("None")) == (cells, chance, len(cells) == 1)
     measured, *_, allowed = numbers_in(told[-1])
     assert (measured, allowed) == (most, 5.0)
+    with unwritten():
+        text = text_of(write_report(folder))
+    word = "Promise kept" if len(cells) == 1 and most <= 5.0 else "Perhaps too often" if chance else "Promise broken"
+    (first,) = re.findall(rf"{word}: (.*?allowed)", text)
+    assert numbers_in(first)[-2:] == [most, 5.0]
 
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:

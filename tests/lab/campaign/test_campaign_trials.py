@@ -158,6 +158,8 @@ def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> 
             assert cell.modes == {"GUIDED": RUNS}
     page = trial_html(told, cells)
     assert "own loop" in page and "Not flown, or failed" in page and "too sure" in page
+    beyond_m = max(row["beyond_m"] for row in rows if np.isfinite(row["beyond_m"]))
+    assert (f"had {-beyond_m:.2f} m left" if beyond_m <= 0.0 else f"the furthest by {beyond_m:.2f} m") in page
 
 
 def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:

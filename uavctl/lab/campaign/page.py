@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,6 +11,7 @@ from typing import Self
 
 from logs.recording.summary import count
 from logs.report import page
+from logs.report.excursion import GRAVE_M
 from logs.report.page import PageSection
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
@@ -34,7 +36,7 @@ from uavctl.lab.campaign.results import (
 )
 from uavctl.lab.campaign.store import SPECIFICATION
 from uavctl.lab.campaign.trials import ToldTrial, TrialSummary, summarise_trial
-from uavctl.lab.trial import MEANING, SHOWN
+from uavctl.lab.trial import BEYOND, MEANING, SHOWN
 
 # A campaign with all that its page shows worked out.
 
@@ -113,13 +115,40 @@ def _outcome(judged: Sequence[CampaignVerdict]) -> str:
     return f"{text} In {left} the costs of such a baseline and the SMPC cannot be told apart." if left else text
 
 
-def _promise(view: CampaignView) -> Iterator[str]:
-    """Yield sentences on whether the promised risk was kept."""
+def _judged(view: CampaignView) -> tuple[list[CellSummary], list[CellSummary], list[CellSummary]]:
+    """Return the cells with a promise, those that broke it, and of these the ones beyond chance."""
     kept = [cell for cell in view.cells if cell.promised_x is not None and cell.violation_ci is not None]
-    if not kept:
-        return
     above = [cell for cell in kept if exceeds(cell.violation_rate or 0.0, cell.promised_x or 0.0)]
     over = [c for c in above if c.violation_ci is not None and c.violation_ci[0] > (c.promised_x or 0.0)]
+    return kept, above, over
+
+
+def _main(view: CampaignView) -> str:
+    """Return the line on what matters most as HTML: failures, else whether promises were kept."""
+    kept, above, over = _judged(view)
+    failed, flown = sum(cell.failed for cell in view.cells), sum(cell.runs for cell in view.cells)
+    if failed:
+        return page.banner("bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", ())
+    if not kept:
+        return ""
+    worst = max(kept, key=lambda cell: (cell.violation_rate or 0.0) / (cell.promised_x or 1.0))
+    most = (
+        f"the most was {percent(worst.violation_rate)} of steps where {percent(worst.promised_x)} are allowed "
+        f"({worst.controller}, {view.place(group_of(worst))})"
+    )
+    cells = count(len(kept), "cell")
+    if over:
+        return page.banner("bad", "Promise broken", f"by {len(over)} of {cells}, beyond chance; {most}.", ())
+    if above:
+        return page.banner("mind", "Perhaps too often", f"in {len(above)} of {cells}, within chance; {most}.", ())
+    return page.banner("good", "Promise kept", f"by all of {cells}; {most}.", ())
+
+
+def _promise(view: CampaignView) -> Iterator[str]:
+    """Yield sentences on whether the promised risk was kept."""
+    kept, above, over = _judged(view)
+    if not kept:
+        return
     worst = max(kept, key=lambda cell: cell.violation_rate or 0.0)
     where = f"{worst.controller}, {view.place(group_of(worst))}"
     if len(above) > len(over):
@@ -206,7 +235,7 @@ def report_html(results: Results) -> str:
     """Return the page of a campaign as HTML."""
     view = CampaignView.of(results)
     subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
-    return page.page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view))
+    return page.page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view), top=_main(view))
 
 
 def _sections(view: CampaignView) -> Iterator[PageSection]:
@@ -447,7 +476,32 @@ def write_trial_report(folder: Path) -> Path:
 def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: str = "") -> str:
     """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {told.master} · uavctl {told.uavctl_version}"
-    return page.page(f"Campaign “{told.name}”", subtitle, _story(cells), _trial_sections(told, cells, specification))
+    title, sections = f"Campaign “{told.name}”", _trial_sections(told, cells, specification)
+    return page.page(title, subtitle, _story(cells), sections, top=_trial_main(cells))
+
+
+def _trial_main(cells: Sequence[TrialSummary]) -> str:
+    """Return the line on what matters most as HTML: failures, else the furthest beyond a wall that any flight was."""
+    failed = sum(cell.failed for cell in cells)
+    runs = sum(cell.runs for cell in cells)
+    if failed:
+        return page.banner("bad", "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.", ())
+    beyond = [
+        (value, cell)
+        for cell in cells
+        for value in cell.values.get("blackout_beyond_m" if cell.place.scenario == "blackout" else BEYOND.key, ())
+        if math.isfinite(value)
+    ]
+    if not beyond:
+        return ""
+    worst_m, worst = max(beyond, key=lambda one: one[0])
+    where = f"{worst.place.controller}, {_TITLES[worst.place.scenario].lower()}, {', '.join(_where(worst))}"
+    left = sum(value > 0.0 for value, _ in beyond)
+    if not left:
+        text = f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({where})."
+        return page.banner("good", "All inside", text, ())
+    text = f"{left} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({where})."
+    return page.banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
 
 
 def _story(cells: Sequence[TrialSummary]) -> Iterator[str]:
