@@ -1,7 +1,7 @@
 """Excursions: where and when the vehicle was beyond a limit of its position, and by how much.
 
 Judged over all that was recorded of the vehicle in the air, its own climb and landing too: by the truth where that is
-known, else by the estimate while the controller flew.
+known, else by the estimate, as long as it is flown by or positions come.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.flight import FLOWN, FlightData
-from logs.recording.summary import RELATIVE_TOLERANCE, box_at
+from logs.recording.summary import BLIND_S, RELATIVE_TOLERANCE, box_at
 from uavctl.records import Estimate
 
 GRAVE_M = 0.05  # beyond a limit: further than what a plan promises to keep now and then
@@ -152,8 +152,9 @@ def _course(flight: FlightData) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     flown = np.zeros(len(t_s), dtype=np.bool_)
     for begun_s, ended_s in flight.spans(FLOWN):
         flown |= (t_s >= begun_s) & (t_s < ended_s)
-    kept = flown if not flight.truths else t_s >= _aloft_s(flight)
-    kept &= np.isfinite(position_m).all(axis=1)
+    kept = (t_s >= _aloft_s(flight)) & np.isfinite(position_m).all(axis=1)
+    if not flight.truths:
+        kept &= flown | np.array([one.age_s <= BLIND_S for one in flight.estimates], dtype=np.bool_)
     return t_s[kept], position_m[kept], flown[kept]
 
 

@@ -17,7 +17,9 @@ from logs.report.excursion import GRAVE_M, Clearance, Excursion, excursions, tru
 from logs.report.verdicts import Judged, flown_config
 from uavctl.build.controller import build_estimator
 from uavctl.config import Config
+from uavctl.flight.envelope import OF_POSITIONS
 from uavctl.labels import number
+from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Decision
 
 GOOD, MIND, BAD = "good", "mind", "bad"  # of a headline: its colour
@@ -94,13 +96,15 @@ class _Told:
             tone, word = (BAD, "Left its limits") if worst.beyond_m >= GRAVE_M else (MIND, "Touched a limit")
             text = (
                 f"went {metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{self._how(worst)}"
-                f"{self._seen()}."
+                f"{self._seen(worst.worst_s)}."
             )
             return Headline(tone, word, text, tuple(self._why(worst)), worst.worst_s)
         if not s.ending.as_ordered:
             at_s = self._ended_s()
             when = "" if at_s is None else f" at {seconds(at_s)}"
-            text = f"{s.ending.cause}{when}{self._blind_text(at_s)}; {self._stayed()}."
+            last = (self.flight.flown or self.flight.decisions)[-1]
+            ended = s.ending.cause if s.ending.cause != Cause.WAITING else f"at the end it was waiting ({last.reason})"
+            text = f"{ended}{when}{self._blind_text(at_s)}; {self._stayed()}."
             return Headline(BAD, "Not as ordered", text, tuple(self._why(None)), at_s or 0.0)
         return self._inside(s.settled_error_m, s.final_error_m)
 
@@ -133,7 +137,7 @@ class _Told:
         """Return that it stayed inside the limits of its position, with how near it came to one of them."""
         if self.excursions:
             worst = self.excursions[0]
-            return f"{metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{self._seen()}"
+            return f"{metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{self._seen(worst.worst_s)}"
         nearest = self.clearance.nearest()
         if nearest is None:
             return "its position has no limits"
@@ -142,7 +146,7 @@ class _Told:
         near = (
             f"{metres(free_m)} from the {wall} at the nearest, {'where it began' if begun else f'at {seconds(at_s)}'}"
         )
-        return f"inside its limits throughout, {near}{self._seen()}"
+        return f"inside its limits throughout, {near}{self._seen(at_s)}"
 
     def _out_of_reach(self) -> str:
         """Return by how much the target lay beyond a limit of position at the end; empty if it did not."""
@@ -156,8 +160,14 @@ class _Told:
             return ""
         return f", which lay {metres(float(beyond[most]))} beyond the limit {design.axes[most]} by then"
 
-    def _seen(self) -> str:
-        return "" if self.flight.truths else " (by the estimate: the true state is unknown)"
+    def _seen(self, at_s: float) -> str:
+        """Return by what it is known where the vehicle was at a time; empty where that is the truth."""
+        if self.flight.truths:
+            return ""
+        breach = self.flight.breach
+        doubted = breach is not None and breach.code in OF_POSITIONS and at_s >= self.breach_s
+        source = "positions that were no longer believed" if doubted else "the estimate"
+        return f" (by {source}: the true state is unknown)"
 
     def _limit(self) -> tuple[str, float]:
         """Return the furthest excess of a state over a limit that is not one of position, and when it was [s]."""

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 from loopback_rig import lockstep
+from recorded_rig import RELAYED, listened, page_of, truth
 from report_rig import drawn
 from synthetic_flight import fly
 from synthetic_scene import room
@@ -29,6 +30,7 @@ WALLS = {  # axis, sign, limit of preset and scene
     "west wall": (1, -1.0, 2.5),
     "ceiling": (2, -1.0, 2.5),
 }
+BLOWN = RELAYED[2]
 WENT = re.compile(r"went ([\d.]+) (m|mm) (?:through the (.*?)|below the (floor)) at ([\d.]+) s")
 
 
@@ -248,3 +250,17 @@ def test_a_fence_that_closes_in_is_drawn_and_named() -> None:
     late = [t.position_m[0] for t in closed.truths if (t.at_ns - closed.origin_ns) * 1e-9 > 8.2]
     assert max(late) < 0.55  # and so the target, at 1.5 m, was not to be reached
     assert re.search(r"target at the last step, which lay 1\.0 m beyond the limit north", found.text)
+
+
+@pytest.mark.slow
+def test_a_recorded_flight_that_was_blown_away_is_told_by_its_positions() -> None:
+    """PX4's own simulator, in a wind that its pilot had not ordered for; its truth was recorded beside it."""
+    since_s, lasted_s = 50.0, 12.0
+    found = head(page_of(listened(BLOWN, since_s, lasted_s).memory))
+    beyond_m, wall, at_s = went(found.text)
+    rows = truth(BLOWN)
+    true_m = [float(np.interp(since_s + at_s, rows[:, 0], rows[:, 1 + axis])) for axis in range(3)]
+    truly = {name: sign * true_m[axis] - limit for name, (axis, sign, limit) in WALLS.items()}
+    assert wall == max(truly, key=truly.__getitem__) and truly[wall] > 0.5
+    assert beyond_m == pytest.approx(truly[wall], abs=0.1)  # by positions, which are a little old
+    assert "no longer believed" in found.text and found.tone == BAD
