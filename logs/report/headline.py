@@ -146,7 +146,7 @@ class _Told:
         near = (
             f"{metres(free_m)} from the {wall} at the nearest, {'where it began' if begun else f'at {seconds(at_s)}'}"
         )
-        return f"inside its limits throughout, {near}{self._seen(at_s)}"
+        return f"inside its walls throughout, {near}{self._seen(at_s)}"
 
     def _out_of_reach(self) -> str:
         """Return by how much the target lay beyond a limit of position at the end; empty if it did not."""

@@ -108,7 +108,7 @@ def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judged) -> None:
 def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judged) -> None:
     found = head(flight, judged)
     assert furthest(flight)[0] < 0.0 and excursions(flight) == ()
-    assert found.tone == GOOD and "inside its limits throughout" in found.text
+    assert found.tone == GOOD and "inside its walls throughout" in found.text
     near = re.search(r"([\d.]+) m from the (.*?) at the nearest, (?:at ([\d.]+) s|where it began)", found.text)
     assert near is not None
     beyond_m, wall, at_s = furthest(flight)
