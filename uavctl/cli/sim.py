@@ -19,7 +19,8 @@ from rich.live import Live
 from rich.markup import escape
 
 from sim.faults import problems
-from sim.server import Door, Port, Ready, Seat, fleet, serve_all
+from sim.fleet import fleet
+from sim.server import Door, Port, Ready, Seat, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages
 from uavctl.cli.flying import stop_on_signals
@@ -226,9 +227,13 @@ def sim(
             "PX4 sends to udpout://127.0.0.1:14540 and 14550, ArduPilot listens at tcpin://127.0.0.1:5760"
         ),
     ] = None,
-    mocap: Annotated[str, Parameter(help="the same for the cameras; an equal URL is one connection")] = (
-        "udpout://127.0.0.1:14560"
-    ),
+    mocap: Annotated[
+        str,
+        Parameter(
+            help="the same for the cameras; an equal URL is one connection. natnet://127.0.0.1/drone lets them be an "
+            "OptiTrack server whose body is the vehicle"
+        ),
+    ] = "udpout://127.0.0.1:14560",
     autopilot: Annotated[
         Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot")
     ] = None,
