@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 
 from uavctl.build.controller import build_design
-from uavctl.cli.common import Column, WideTable
+from uavctl.cli.common import DEFAULTS, Column, WideTable, columns, two_columns
 from uavctl.cli.solve import plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
@@ -72,3 +72,25 @@ def test_groups_stay_together_where_they_fit() -> None:
     assert headings[53] == [["t", *"abcdef"], ["t", "g"]]
     assert headings[29] == [["t", *"abc"], ["t", *"def"], ["t", "g"]]
     assert headings[28] == [["t", *"ab"], ["t", *"cd"], ["t", *"ef"], ["t", "g"]]
+
+
+LONG = "x" * 170  # as a path may be
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        two_columns("title", [("file", LONG), ("more", "two words")]),
+        columns("title", ["a", "b"], [["1", LONG], ["2", "two words"]]),
+        Group("before", columns("title", ["a", "b"], [[LONG, LONG]]), "two words"),
+    ],
+)
+def test_a_table_that_goes_to_a_file_is_whole(table: RenderableType, capsys: pytest.CaptureFixture[str]) -> None:
+    DEFAULTS.show({}, lambda: table)
+    told = capsys.readouterr().out
+    assert LONG in told and "two words" in told and "…" not in told
+
+
+def test_a_table_with_room_keeps_the_usual_width_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    DEFAULTS.show({}, lambda: columns("", ["a", "b"], [["1", "word " * 100]]))
+    assert {len(line) for line in capsys.readouterr().out.splitlines()} == {120}

@@ -15,6 +15,7 @@ from cyclopts import Parameter, validators
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -25,7 +26,7 @@ from uavctl.errors import ConfigError, DesignError
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
 
 
-_FILE_WIDTH = 120
+_FILE_WIDTH, _WIDEST = 120, 10_000
 
 Overrides = Annotated[
     tuple[str, ...],
@@ -77,8 +78,12 @@ class Common:
         if self.json:
             sys.stdout.write(msgspec.json.encode(document).decode() + "\n")
         else:
-            # Files and pipes have no width of their own; the usual 80 columns would fold the tables.
-            Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(picture())
+            shown, console = picture(), Console()
+            if not sys.stdout.isatty():
+                # Files and pipes have no width of their own; the usual 80 columns would fold tables and cut words.
+                anything = console.options.update_width(_WIDEST)
+                console.width = max(_FILE_WIDTH, Measurement.get(console, anything, shown).minimum)
+            console.print(shown)
 
 
 def can_be_read(type_: object, path: object) -> None:
