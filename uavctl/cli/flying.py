@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -430,6 +431,25 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+SERVER_RETRY_S = 1.0
+
+
+def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
+    """Return a function that waits a second for a server of TCP, says so once, and returns False once it is to stop."""
+    told: set[str] = set()
+
+    def wait(url: str) -> bool:
+        if url not in told:
+            told.add(url)
+            messages().print(f"waiting for {escape(url)}, where nobody listens yet; Ctrl-C ends it", soft_wrap=True)
+        until_s = time.monotonic() + SERVER_RETRY_S
+        while time.monotonic() < until_s and not stopped():
+            time.sleep(0.05)
+        return not stopped()
+
+    return wait
 
 
 class LiveFeed:
