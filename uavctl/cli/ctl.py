@@ -211,4 +211,4 @@ def _trouble(recorder: RecorderHealth) -> str:
 
 
 def _point(point: dict[str, float] | None) -> str:
-    return "-" if point is None else ", ".join(f"{axis} {value:.2f} m" for axis, value in point.items())
+    return "-" if point is None else ", ".join(f"{axis} {value:z.2f} m" for axis, value in point.items())

@@ -527,7 +527,7 @@ def _line(ticked: Ticked, who_flies: HandoverState) -> str:
     decision, vehicle, estimate = ticked.decision, ticked.vehicle, ticked.estimate
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
-    accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
+    accel = "-" if decision.input is None else " ".join(f"{u:+z.2f}" for u in decision.input)
     waiting = waits_for(who_flies) if decision.mode is ControlMode.WAIT else ""
     mode = f"{mode}, waiting for {waiting}" if waiting else mode
     return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"

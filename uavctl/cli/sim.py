@@ -148,7 +148,7 @@ def _cells(one: VehicleSnapshot) -> tuple[str, ...]:
 
 
 def _vector(vector: Vec3) -> str:
-    return " ".join(f"{component:+.2f}" for component in vector)
+    return " ".join(f"{component:+z.2f}" for component in vector)
 
 
 def _setpoint(one: VehicleSnapshot) -> str:
